@@ -1,0 +1,1 @@
+//! The robot's half: everything `task-agent` does. Imports run downward only; see ARCHITECTURE.md.

@@ -1,0 +1,393 @@
+//! Bodies of the HTTP API under `/api/v1`. Times are milliseconds since the Unix epoch by the server's clock, sizes are
+//! bytes. Unknown fields are tolerated in answers; requests are checked by the server.
+
+use serde::{Deserialize, Serialize};
+
+use crate::desired::{Delivery, PackageRef, Wanted};
+use crate::envelope::PublicKey;
+use crate::id::Labels;
+use crate::manifest::{TaskKind, TaskManifest};
+use crate::report::{ActiveVersion, Condition, Failure, HostFacts, Phase, Progress};
+use crate::selector::Selector;
+use crate::topic::TopicPrefix;
+use crate::{DeploymentId, Digest, Generation, MacAddress, RobotId, RobotName, TaskName, Version};
+
+/// Where the API begins.
+pub const BASE: &str = "/api/v1";
+/// Request header that makes an order safe to retry: the same key gives the same deployment. 1 to 128 visible characters.
+pub const IDEMPOTENCY_KEY: &str = "idempotency-key";
+
+/// Every error's body.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ErrorBody {
+    /// The error.
+    pub error: ApiError,
+}
+
+/// An error: a stable code for programs, a sentence for people.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ApiError {
+    /// `not_found`, `invalid_request`, `unauthorized`, `forbidden`, `mac_known`, `no_robots_match`, …
+    pub code: String,
+    /// What went wrong, naming the caller's own key.
+    pub message: String,
+}
+
+/// `GET /server` (operator).
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct ServerInfo {
+    /// The server's version.
+    pub version: String,
+    /// The key that signs desired states.
+    pub key: PublicKey,
+    /// The MQTT listener's address, `host:port`, as bound.
+    pub mqtt: String,
+    /// The server's clock.
+    pub now_ms: u64,
+}
+
+/// `POST /enroll` (enrolment token).
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct EnrollRequest {
+    /// The robot's MAC: its identity towards people.
+    pub mac: MacAddress,
+    /// Its name; the server makes one from the MAC if absent.
+    #[serde(default)]
+    pub name: Option<RobotName>,
+    /// Its labels.
+    #[serde(default)]
+    pub labels: Labels,
+}
+
+/// Answer to an enrolment. The token is shown this once.
+#[derive(Clone, Serialize, Deserialize)]
+pub struct EnrollResponse {
+    /// The robot's new identity.
+    pub robot_id: RobotId,
+    /// The name it got.
+    pub name: RobotName,
+    /// Its bearer token and MQTT password.
+    pub token: String,
+    /// How to reach MQTT.
+    pub mqtt: MqttEndpoint,
+}
+
+/// Where a robot's MQTT session goes.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct MqttEndpoint {
+    /// Host; absent means the host of the server's URL.
+    #[serde(default)]
+    pub host: Option<String>,
+    /// TCP port.
+    pub port: u16,
+    /// What all topics start with.
+    pub prefix: TopicPrefix,
+}
+
+/// `POST /enrollment-tokens` (operator).
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+pub struct CreateEnrollmentToken {
+    /// Only for this robot, by id or name, which may register again with it.
+    #[serde(default)]
+    pub robot: Option<String>,
+    /// How many enrolments it is good for; absent: any number.
+    #[serde(default)]
+    pub uses: Option<u64>,
+    /// Lifetime in seconds; the server's default is a day.
+    #[serde(default)]
+    pub ttl_s: Option<u64>,
+    /// Labels each robot that uses it gets.
+    #[serde(default)]
+    pub labels: Labels,
+}
+
+/// A new enrolment token. The secret is shown this once.
+#[derive(Clone, Serialize, Deserialize)]
+pub struct EnrollmentToken {
+    /// The public part of it.
+    pub id: String,
+    /// The whole token.
+    pub token: String,
+    /// When it ends.
+    pub expires_at_ms: u64,
+}
+
+/// `GET /robots` (operator), optionally `?selector=`.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+pub struct RobotList {
+    /// Sorted by name.
+    pub robots: Vec<RobotView>,
+}
+
+/// A robot as the operator sees it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RobotView {
+    /// Its identity.
+    pub id: RobotId,
+    /// Its name.
+    pub name: RobotName,
+    /// The MAC it was registered by.
+    pub mac: MacAddress,
+    /// Its labels.
+    pub labels: Labels,
+    /// Whether it is connected over MQTT or polls.
+    pub online: bool,
+    /// Its last peer address, `ip:port`.
+    pub address: Option<String>,
+    /// When it was last heard.
+    pub last_seen_ms: Option<u64>,
+    /// When it registered.
+    pub enrolled_at_ms: u64,
+    /// The generation it should have.
+    pub generation: Generation,
+    /// The generation it last reported.
+    pub observed_generation: Generation,
+    /// `diverged`, `duplicate_identity` and what the robot reported.
+    pub conditions: Vec<Condition>,
+    /// What it said of its machine.
+    pub host: Option<HostFacts>,
+    /// Its tasks, sorted by name.
+    pub tasks: Vec<RobotTask>,
+}
+
+/// A task on a robot: what is ordered, and where it stands.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RobotTask {
+    /// The task's name.
+    pub task: TaskName,
+    /// The version ordered.
+    pub version: Version,
+    /// The order.
+    pub deployment: DeploymentId,
+    /// Whether it should run.
+    pub wanted: Wanted,
+    /// How often it was asked to start.
+    pub run: u64,
+    /// Where it stands.
+    pub phase: Phase,
+    /// How far the phase has come.
+    pub progress: Option<Progress>,
+    /// Why it failed.
+    pub failure: Option<Failure>,
+    /// The version whose process lives.
+    pub active: Option<ActiveVersion>,
+    /// Times the process was started again in this run.
+    pub restarts: u32,
+}
+
+/// `PATCH /robots/{robot}` (operator): absent fields stay.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+pub struct EditRobot {
+    /// A new name.
+    #[serde(default)]
+    pub name: Option<RobotName>,
+    /// The new labels, all of them.
+    #[serde(default)]
+    pub labels: Option<Labels>,
+}
+
+/// Answer to a robot's `POST /robots/{robot}/report`. The report is stored.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ReportReply {
+    /// The generation the robot should have.
+    pub generation: Generation,
+    /// The name and labels the server holds; the server's win over the robot's own.
+    pub name: RobotName,
+    /// Likewise.
+    pub labels: Labels,
+}
+
+/// `GET /packages` (operator).
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+pub struct PackageList {
+    /// Sorted by name, then newest first.
+    pub packages: Vec<PackageView>,
+}
+
+/// One package version.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PackageView {
+    /// The pinned package.
+    pub package: PackageRef,
+    /// When it was pushed.
+    pub pushed_at_ms: u64,
+    /// Its manifest.
+    pub manifest: TaskManifest,
+}
+
+/// `POST /deployments` (operator), with an `Idempotency-Key` header.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct CreateDeployment {
+    /// The package's name: its repository.
+    pub package: TaskName,
+    /// Its manifest, pushed before.
+    pub manifest: Digest,
+    /// Which robots; resolved once, now.
+    pub selector: Selector,
+    /// How the bytes should travel.
+    #[serde(default)]
+    pub delivery: Delivery,
+    /// How many robots at a time; absent: all at once.
+    #[serde(default)]
+    pub batch: Option<u64>,
+    /// Pause when more than this many robots have failed; absent: never.
+    #[serde(default)]
+    pub max_failures: Option<u64>,
+    /// Seconds until what is not done expires; absent: the server's setting.
+    #[serde(default)]
+    pub expires_in_s: Option<u64>,
+    /// Only say which robots it would be. Stores nothing, needs no key.
+    #[serde(default)]
+    pub dry_run: bool,
+}
+
+/// Answer to a dry run, and to an order on tasks: the robots meant.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+pub struct MatchedRobots {
+    /// Sorted by name.
+    pub robots: Vec<MatchedRobot>,
+}
+
+/// A robot that a selector matched.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct MatchedRobot {
+    /// Its identity.
+    pub id: RobotId,
+    /// Its name.
+    pub name: RobotName,
+    /// Whether it is connected now.
+    pub online: bool,
+}
+
+/// `GET /deployments` (operator): the newest first, without assignments.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+pub struct DeploymentList {
+    /// The deployments.
+    pub deployments: Vec<DeploymentView>,
+}
+
+/// A deployment as the operator sees it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct DeploymentView {
+    /// Its identity.
+    pub id: DeploymentId,
+    /// What it brings.
+    pub package: PackageRef,
+    /// Service or job.
+    pub kind: TaskKind,
+    /// The selector as it was given.
+    pub selector: Selector,
+    /// How the bytes travel.
+    pub delivery: Delivery,
+    /// Where it stands as a whole.
+    pub state: DeploymentState,
+    /// Robots at a time.
+    pub batch: Option<u64>,
+    /// Failures it bears.
+    pub max_failures: Option<u64>,
+    /// When it was ordered.
+    pub created_at_ms: u64,
+    /// When what is left expires.
+    pub expires_at_ms: u64,
+    /// How many assignments stand in each phase, zeros left out, in the order of a life.
+    pub counts: Vec<PhaseCount>,
+    /// Deployments it took the place of on some robot.
+    pub supersedes: Vec<DeploymentId>,
+    /// One per robot, sorted by name; only in `GET /deployments/{id}` and the answer to an order.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub assignments: Option<Vec<AssignmentView>>,
+}
+
+/// How many assignments stand in a phase.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct PhaseCount {
+    /// The phase.
+    pub phase: Phase,
+    /// How many.
+    pub count: u64,
+}
+
+/// Where a deployment stands as a whole.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum DeploymentState {
+    /// Some assignment is not settled.
+    Active,
+    /// Too many robots failed; no further batch is begun until it is resumed.
+    Paused,
+    /// Every assignment is settled.
+    Settled,
+    /// The operator took it back.
+    Cancelled,
+}
+
+/// A deployment's part for one robot.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct AssignmentView {
+    /// The robot.
+    pub robot: RobotId,
+    /// Its name.
+    pub name: RobotName,
+    /// Whether it is connected now.
+    pub online: bool,
+    /// Whether its batch has begun.
+    pub released: bool,
+    /// Where it stands.
+    pub phase: Phase,
+    /// How far the phase has come.
+    pub progress: Option<Progress>,
+    /// Why it failed.
+    pub failure: Option<Failure>,
+    /// Tries of the phase.
+    pub attempts: u32,
+    /// The newer deployment that took its place.
+    pub superseded_by: Option<DeploymentId>,
+    /// When it last changed.
+    pub updated_at_ms: u64,
+}
+
+/// `POST /tasks/{task}/{start|stop|remove}` (operator), with an `Idempotency-Key` header.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct OrderTask {
+    /// Which robots; those that have no such task are left out.
+    pub selector: Selector,
+    /// Only say which robots it would be.
+    #[serde(default)]
+    pub dry_run: bool,
+}
+
+/// `POST /session` (anyone): exchanges an operator token for a cookie.
+#[derive(Clone, Serialize, Deserialize)]
+pub struct SignIn {
+    /// The operator token.
+    pub token: String,
+}
+
+/// What `GET /events` (operator) streams: each is the `data` of a server-sent event whose `event` is the tag's value.
+/// A view replaces what was known before. After (re)connecting, fetch the lists once.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "type", rename_all = "snake_case")]
+pub enum Event {
+    /// A robot is new or has changed.
+    Robot {
+        /// As it is now.
+        robot: Box<RobotView>,
+    },
+    /// A robot was removed.
+    RobotRemoved {
+        /// Which.
+        id: RobotId,
+    },
+    /// A deployment is new or has changed; without assignments.
+    Deployment {
+        /// As it is now.
+        deployment: Box<DeploymentView>,
+    },
+    /// A package was pushed or deleted.
+    Package {
+        /// Which.
+        name: TaskName,
+    },
+    /// The listener was too slow and missed events: fetch the lists again.
+    Missed,
+}

@@ -1,0 +1,191 @@
+//! DSSE envelopes (Dead Simple Signing Envelope, protocol v1.0.2) over ed25519: how a desired state is signed.
+//! An envelope's payload is only ever reached through [`Envelope::open`], which verifies first.
+
+use std::fmt;
+
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use ed25519_dalek::{Signature, Signer as _};
+use serde::{Deserialize, Serialize};
+
+use crate::Digest;
+
+/// The payload type of a signed [`crate::desired::DesiredState`].
+pub const DESIRED_STATE_TYPE: &str = "application/vnd.taskd.desired.v1+json";
+
+/// A signed payload: JSON `{"payload": base64, "payloadType": text, "signatures": [{"keyid", "sig": base64}]}`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Envelope {
+    payload: String,
+    #[serde(rename = "payloadType")]
+    payload_type: String,
+    signatures: Vec<EnvelopeSignature>,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+struct EnvelopeSignature {
+    #[serde(default)]
+    keyid: String,
+    sig: String,
+}
+
+/// Why an envelope was not opened.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum EnvelopeError {
+    /// The payload is of another type than expected.
+    #[error("payload is {found:?}, expected {expected:?}")]
+    WrongType {
+        /// What the envelope says.
+        found: String,
+        /// What the caller asked for.
+        expected: &'static str,
+    },
+    /// A base64 field does not decode.
+    #[error("envelope field {0} is not base64")]
+    Encoding(&'static str),
+    /// No signature is by the pinned key.
+    #[error("no valid signature by key {0}")]
+    NotSigned(String),
+}
+
+impl Envelope {
+    /// Signs `payload`.
+    pub fn seal(payload_type: &'static str, payload: &[u8], key: &SigningKey) -> Self {
+        let sig = key.0.sign(&pre_authentication_encoding(payload_type, payload));
+        Self {
+            payload: STANDARD.encode(payload),
+            payload_type: payload_type.to_owned(),
+            signatures: vec![EnvelopeSignature { keyid: key.public_key().id(), sig: STANDARD.encode(sig.to_bytes()) }],
+        }
+    }
+
+    /// The payload, once a signature by `key` has been verified. Key ids are hints only and are not trusted.
+    pub fn open(&self, expected: &'static str, key: &PublicKey) -> Result<Vec<u8>, EnvelopeError> {
+        if self.payload_type != expected {
+            return Err(EnvelopeError::WrongType { found: self.payload_type.chars().take(80).collect(), expected });
+        }
+        let payload = STANDARD.decode(&self.payload).map_err(|_| EnvelopeError::Encoding("payload"))?;
+        let message = pre_authentication_encoding(expected, &payload);
+        let signed = self.signatures.iter().take(MAX_SIGNATURES).any(|signature| {
+            STANDARD
+                .decode(&signature.sig)
+                .ok()
+                .and_then(|sig| Signature::from_slice(&sig).ok())
+                .is_some_and(|sig| key.0.verify_strict(&message, &sig).is_ok())
+        });
+        if signed { Ok(payload) } else { Err(EnvelopeError::NotSigned(key.id())) }
+    }
+}
+
+/// More signatures than this are not looked at: each costs a verification.
+const MAX_SIGNATURES: usize = 8;
+
+/// DSSE's `PAE(type, body)`: "DSSEv1", then each field's length and bytes, separated by single spaces.
+fn pre_authentication_encoding(payload_type: &str, payload: &[u8]) -> Vec<u8> {
+    let mut encoded = format!("DSSEv1 {} {payload_type} {} ", payload_type.len(), payload.len()).into_bytes();
+    encoded.extend_from_slice(payload);
+    encoded
+}
+
+/// An ed25519 private key.
+pub struct SigningKey(ed25519_dalek::SigningKey);
+
+impl SigningKey {
+    /// A fresh key from the operating system's random generator.
+    pub fn random() -> Self {
+        Self::from_bytes(rand::random())
+    }
+
+    /// From its 32-byte seed.
+    pub fn from_bytes(seed: [u8; 32]) -> Self {
+        Self(ed25519_dalek::SigningKey::from_bytes(&seed))
+    }
+
+    /// The 32-byte seed, to be stored with mode 0600.
+    pub fn to_bytes(&self) -> [u8; 32] {
+        self.0.to_bytes()
+    }
+
+    /// The key that verifies.
+    pub fn public_key(&self) -> PublicKey {
+        PublicKey(self.0.verifying_key())
+    }
+}
+
+/// An ed25519 public key, in JSON as standard base64 of its 32 bytes.
+#[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub struct PublicKey(ed25519_dalek::VerifyingKey);
+
+impl PublicKey {
+    /// From its 32 bytes; `None` if they are no point of the curve.
+    pub fn from_bytes(bytes: [u8; 32]) -> Option<Self> {
+        ed25519_dalek::VerifyingKey::from_bytes(&bytes).ok().map(Self)
+    }
+
+    /// Its 32 bytes.
+    pub fn to_bytes(&self) -> [u8; 32] {
+        self.0.to_bytes()
+    }
+
+    /// A short name for it: the first 16 hex digits of its SHA-256.
+    pub fn id(&self) -> String {
+        Digest::of(&self.to_bytes()).hex()[..16].to_owned()
+    }
+}
+
+/// A text that is not a public key.
+#[derive(Debug, thiserror::Error)]
+#[error("not an ed25519 public key: expected base64 of 32 bytes")]
+pub struct InvalidKey;
+
+impl TryFrom<String> for PublicKey {
+    type Error = InvalidKey;
+    fn try_from(text: String) -> Result<Self, InvalidKey> {
+        let bytes = STANDARD.decode(text).map_err(|_| InvalidKey)?;
+        bytes.try_into().ok().and_then(Self::from_bytes).ok_or(InvalidKey)
+    }
+}
+
+impl From<PublicKey> for String {
+    fn from(key: PublicKey) -> String {
+        STANDARD.encode(key.to_bytes())
+    }
+}
+
+impl fmt::Debug for PublicKey {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "PublicKey({})", self.id())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn opens_only_what_the_pinned_key_signed() {
+        let key = SigningKey::from_bytes([7; 32]);
+        let envelope = Envelope::seal(DESIRED_STATE_TYPE, b"{}", &key);
+        assert_eq!(envelope.open(DESIRED_STATE_TYPE, &key.public_key()), Ok(b"{}".to_vec()));
+        let stranger = SigningKey::from_bytes([8; 32]).public_key();
+        assert_eq!(envelope.open(DESIRED_STATE_TYPE, &stranger), Err(EnvelopeError::NotSigned(stranger.id())));
+    }
+
+    #[test]
+    fn any_changed_payload_is_refused() {
+        let key = SigningKey::from_bytes([7; 32]);
+        let mut envelope = Envelope::seal(DESIRED_STATE_TYPE, b"{\"generation\":1}", &key);
+        envelope.payload = STANDARD.encode(b"{\"generation\":2}");
+        assert!(matches!(envelope.open(DESIRED_STATE_TYPE, &key.public_key()), Err(EnvelopeError::NotSigned(_))));
+        envelope.payload_type = "text/plain".to_owned();
+        assert!(matches!(envelope.open(DESIRED_STATE_TYPE, &key.public_key()), Err(EnvelopeError::WrongType { .. })));
+    }
+
+    #[test]
+    fn encoding_matches_the_specification() {
+        // The example of the DSSE protocol document.
+        let encoded = pre_authentication_encoding("http://example.com/HelloWorld", b"hello world");
+        assert_eq!(encoded, b"DSSEv1 29 http://example.com/HelloWorld 11 hello world");
+    }
+}

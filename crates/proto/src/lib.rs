@@ -1,0 +1,17 @@
+//! Wire types shared by server, agent and bench: everything that crosses the network or a disk both sides read.
+//! It never does I/O and never reads a clock; randomness and time are arguments or explicit constructors.
+
+pub mod api;
+pub mod desired;
+pub mod digest;
+pub mod envelope;
+pub mod id;
+pub mod manifest;
+pub mod oci;
+pub mod report;
+pub mod selector;
+pub mod token;
+pub mod topic;
+
+pub use digest::Digest;
+pub use id::{DeploymentId, Generation, InstanceId, MacAddress, RobotId, RobotName, TaskName, Version};

@@ -1,0 +1,385 @@
+//! The task manifest: a package's config blob, made from `task.toml` and `package.xml` at push and obeyed by the agent.
+//! It is data and its own rules; reading the source files is the server crate's work.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use crate::id::Labels;
+use crate::{Digest, TaskName, Version};
+
+/// The longest any text in a manifest may be, in bytes.
+pub const MAX_TEXT_BYTES: usize = 4096;
+/// The most elements any list or table in a manifest may have.
+pub const MAX_LIST_LEN: usize = 256;
+
+/// What a package is and how it is built, run and watched.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TaskManifest {
+    /// The package's and the task's name.
+    pub name: TaskName,
+    /// The package's version.
+    pub version: Version,
+    /// How it is built.
+    #[serde(default)]
+    pub build: Build,
+    /// How it is run.
+    pub run: Run,
+    /// What must hold on the ROS graph before it counts as running.
+    #[serde(default)]
+    pub ready: Ready,
+    /// ROS parameters by node and name.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub parameters: BTreeMap<String, BTreeMap<String, serde_json::Value>>,
+    /// Files that come back when the task ends.
+    #[serde(default)]
+    pub outputs: Outputs,
+    /// What the robot must have.
+    #[serde(default)]
+    pub requires: Requires,
+    /// Names of the packages that `package.xml` says are needed to run it.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub exec_depends: Vec<String>,
+    /// What the content blob holds.
+    pub content: ContentFacts,
+}
+
+/// How a package is built on the robot.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Build {
+    /// The build tool.
+    #[serde(default)]
+    pub tool: BuildTool,
+}
+
+/// A build tool.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum BuildTool {
+    /// `colcon build`, ROS 2.
+    Colcon,
+    /// `catkin_make install`, ROS 1.
+    Catkin,
+    /// Nothing to build: an install tree or plain files.
+    #[default]
+    None,
+}
+
+/// How a task is run. Exactly one of `launch` and `exec` is given.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Run {
+    /// Package and launch file for `ros2 launch`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub launch: Option<[String; 2]>,
+    /// A command and its arguments, run in the task's directory.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub exec: Option<Vec<String>>,
+    /// Launch arguments, `name:=value`.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub args: BTreeMap<String, String>,
+    /// Service or job.
+    #[serde(default)]
+    pub kind: TaskKind,
+    /// What a reboot does.
+    #[serde(default)]
+    pub on_boot: OnBoot,
+    /// When the process is started again after it ended by itself.
+    #[serde(default)]
+    pub restart: Restart,
+    /// Whether an interrupted job may be started again.
+    #[serde(default)]
+    pub idempotent: bool,
+    /// Seconds between SIGINT and SIGTERM, and again between SIGTERM and SIGKILL.
+    #[serde(default = "default_stop_timeout_s")]
+    pub stop_timeout_s: u32,
+}
+
+impl Default for Run {
+    fn default() -> Self {
+        Self {
+            launch: None,
+            exec: None,
+            args: BTreeMap::new(),
+            kind: TaskKind::default(),
+            on_boot: OnBoot::default(),
+            restart: Restart::default(),
+            idempotent: false,
+            stop_timeout_s: default_stop_timeout_s(),
+        }
+    }
+}
+
+fn default_stop_timeout_s() -> u32 {
+    10
+}
+
+/// Whether a task keeps running or ends.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum TaskKind {
+    /// Keeps running.
+    #[default]
+    Service,
+    /// Runs to completion, once per run.
+    Job,
+}
+
+/// What a reboot does to a task.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum OnBoot {
+    /// It is started.
+    #[default]
+    Start,
+    /// It stays down until it is asked to start.
+    Hold,
+}
+
+/// When a process that ended by itself is started again.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Restart {
+    /// When it failed.
+    #[default]
+    OnFailure,
+    /// Whenever it ended.
+    Always,
+    /// Never.
+    Never,
+}
+
+/// What must hold before a task counts as running.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Ready {
+    /// Nodes that must be on the graph.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub nodes: Vec<String>,
+    /// Lifecycle nodes the agent configures and activates.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub lifecycle: Vec<String>,
+    /// Seconds all of it must hold.
+    #[serde(default = "default_hold_s")]
+    pub hold_s: u32,
+    /// Seconds it may take.
+    #[serde(default = "default_ready_timeout_s")]
+    pub timeout_s: u32,
+}
+
+impl Default for Ready {
+    fn default() -> Self {
+        Self {
+            nodes: Vec::new(),
+            lifecycle: Vec::new(),
+            hold_s: default_hold_s(),
+            timeout_s: default_ready_timeout_s(),
+        }
+    }
+}
+
+fn default_hold_s() -> u32 {
+    2
+}
+
+fn default_ready_timeout_s() -> u32 {
+    30
+}
+
+/// Files that come back to the server when the task ends.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Outputs {
+    /// Glob patterns below the task's directory.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub paths: Vec<String>,
+}
+
+/// What a robot must have; an empty list accepts anything.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Requires {
+    /// Labels the robot must carry.
+    #[serde(default, skip_serializing_if = "Labels::is_empty")]
+    pub labels: Labels,
+    /// ROS distributions, any of which will do.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub ros_distro: Vec<String>,
+    /// Architectures, any of which will do.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub arch: Vec<String>,
+}
+
+/// What the packer measured of the content blob, so that a robot knows before it pulls.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ContentFacts {
+    /// Digest of the uncompressed tar.
+    pub tar_digest: Digest,
+    /// Size of the uncompressed tar in bytes.
+    pub tar_size: u64,
+    /// Number of files, directories and links.
+    pub entries: u64,
+}
+
+/// A rule a manifest breaks, named by the user's own key.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{key}: {reason}")]
+pub struct ManifestProblem {
+    /// The key as it is written in `task.toml`, for example `run.exec`.
+    pub key: String,
+    /// What is wrong with it.
+    pub reason: String,
+}
+
+impl TaskManifest {
+    /// Every rule this manifest breaks; empty when it can be deployed.
+    pub fn problems(&self) -> Vec<ManifestProblem> {
+        let mut problems = Problems(Vec::new());
+        self.check_run(&mut problems);
+        self.check_ready(&mut problems);
+        problems.texts("outputs.paths", &self.outputs.paths);
+        for path in &self.outputs.paths {
+            if path.starts_with('/') || path.split('/').any(|part| part == "..") {
+                problems.add("outputs.paths", format!("{path:?} must stay below the task's directory"));
+            }
+        }
+        problems.texts("requires.ros_distro", &self.requires.ros_distro);
+        problems.texts("requires.arch", &self.requires.arch);
+        problems.texts("exec_depend", &self.exec_depends);
+        if self.parameters.len() > MAX_LIST_LEN || self.parameters.values().any(|p| p.len() > MAX_LIST_LEN) {
+            problems.add("parameters", format!("more than {MAX_LIST_LEN} entries"));
+        }
+        for node in self.parameters.keys() {
+            problems.node_name("parameters", node);
+        }
+        problems.0
+    }
+
+    fn check_run(&self, problems: &mut Problems) {
+        let run = &self.run;
+        match (&run.launch, &run.exec) {
+            (None, None) => problems.add("run", "give either \"launch\" or \"exec\"".to_owned()),
+            (Some(_), Some(_)) => problems.add("run", "\"launch\" and \"exec\" exclude each other".to_owned()),
+            (Some(launch), None) => {
+                problems.texts("run.launch", launch);
+                if launch.iter().any(|part| part.starts_with('-')) {
+                    problems.add("run.launch", "package and file must not start with '-'".to_owned());
+                }
+            }
+            (None, Some(exec)) => {
+                problems.texts("run.exec", exec);
+                if exec.first().is_none_or(String::is_empty) {
+                    problems.add("run.exec", "needs a command".to_owned());
+                }
+                if !run.args.is_empty() {
+                    problems
+                        .add("run.args", "goes with \"launch\"; put a command's arguments into \"exec\"".to_owned());
+                }
+            }
+        }
+        if run.args.len() > MAX_LIST_LEN {
+            problems.add("run.args", format!("more than {MAX_LIST_LEN} entries"));
+        }
+        for (name, value) in &run.args {
+            problems.texts("run.args", [name, value]);
+            if name.is_empty() || name.starts_with('-') || name.contains(":=") {
+                problems.add("run.args", format!("{name:?} is not the name of a launch argument"));
+            }
+        }
+        if !(1..=600).contains(&run.stop_timeout_s) {
+            problems.add("run.stop_timeout_s", "must be between 1 and 600".to_owned());
+        }
+        if run.idempotent && run.kind == TaskKind::Service {
+            problems.add("run.idempotent", "goes with kind = \"job\"".to_owned());
+        }
+    }
+
+    fn check_ready(&self, problems: &mut Problems) {
+        let ready = &self.ready;
+        for (key, nodes) in [("ready.nodes", &ready.nodes), ("ready.lifecycle", &ready.lifecycle)] {
+            problems.texts(key, nodes);
+            for node in nodes {
+                problems.node_name(key, node);
+            }
+        }
+        if !(1..=3600).contains(&ready.timeout_s) {
+            problems.add("ready.timeout_s", "must be between 1 and 3600".to_owned());
+        }
+        if ready.hold_s >= ready.timeout_s {
+            problems.add("ready.hold_s", "must be less than ready.timeout_s".to_owned());
+        }
+    }
+}
+
+struct Problems(Vec<ManifestProblem>);
+
+impl Problems {
+    fn add(&mut self, key: &str, reason: String) {
+        self.0.push(ManifestProblem { key: key.to_owned(), reason });
+    }
+
+    /// Texts end up in a generated script and in argument lists: no NUL, no line breaks, no other control characters.
+    fn texts<T: AsRef<str>>(&mut self, key: &str, texts: impl IntoIterator<Item = T>) {
+        let mut count = 0;
+        for text in texts {
+            let text = text.as_ref();
+            count += 1;
+            if text.chars().any(char::is_control) {
+                self.add(key, format!("{text:?} has a control character"));
+            }
+            if text.len() > MAX_TEXT_BYTES {
+                self.add(key, format!("a text is longer than {MAX_TEXT_BYTES} bytes"));
+            }
+        }
+        if count > MAX_LIST_LEN {
+            self.add(key, format!("more than {MAX_LIST_LEN} entries"));
+        }
+    }
+
+    fn node_name(&mut self, key: &str, name: &str) {
+        let part_ok = |part: &str| {
+            part.bytes().next().is_some_and(|b| b.is_ascii_alphabetic() || b == b'_')
+                && part.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'_')
+        };
+        if !name.strip_prefix('/').is_some_and(|rest| rest.split('/').all(part_ok)) || name.len() > 255 {
+            self.add(key, format!("{name:?} is not a full node name like \"/mapper\""));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn manifest(run: Run) -> TaskManifest {
+        TaskManifest {
+            name: "talker".parse().expect("valid"),
+            version: "1.0.0".parse().expect("valid"),
+            build: Build::default(),
+            run,
+            ready: Ready::default(),
+            parameters: BTreeMap::new(),
+            outputs: Outputs::default(),
+            requires: Requires::default(),
+            exec_depends: Vec::new(),
+            content: ContentFacts { tar_digest: Digest::of(b""), tar_size: 0, entries: 0 },
+        }
+    }
+
+    fn run(exec: &[&str]) -> Run {
+        Run { exec: Some(exec.iter().map(|s| (*s).to_owned()).collect()), ..Run::default() }
+    }
+
+    #[test]
+    fn a_plain_command_has_no_problems() {
+        assert_eq!(manifest(run(&["true"])).problems(), []);
+    }
+
+    #[test]
+    fn problems_name_the_users_key() {
+        let keys = |manifest: &TaskManifest| manifest.problems().into_iter().map(|p| p.key).collect::<Vec<_>>();
+        assert_eq!(keys(&manifest(Run::default())), ["run"]);
+        assert_eq!(keys(&manifest(run(&[]))), ["run.exec"]);
+        assert_eq!(keys(&manifest(run(&["a\nb"]))), ["run.exec"]);
+        let mut odd = manifest(run(&["true"]));
+        odd.ready.nodes = vec!["mapper".to_owned()];
+        odd.outputs.paths = vec!["../secrets".to_owned()];
+        assert_eq!(keys(&odd), ["ready.nodes", "outputs.paths"]);
+    }
+}

@@ -1,0 +1,103 @@
+//! The parts of the OCI image and distribution specifications (v1.1) that taskd writes or reads.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use crate::Digest;
+use crate::desired::BlobRef;
+
+/// Media type of an image manifest, the only kind of manifest a package uses.
+pub const MANIFEST_TYPE: &str = "application/vnd.oci.image.manifest.v1+json";
+/// Media type of an image index; stored for other clients, never deployed.
+pub const INDEX_TYPE: &str = "application/vnd.oci.image.index.v1+json";
+/// `artifactType` of a task package.
+pub const PACKAGE_TYPE: &str = "application/vnd.taskd.package.v1";
+/// Media type of a package's config: a [`crate::manifest::TaskManifest`] as JSON.
+pub const CONFIG_TYPE: &str = "application/vnd.taskd.config.v1+json";
+/// Media type of a package's one layer.
+pub const CONTENT_TYPE: &str = "application/vnd.taskd.content.v1.tar+zstd";
+
+/// An OCI content descriptor.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub struct Descriptor {
+    /// The content's media type.
+    pub media_type: String,
+    /// The content's digest.
+    pub digest: Digest,
+    /// The content's size in bytes.
+    pub size: u64,
+    /// The type of the artifact a manifest descriptor points to (referrers lists).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub artifact_type: Option<String>,
+    /// Free annotations.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub annotations: BTreeMap<String, String>,
+}
+
+impl Descriptor {
+    /// A descriptor without artifact type or annotations.
+    pub fn new(media_type: &str, blob: BlobRef) -> Self {
+        Self {
+            media_type: media_type.to_owned(),
+            digest: blob.digest,
+            size: blob.size,
+            artifact_type: None,
+            annotations: BTreeMap::new(),
+        }
+    }
+
+    /// Digest and size alone.
+    pub fn blob(&self) -> BlobRef {
+        BlobRef { digest: self.digest, size: self.size }
+    }
+}
+
+/// An OCI image manifest.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub struct ImageManifest {
+    /// Always 2.
+    pub schema_version: u32,
+    /// [`MANIFEST_TYPE`]; other writers may leave it out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub media_type: Option<String>,
+    /// What kind of artifact this is.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub artifact_type: Option<String>,
+    /// The config blob.
+    pub config: Descriptor,
+    /// The content blobs.
+    pub layers: Vec<Descriptor>,
+    /// The manifest this one refers to, if any.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub subject: Option<Descriptor>,
+    /// Free annotations.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub annotations: BTreeMap<String, String>,
+}
+
+impl ImageManifest {
+    /// The manifest of a task package.
+    pub fn package(config: BlobRef, content: BlobRef) -> Self {
+        Self {
+            schema_version: 2,
+            media_type: Some(MANIFEST_TYPE.to_owned()),
+            artifact_type: Some(PACKAGE_TYPE.to_owned()),
+            config: Descriptor::new(CONFIG_TYPE, config),
+            layers: vec![Descriptor::new(CONTENT_TYPE, content)],
+            subject: None,
+            annotations: BTreeMap::new(),
+        }
+    }
+
+    /// The config and content blobs, if this is the manifest of a task package.
+    pub fn package_blobs(&self) -> Option<(BlobRef, BlobRef)> {
+        let [content] = &self.layers[..] else { return None };
+        let is_package = self.artifact_type.as_deref() == Some(PACKAGE_TYPE)
+            && self.config.media_type == CONFIG_TYPE
+            && content.media_type == CONTENT_TYPE;
+        is_package.then(|| (self.config.blob(), content.blob()))
+    }
+}

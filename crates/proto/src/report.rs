@@ -1,0 +1,359 @@
+//! What a robot says: whole snapshots of its tasks, ordered by (start, seq), and its connection status.
+//! Times are elapsed milliseconds, because a robot's clock may lie.
+
+use std::borrow::Cow;
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+use crate::desired::{PackageRef, Wanted};
+use crate::manifest::TaskKind;
+use crate::{DeploymentId, Generation, InstanceId, MacAddress, RobotId, TaskName, Version};
+
+/// A robot's whole state. A later one replaces an earlier one; (start, seq) says which is later.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Report {
+    /// Who speaks.
+    pub robot_id: RobotId,
+    /// How many times this robot's agent has been started, from 1; kept in its ledger.
+    pub start: u64,
+    /// This start of the agent. Two instances alive at once are a cloned identity.
+    pub instance: InstanceId,
+    /// The kernel's boot id.
+    pub boot_id: String,
+    /// Counts this instance's reports from 1.
+    pub seq: u64,
+    /// The last generation the robot accepted.
+    pub observed_generation: Generation,
+    /// Milliseconds since this instance started.
+    pub uptime_ms: u64,
+    /// Facts about the machine.
+    pub host: HostFacts,
+    /// Everything out of the ordinary that concerns the robot as a whole.
+    #[serde(default)]
+    pub conditions: Vec<Condition>,
+    /// All tasks in the ledger, sorted by name.
+    pub tasks: Vec<TaskReport>,
+}
+
+/// What the agent found out about its machine.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct HostFacts {
+    /// The agent's version.
+    pub agent_version: String,
+    /// The kernel's host name.
+    pub hostname: String,
+    /// `x86_64`, `aarch64`, …
+    pub arch: String,
+    /// The MAC the robot was registered by.
+    #[serde(default)]
+    pub mac: Option<MacAddress>,
+    /// ROS distributions found, for example `jazzy`.
+    #[serde(default)]
+    pub ros_distros: Vec<String>,
+    /// Free bytes on the data directory's file system.
+    #[serde(default)]
+    pub disk_free_bytes: u64,
+}
+
+/// A condition of the whole robot, with a stable code and a text for people.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Condition {
+    /// For programs: `held`, `state_refused`, `settings_differ`, …
+    pub code: String,
+    /// For people: what and where.
+    pub text: String,
+}
+
+/// One task in a robot's ledger.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct TaskReport {
+    /// The task's name.
+    pub task: TaskName,
+    /// The order this entry is about.
+    pub deployment: DeploymentId,
+    /// The package it ordered.
+    pub package: PackageRef,
+    /// What the desired state last asked for.
+    pub wanted: Wanted,
+    /// The run last asked for.
+    pub run: u64,
+    /// Service or job; unknown until the task manifest is there.
+    #[serde(default)]
+    pub kind: Option<TaskKind>,
+    /// Where it stands.
+    pub phase: Phase,
+    /// Milliseconds it has stood there.
+    pub phase_ms: u64,
+    /// How far the phase has come, where that is known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub progress: Option<Progress>,
+    /// Tries of the current phase, from 1.
+    #[serde(default)]
+    pub attempts: u32,
+    /// Times the restart policy has started the process again in this run.
+    #[serde(default)]
+    pub restarts: u32,
+    /// Why it failed, is unmet or deferred.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub failure: Option<Failure>,
+    /// The version whose process lives, which need not be the one ordered.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub active: Option<ActiveVersion>,
+}
+
+/// The version of a task that is running.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ActiveVersion {
+    /// The order that brought it.
+    pub deployment: DeploymentId,
+    /// Its version.
+    pub version: Version,
+    /// The task's process id on the robot.
+    pub pid: u32,
+}
+
+/// How far a phase has come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Progress {
+    /// Bytes done.
+    pub done: u64,
+    /// Bytes in all.
+    pub total: u64,
+}
+
+/// Where an assignment stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Phase {
+    /// Ordered; the robot has not begun.
+    Assigned,
+    /// The package's bytes are being pulled.
+    Fetching,
+    /// They are being unpacked.
+    Unpacking,
+    /// The build tool runs.
+    Building,
+    /// Ready to start.
+    Staged,
+    /// The process has been started and is not ready yet.
+    Starting,
+    /// It runs and is ready.
+    Running,
+    /// A job ran to its end with exit code 0.
+    Succeeded,
+    /// It ended, or could not go on; see the failure.
+    Failed,
+    /// It was asked to stop, and has.
+    Stopped,
+    /// This robot can't run it.
+    Unmet,
+    /// Not now; it is tried again.
+    Deferred,
+    /// A newer deployment of the same task took its place.
+    Superseded,
+    /// The operator took it back.
+    Cancelled,
+    /// It was not done in time.
+    Expired,
+    /// The new version did not get ready, the old one runs again.
+    RolledBack,
+    /// Written by a newer version of the other side.
+    #[serde(other)]
+    Unknown,
+}
+
+impl Phase {
+    /// Every phase that this version writes, in the order of a life.
+    pub const ALL: [Self; 16] = [
+        Self::Assigned,
+        Self::Fetching,
+        Self::Unpacking,
+        Self::Building,
+        Self::Staged,
+        Self::Starting,
+        Self::Running,
+        Self::Succeeded,
+        Self::Failed,
+        Self::Stopped,
+        Self::Unmet,
+        Self::Deferred,
+        Self::Superseded,
+        Self::Cancelled,
+        Self::Expired,
+        Self::RolledBack,
+    ];
+
+    /// The phase as it is written on the wire and in the database.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Assigned => "assigned",
+            Self::Fetching => "fetching",
+            Self::Unpacking => "unpacking",
+            Self::Building => "building",
+            Self::Staged => "staged",
+            Self::Starting => "starting",
+            Self::Running => "running",
+            Self::Succeeded => "succeeded",
+            Self::Failed => "failed",
+            Self::Stopped => "stopped",
+            Self::Unmet => "unmet",
+            Self::Deferred => "deferred",
+            Self::Superseded => "superseded",
+            Self::Cancelled => "cancelled",
+            Self::Expired => "expired",
+            Self::RolledBack => "rolled_back",
+            Self::Unknown => "unknown",
+        }
+    }
+
+    /// Reads what [`Phase::as_str`] wrote; anything else is `Unknown`.
+    pub fn from_text(text: &str) -> Self {
+        Self::ALL.into_iter().find(|phase| phase.as_str() == text).unwrap_or(Self::Unknown)
+    }
+
+    /// Whether nothing more will happen without a new order.
+    pub fn is_final(self) -> bool {
+        matches!(
+            self,
+            Self::Succeeded
+                | Self::Failed
+                | Self::Stopped
+                | Self::Unmet
+                | Self::Superseded
+                | Self::Cancelled
+                | Self::Expired
+                | Self::RolledBack
+        )
+    }
+
+    /// Whether someone who waits for the order may go: it is final, or a service runs.
+    pub fn is_settled(self, kind: TaskKind) -> bool {
+        self.is_final() || (self == Self::Running && kind == TaskKind::Service)
+    }
+
+    /// Whether a settled order did what it was meant to.
+    pub fn is_success(self, kind: TaskKind) -> bool {
+        match kind {
+            TaskKind::Service => self == Self::Running,
+            TaskKind::Job => self == Self::Succeeded,
+        }
+    }
+}
+
+impl fmt::Display for Phase {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(self.as_str())
+    }
+}
+
+/// Why something failed: a stable code for programs and a text that says what and where.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Failure {
+    /// For programs.
+    pub code: FailureCode,
+    /// For people.
+    pub text: String,
+}
+
+impl Failure {
+    /// A failure with `code` and `text`; control characters, which a package could smuggle in, become spaces.
+    pub fn new(code: FailureCode, text: impl Into<String>) -> Self {
+        let text: String =
+            text.into().chars().map(|c| if c.is_control() && c != '\n' { ' ' } else { c }).take(4096).collect();
+        Self { code, text }
+    }
+}
+
+impl fmt::Display for Failure {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}: {}", self.code.0, self.text)
+    }
+}
+
+/// A failure's stable code. Codes of newer versions pass through unchanged.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct FailureCode(Cow<'static, str>);
+
+/// Declares the failure codes this version gives.
+macro_rules! failure_codes {
+    ($($(#[$doc:meta])* $name:ident = $text:literal;)*) => {
+        impl FailureCode {
+            $($(#[$doc])* pub const $name: Self = Self(Cow::Borrowed($text));)*
+        }
+    };
+}
+
+failure_codes! {
+    /// Too little disk for blob, tree, build and reserve.
+    DISK_FULL = "disk_full";
+    /// The bytes do not hash to the digest that was ordered.
+    DIGEST_MISMATCH = "digest_mismatch";
+    /// The package can't be had from the server: deleted, or access refused.
+    PACKAGE_UNAVAILABLE = "package_unavailable";
+    /// The task manifest does not parse or contradicts the order.
+    MANIFEST_INVALID = "manifest_invalid";
+    /// An archive entry that is not allowed, or more of them than the limits.
+    ARCHIVE_REFUSED = "archive_refused";
+    /// The build tool failed or took too long.
+    BUILD_FAILED = "build_failed";
+    /// The robot lacks what the package requires.
+    REQUIREMENTS_UNMET = "requirements_unmet";
+    /// The process could not be started.
+    START_FAILED = "start_failed";
+    /// The process ended with a code or by a signal.
+    PROCESS_EXITED = "process_exited";
+    /// It was not ready within its time.
+    NOT_READY = "not_ready";
+    /// A job's process was gone after a restart of robot or agent.
+    INTERRUPTED = "interrupted";
+    /// A step did not end within its deadline.
+    DEADLINE_EXCEEDED = "deadline_exceeded";
+    /// The robot's disk or system refused an operation.
+    IO_ERROR = "io_error";
+    /// A person at the robot said `hold`.
+    HELD = "held";
+}
+
+impl FailureCode {
+    /// The code as text.
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+/// A robot's connection state, published by the robot and, with `online` false, by its last will.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Status {
+    /// Whether the robot is connected.
+    pub online: bool,
+    /// The agent's start counter, as in [`Report::start`].
+    pub start: u64,
+    /// The agent's instance.
+    pub instance: InstanceId,
+    /// Counts this instance's connections from 1; a status with a lower one is out of date.
+    pub connection: u64,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn phases_are_the_same_text_everywhere() {
+        for phase in Phase::ALL {
+            assert_eq!(serde_json::to_value(phase).expect("json"), phase.as_str());
+            assert_eq!(Phase::from_text(phase.as_str()), phase);
+        }
+        assert_eq!(serde_json::from_str::<Phase>("\"levitating\"").expect("tolerated"), Phase::Unknown);
+    }
+
+    #[test]
+    fn running_settles_a_service_but_not_a_job() {
+        assert!(Phase::Running.is_settled(TaskKind::Service));
+        assert!(!Phase::Running.is_settled(TaskKind::Job));
+        assert!(Phase::Succeeded.is_success(TaskKind::Job));
+        assert!(!Phase::Succeeded.is_success(TaskKind::Service));
+    }
+}

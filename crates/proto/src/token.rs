@@ -1,0 +1,151 @@
+//! Bearer tokens: `tsko_`, `tske_`, `tskr_` (operator, enrolment, robot), an id, 256 random bits and a CRC-32, so that a
+//! mistyped token is refused before anything is looked up. An enrolment token also carries the server's public key.
+//! Only the SHA-256 of a secret is ever stored; tokens never appear in `Debug` output.
+
+use std::fmt;
+use std::str::FromStr;
+
+use crate::Digest;
+use crate::digest::{hex, unhex};
+use crate::envelope::PublicKey;
+
+/// Whose token it is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum TokenKind {
+    /// A person at the command line or the page.
+    Operator,
+    /// A robot that is about to register.
+    Enrolment,
+    /// A registered robot.
+    Robot,
+}
+
+impl TokenKind {
+    fn prefix(self) -> &'static str {
+        match self {
+            Self::Operator => "tsko",
+            Self::Enrolment => "tske",
+            Self::Robot => "tskr",
+        }
+    }
+}
+
+/// A token with its secret. Write it only to a file of mode 0600 or to the person it is made for.
+#[derive(Clone, PartialEq, Eq)]
+pub struct Token {
+    kind: TokenKind,
+    id: [u8; 6],
+    secret: [u8; 32],
+    server_key: Option<PublicKey>,
+}
+
+/// A text that is not a token.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("not a token: a character is missing or wrong (a token starts with tsko_, tske_ or tskr_)")]
+pub struct InvalidToken;
+
+impl Token {
+    /// A fresh operator's or robot's token.
+    pub fn random(kind: TokenKind) -> Self {
+        Self { kind, id: rand::random(), secret: rand::random(), server_key: None }
+    }
+
+    /// A fresh enrolment token that pins `server_key`.
+    pub fn random_enrolment(server_key: PublicKey) -> Self {
+        Self { server_key: Some(server_key), ..Self::random(TokenKind::Enrolment) }
+    }
+
+    /// Whose token it is.
+    pub fn kind(&self) -> TokenKind {
+        self.kind
+    }
+
+    /// The public part, 12 hex digits, by which the token is listed, looked up and revoked.
+    pub fn id(&self) -> String {
+        hex(&self.id)
+    }
+
+    /// What is stored and compared: the SHA-256 of the secret.
+    pub fn secret_digest(&self) -> Digest {
+        Digest::of(&self.secret)
+    }
+
+    /// The pinned server key of an enrolment token.
+    pub fn server_key(&self) -> Option<&PublicKey> {
+        self.server_key.as_ref()
+    }
+
+    /// The token's full text, secret included.
+    pub fn reveal(&self) -> String {
+        let body = self.body();
+        let checksum = crc32fast::hash(body.as_bytes());
+        format!("{body}_{checksum:08x}")
+    }
+
+    fn body(&self) -> String {
+        let mut body = format!("{}_{}_{}", self.kind.prefix(), hex(&self.id), hex(&self.secret));
+        if let Some(key) = &self.server_key {
+            body.push('_');
+            body.push_str(&hex(&key.to_bytes()));
+        }
+        body
+    }
+}
+
+impl FromStr for Token {
+    type Err = InvalidToken;
+    fn from_str(text: &str) -> Result<Self, InvalidToken> {
+        let (body, checksum) = text.trim().rsplit_once('_').ok_or(InvalidToken)?;
+        if checksum != format!("{:08x}", crc32fast::hash(body.as_bytes())) {
+            return Err(InvalidToken);
+        }
+        let fields: Vec<&str> = body.split('_').collect();
+        let (kind, server_key) = match fields[..] {
+            ["tsko", _, _] => (TokenKind::Operator, None),
+            ["tskr", _, _] => (TokenKind::Robot, None),
+            ["tske", _, _, key] => {
+                let key = unhex(key).and_then(PublicKey::from_bytes).ok_or(InvalidToken)?;
+                (TokenKind::Enrolment, Some(key))
+            }
+            _ => return Err(InvalidToken),
+        };
+        let id = unhex(fields[1]).ok_or(InvalidToken)?;
+        let secret = unhex(fields[2]).ok_or(InvalidToken)?;
+        Ok(Self { kind, id, secret, server_key })
+    }
+}
+
+impl fmt::Debug for Token {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}_{}_…", self.kind.prefix(), self.id())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::envelope::SigningKey;
+
+    #[test]
+    fn tokens_parse_back_and_hide_their_secret() {
+        let key = SigningKey::random().public_key();
+        for token in [Token::random(TokenKind::Operator), Token::random(TokenKind::Robot), Token::random_enrolment(key)]
+        {
+            let text = token.reveal();
+            assert_eq!(text.parse(), Ok(token.clone()));
+            assert!(!format!("{token:?}").contains(&text[18..40]));
+        }
+    }
+
+    #[test]
+    fn one_wrong_character_is_noticed() {
+        let text = Token::random(TokenKind::Robot).reveal();
+        for at in 0..text.len() {
+            let mut bytes = text.clone().into_bytes();
+            bytes[at] = if bytes[at] == b'0' { b'1' } else { b'0' };
+            let broken = String::from_utf8(bytes).expect("ascii");
+            assert_eq!(broken.parse::<Token>(), Err(InvalidToken), "at {at}");
+        }
+        assert_eq!("".parse::<Token>(), Err(InvalidToken));
+    }
+}

@@ -1,0 +1,3 @@
+//! The `taskd` binary: parses the command line and hands over. It never holds logic of its own.
+
+fn main() {}

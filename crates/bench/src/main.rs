@@ -1,3 +1,3 @@
-//! The binary.
+//! The `taskbench` binary.
 
 fn main() {}

@@ -1,1 +1,3 @@
 //! The robot's half: everything `task-agent` does. Imports run downward only; see ARCHITECTURE.md.
+
+pub mod commands;

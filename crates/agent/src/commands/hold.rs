@@ -1,0 +1,35 @@
+//! `task-agent hold` and `release`: a person at the robot has the last word. A flag file in the data directory, so that
+//! both work without server and without a running agent.
+
+use std::process::ExitCode;
+
+use anyhow::Context as _;
+
+use super::DataDir;
+
+/// Arguments of `hold` and of `release`.
+#[derive(Debug, clap::Args)]
+pub struct Arguments {
+    #[command(flatten)]
+    data: DataDir,
+}
+
+/// The flag file's name in the data directory.
+pub const FLAG_FILE: &str = "hold";
+
+/// From now on nothing is started or switched.
+pub fn hold(arguments: Arguments) -> anyhow::Result<ExitCode> {
+    let path = arguments.data.data.join(FLAG_FILE);
+    std::fs::write(&path, b"").with_context(|| format!("cannot write {}", path.display()))?;
+    Ok(ExitCode::SUCCESS)
+}
+
+/// From now on orders are followed again.
+pub fn release(arguments: Arguments) -> anyhow::Result<ExitCode> {
+    let path = arguments.data.data.join(FLAG_FILE);
+    match std::fs::remove_file(&path) {
+        Ok(()) => Ok(ExitCode::SUCCESS),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(ExitCode::SUCCESS),
+        Err(error) => Err(error).with_context(|| format!("cannot remove {}", path.display())),
+    }
+}

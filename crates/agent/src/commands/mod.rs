@@ -1,0 +1,28 @@
+//! The subcommands of `task-agent`: each turns its arguments into one call and the outcome into an exit code.
+//! They are the only place beside `main` that uses `anyhow` and prints.
+
+use std::path::PathBuf;
+
+pub mod configure;
+pub mod enroll;
+pub mod hold;
+pub mod run;
+pub mod shim;
+pub mod status;
+
+/// Where a robot keeps everything, unless `--data` or `TASK_AGENT_DATA` say otherwise.
+pub const DEFAULT_DATA_DIR: &str = "/var/lib/task-agent";
+
+/// The data directory, which every subcommand takes.
+#[derive(Debug, Clone, clap::Args)]
+pub struct DataDir {
+    /// Directory of the robot's identity, settings, ledger and tasks
+    #[arg(long, env = "TASK_AGENT_DATA", value_name = "DIR", default_value = DEFAULT_DATA_DIR)]
+    pub data: PathBuf,
+}
+
+/// Prints an error and its whole chain of causes on stderr.
+#[expect(clippy::print_stderr, reason = "this is where the binary reports its failure to a person")]
+pub fn print_error(error: &anyhow::Error) {
+    eprintln!("task-agent: {error:#}");
+}

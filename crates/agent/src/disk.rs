@@ -1,0 +1,112 @@
+//! Whether a package fits on the disk: blob, unpacked tree, build and a reserve, checked before anything travels.
+//! It never frees anything.
+
+use std::io;
+use std::path::Path;
+
+use task_proto::desired::PackageRef;
+use task_proto::manifest::{BuildTool, TaskManifest};
+
+/// What a file costs beyond its bytes: a block that is only partly used, and an inode.
+const BYTES_PER_ENTRY: u64 = 4096 + 256;
+/// A build and its install tree together take about this many times the sources.
+const BUILD_FACTOR: u64 = 2;
+
+/// The bytes that one package needs, by what they are for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Need {
+    /// The compressed content, as far as it is not there yet.
+    pub blob: u64,
+    /// The unpacked tree.
+    pub tree: u64,
+    /// Build and install trees.
+    pub build: u64,
+    /// What must stay free for everything else on the machine.
+    pub reserve: u64,
+}
+
+/// There is not enough room. Its text is the failure's text and has all the figures.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "{free} of {total} bytes are free, {} are needed: {} for the package, {} for its tree, {} for the build, {} in reserve",
+    need.total(), need.blob, need.tree, need.build, need.reserve
+)]
+pub struct DiskFull {
+    /// Free bytes on the data directory's file system.
+    pub free: u64,
+    /// Its size.
+    pub total: u64,
+    /// What it would have taken.
+    pub need: Need,
+}
+
+/// Room on a file system.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Room {
+    /// Bytes that an ordinary user may still write.
+    pub free: u64,
+    /// Bytes in all.
+    pub total: u64,
+}
+
+impl Need {
+    /// What `package` needs when `present` bytes of its content are there already.
+    pub fn of(package: &PackageRef, manifest: &TaskManifest, present: u64, reserve: u64) -> Self {
+        let facts = &manifest.content;
+        let tree = facts.tar_size.saturating_add(facts.entries.saturating_mul(BYTES_PER_ENTRY));
+        let build = match manifest.build.tool {
+            BuildTool::Colcon | BuildTool::Catkin => tree.saturating_mul(BUILD_FACTOR),
+            BuildTool::None => 0,
+        };
+        Self { blob: package.content.size.saturating_sub(present), tree, build, reserve }
+    }
+
+    /// All of it.
+    pub fn total(&self) -> u64 {
+        [self.tree, self.build, self.reserve].into_iter().fold(self.blob, u64::saturating_add)
+    }
+
+    /// Whether it fits into `room`.
+    pub fn check(self, room: Room) -> Result<(), DiskFull> {
+        if self.total() <= room.free {
+            return Ok(());
+        }
+        Err(DiskFull { free: room.free, total: room.total, need: self })
+    }
+}
+
+/// The room on the file system that holds `path`.
+pub fn room(path: &Path) -> io::Result<Room> {
+    let stat = nix::sys::statvfs::statvfs(path)?;
+    let block = stat.fragment_size();
+    Ok(Room { free: stat.blocks_available().saturating_mul(block), total: stat.blocks().saturating_mul(block) })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const NEED: Need = Need { blob: 10, tree: 20, build: 40, reserve: 30 };
+
+    #[test]
+    fn the_refusal_has_the_figures() {
+        assert_eq!(NEED.check(Room { free: 100, total: 500 }), Ok(()));
+        let full = NEED.check(Room { free: 99, total: 500 }).unwrap_err();
+        assert_eq!(
+            full.to_string(),
+            "99 of 500 bytes are free, 100 are needed: 10 for the package, 20 for its tree, 40 for the build, 30 in reserve"
+        );
+    }
+
+    #[test]
+    fn absurd_sizes_never_wrap() {
+        let need = Need { blob: u64::MAX, tree: u64::MAX, ..NEED };
+        assert!(need.check(Room { free: u64::MAX - 1, total: u64::MAX }).is_err());
+    }
+
+    #[test]
+    fn a_real_file_system_has_room() {
+        let room = room(Path::new("/")).unwrap();
+        assert!(room.free <= room.total && room.total > 0);
+    }
+}

@@ -1,0 +1,257 @@
+//! Where everything lies in the agent's data directory:
+//!
+//! ```text
+//! identity.json                     who this robot is (0600)
+//! ledger.json                       what the agent was doing
+//! blobs/sha256/<hex>.part           bytes of a package's content that have arrived so far
+//! staging/                          trees being unpacked; emptied at every start
+//! tasks/<name>/current              link to the active version
+//! tasks/<name>/run/                 the shim's files: pid, exit status
+//! tasks/<name>/logs/                the task's and the build's output
+//! tasks/<name>/<hex>/               one version, by the digest of its OCI manifest
+//!   task.json                       the task manifest, byte for byte as it was pulled
+//!   src/  build/  install/  run.sh
+//! ```
+//!
+//! It owns names, and what may be cleaned away; what is in the files is their owners' affair.
+
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use task_proto::{Digest, TaskName};
+
+use crate::durable;
+
+/// The agent's data directory.
+#[derive(Debug, Clone)]
+pub struct DataDir {
+    root: PathBuf,
+}
+
+/// What belongs to one task.
+#[derive(Debug, Clone)]
+pub struct TaskDir {
+    root: PathBuf,
+}
+
+/// What belongs to one version of a task.
+#[derive(Debug, Clone)]
+pub struct VersionDir {
+    root: PathBuf,
+}
+
+impl DataDir {
+    /// The directory at `root`, which is made absolute; nothing is created yet.
+    pub fn new(root: &Path) -> io::Result<Self> {
+        Ok(Self { root: std::path::absolute(root)? })
+    }
+
+    /// The directory itself.
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// Who this robot is.
+    pub fn identity(&self) -> PathBuf {
+        self.root.join("identity.json")
+    }
+
+    /// What the agent was doing.
+    pub fn ledger(&self) -> PathBuf {
+        self.root.join("ledger.json")
+    }
+
+    /// Where a blob's bytes gather while they are being pulled.
+    pub fn blob_part(&self, digest: &Digest) -> PathBuf {
+        self.blobs().join(format!("{}.part", digest.hex()))
+    }
+
+    /// Where trees are unpacked before they get their place.
+    pub fn staging(&self) -> PathBuf {
+        self.root.join("staging")
+    }
+
+    /// One task's directory.
+    pub fn task(&self, name: &TaskName) -> TaskDir {
+        TaskDir { root: self.tasks().join(name.as_str()) }
+    }
+
+    /// Removes what an agent that died left half done. Only at start: a pull in progress would lose its tree.
+    pub fn clean_staging(&self) -> io::Result<()> {
+        durable::remove_dir_all(&self.staging())
+    }
+
+    /// Removes all gathered bytes except those of the blobs in `wanted`.
+    pub fn clean_parts(&self, wanted: &[Digest]) -> io::Result<()> {
+        let keep: Vec<PathBuf> = wanted.iter().map(|digest| self.blob_part(digest)).collect();
+        for path in entries(&self.blobs())? {
+            if !keep.contains(&path) {
+                durable::remove_file(&path)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// The names of all tasks that have a directory.
+    pub fn task_names(&self) -> io::Result<Vec<TaskName>> {
+        Ok(entries(&self.tasks())?.iter().filter_map(|path| file_name(path)?.parse().ok()).collect())
+    }
+
+    fn blobs(&self) -> PathBuf {
+        self.root.join("blobs").join("sha256")
+    }
+
+    fn tasks(&self) -> PathBuf {
+        self.root.join("tasks")
+    }
+}
+
+impl TaskDir {
+    /// The directory itself.
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// The shim's files.
+    pub fn run(&self) -> PathBuf {
+        self.root.join("run")
+    }
+
+    /// The task's and the build's output.
+    pub fn logs(&self) -> PathBuf {
+        self.root.join("logs")
+    }
+
+    /// The version whose package has this manifest digest.
+    pub fn version(&self, manifest: &Digest) -> VersionDir {
+        VersionDir { root: self.root.join(manifest.hex()) }
+    }
+
+    /// The version that `current` points to.
+    pub fn current(&self) -> Option<Digest> {
+        digest_of(&fs::read_link(self.current_link()).ok()?)
+    }
+
+    /// Points `current` to a version.
+    pub fn set_current(&self, manifest: &Digest) -> io::Result<()> {
+        durable::write_link(&self.current_link(), Path::new(&manifest.hex()))
+    }
+
+    /// Every version that has a directory.
+    pub fn versions(&self) -> io::Result<Vec<Digest>> {
+        Ok(entries(&self.root)?.iter().filter_map(|path| digest_of(path)).collect())
+    }
+
+    /// Removes every version except those in `kept` and the current one.
+    pub fn prune(&self, kept: &[Digest]) -> io::Result<()> {
+        let current = self.current();
+        for digest in self.versions()? {
+            if !kept.contains(&digest) && current != Some(digest) {
+                durable::remove_dir_all(self.version(&digest).root())?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Removes the task with all it left.
+    pub fn remove(&self) -> io::Result<()> {
+        durable::remove_dir_all(&self.root)
+    }
+
+    fn current_link(&self) -> PathBuf {
+        self.root.join("current")
+    }
+}
+
+impl VersionDir {
+    /// The directory itself.
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// The task manifest, byte for byte as it was pulled.
+    pub fn manifest(&self) -> PathBuf {
+        self.root.join("task.json")
+    }
+
+    /// The unpacked package. It exists only whole: it is renamed here when all of it is on the disk.
+    pub fn src(&self) -> PathBuf {
+        self.root.join("src")
+    }
+
+    /// The build tool's intermediate files.
+    pub fn build(&self) -> PathBuf {
+        self.root.join("build")
+    }
+
+    /// What was built.
+    pub fn install(&self) -> PathBuf {
+        self.root.join("install")
+    }
+
+    /// The generated script that starts the task.
+    pub fn run_script(&self) -> PathBuf {
+        self.root.join("run.sh")
+    }
+}
+
+/// A directory's entries, sorted; none if it is not there.
+fn entries(dir: &Path) -> io::Result<Vec<PathBuf>> {
+    let listing = match fs::read_dir(dir) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+        other => other?,
+    };
+    let mut paths = listing.map(|entry| Ok(entry?.path())).collect::<io::Result<Vec<_>>>()?;
+    paths.sort();
+    Ok(paths)
+}
+
+fn file_name(path: &Path) -> Option<&str> {
+    path.file_name()?.to_str()
+}
+
+fn digest_of(path: &Path) -> Option<Digest> {
+    format!("sha256:{}", file_name(path)?).parse().ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pruning_keeps_the_current_version_and_those_named() {
+        let dir = tempfile::tempdir().unwrap();
+        let data = DataDir::new(dir.path()).unwrap();
+        let task = data.task(&"talker".parse().unwrap());
+        let [old, previous, current] = [b"1", b"2", b"3"].map(|bytes| Digest::of(bytes));
+        for digest in [old, previous, current] {
+            durable::create_dir_all(&task.version(&digest).src()).unwrap();
+        }
+        assert_eq!(task.current(), None);
+        task.set_current(&old).unwrap();
+        task.set_current(&current).unwrap();
+        task.prune(&[previous]).unwrap();
+        let mut left = vec![previous, current];
+        left.sort();
+        assert_eq!((task.current(), task.versions().unwrap()), (Some(current), left));
+        assert_eq!(data.task_names().unwrap(), ["talker".parse().unwrap()]);
+        task.remove().unwrap();
+        assert_eq!(data.task_names().unwrap(), []);
+    }
+
+    #[test]
+    fn cleaning_keeps_wanted_parts_only() {
+        let dir = tempfile::tempdir().unwrap();
+        let data = DataDir::new(dir.path()).unwrap();
+        let (wanted, other) = (Digest::of(b"wanted"), Digest::of(b"other"));
+        data.clean_parts(&[]).unwrap();
+        data.clean_staging().unwrap();
+        durable::create_dir_all(&data.blobs()).unwrap();
+        for digest in [wanted, other] {
+            fs::write(data.blob_part(&digest), "…").unwrap();
+        }
+        data.clean_parts(&[wanted]).unwrap();
+        assert!(data.blob_part(&wanted).exists() && !data.blob_part(&other).exists());
+    }
+}

@@ -1,1 +1,5 @@
 //! The server half: everything `taskd` does. Imports run downward only; see ARCHITECTURE.md.
+
+pub mod clock;
+pub mod config;
+pub mod http;

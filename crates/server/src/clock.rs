@@ -1,0 +1,65 @@
+//! What time it is, in milliseconds since the Unix epoch. Nothing else reads the system's clock; whoever needs the time
+//! is given a `Clock` or a number. It never waits: waiting is tokio's.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+/// A source of the time. Clones of a fixed clock move together.
+#[derive(Debug, Clone)]
+pub struct Clock(Source);
+
+#[derive(Debug, Clone)]
+enum Source {
+    System,
+    Fixed(Arc<AtomicU64>),
+}
+
+impl Clock {
+    /// The machine's clock.
+    pub fn system() -> Self {
+        Self(Source::System)
+    }
+
+    /// A clock that stands at `now_ms` until it is moved with [`Clock::advance_ms`].
+    pub fn fixed(now_ms: u64) -> Self {
+        Self(Source::Fixed(Arc::new(AtomicU64::new(now_ms))))
+    }
+
+    /// Milliseconds since the Unix epoch; zero on a machine whose clock stands before it.
+    #[expect(clippy::disallowed_methods, reason = "this is the one module that reads the time")]
+    pub fn now_ms(&self) -> u64 {
+        match &self.0 {
+            Source::System => {
+                let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+                u64::try_from(since.as_millis()).unwrap_or(u64::MAX)
+            }
+            Source::Fixed(now_ms) => now_ms.load(Ordering::SeqCst),
+        }
+    }
+
+    /// Moves a fixed clock forward; the machine's own is not ours to move.
+    pub fn advance_ms(&self, by_ms: u64) {
+        if let Source::Fixed(now_ms) = &self.0 {
+            now_ms.fetch_add(by_ms, Ordering::SeqCst);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn clones_of_a_fixed_clock_move_together() {
+        let clock = Clock::fixed(1_000);
+        let other = clock.clone();
+        clock.advance_ms(500);
+        assert_eq!(other.now_ms(), 1_500);
+    }
+
+    #[test]
+    fn the_system_clock_is_past_2020() {
+        assert!(Clock::system().now_ms() > 1_577_836_800_000);
+    }
+}

@@ -1,0 +1,583 @@
+//! The server's settings and where they come from: flags, then `TASKD_*` variables, then a TOML file, then defaults.
+//! One table names every setting, so the three sources can't drift apart. It reads the file it is pointed to and
+//! resolves host names; it never creates anything.
+
+use std::ffi::OsString;
+use std::net::{SocketAddr, ToSocketAddrs as _};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use clap::{Arg, ArgAction, ArgMatches};
+use task_proto::topic::TopicPrefix;
+
+/// Everything `taskd serve` can be told.
+#[derive(Debug, Clone)]
+pub struct Config {
+    /// The directory that holds all state.
+    pub data: PathBuf,
+    /// Where HTTP listens; port 0 takes a free one.
+    pub http: SocketAddr,
+    /// Where MQTT listens; port 0 takes a free one.
+    pub mqtt: SocketAddr,
+    /// The database's URL; absent: SQLite in the data directory.
+    pub database: Option<String>,
+    /// What all MQTT topics start with.
+    pub topic_prefix: TopicPrefix,
+    /// Whether unencrypted listeners may be reached from other machines.
+    pub allow_plaintext: bool,
+    /// How long an assignment may stay undone.
+    pub assignment_expiry: Duration,
+    /// How long a signed desired state allows new work to be begun.
+    pub desired_lifetime: Duration,
+    /// The MQTT host robots are told; absent: the host of the URL they already use.
+    pub public_mqtt_host: Option<String>,
+    /// The MQTT port robots are told; absent: the one that is bound.
+    pub public_mqtt_port: Option<u16>,
+    /// After how long a silent robot that polls counts as offline, and robots are told to poll at a third of it.
+    pub presence_timeout: Duration,
+    /// How blobs are read.
+    pub blob_read: BlobRead,
+    /// How long an unfinished upload or an unreferenced blob is kept.
+    pub blob_grace: Duration,
+    /// The most HTTP connections at once; more wait in the listener's backlog.
+    pub max_http_connections: usize,
+    /// The most MQTT connections at once; more are refused.
+    pub max_mqtt_connections: usize,
+    /// The most bytes one blob may have.
+    pub max_blob_bytes: u64,
+}
+
+/// How the blob handler gets at a file's bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum BlobRead {
+    /// Through the page cache, mapped into memory: fastest.
+    Mmap,
+    /// By positioned reads: a disk error is an error instead of a signal.
+    Pread,
+}
+
+/// Where a setting was read.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Origin {
+    /// A command line flag.
+    Flag(String),
+    /// An environment variable.
+    Variable(String),
+    /// A key in a file.
+    File {
+        /// The key.
+        key: String,
+        /// The file.
+        path: PathBuf,
+    },
+}
+
+impl std::fmt::Display for Origin {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Flag(flag) => f.write_str(flag),
+            Self::Variable(name) => f.write_str(name),
+            Self::File { key, path } => write!(f, "{key} in {}", path.display()),
+        }
+    }
+}
+
+/// Settings that can't be used.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// A value does not parse.
+    #[error("{origin}: {reason}")]
+    Value {
+        /// Where it stands.
+        origin: Origin,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// A setting that does not exist.
+    #[error("{origin}: there is no such setting{hint}")]
+    Unknown {
+        /// Where it stands.
+        origin: Origin,
+        /// The setting that was probably meant, if one is close.
+        hint: String,
+    },
+    /// The file can't be read.
+    #[error("can't read the configuration file {}", path.display())]
+    Unreadable {
+        /// Which.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// The file is not TOML.
+    #[error("{} is not valid TOML: {reason}", path.display())]
+    Syntax {
+        /// Which.
+        path: PathBuf,
+        /// Where and why.
+        reason: String,
+    },
+    /// No data directory is given and there is no home to put it in.
+    #[error("--data: no directory is given, and neither XDG_DATA_HOME nor HOME says where to put one")]
+    NoDataDirectory,
+    /// An unencrypted listener would be reachable from other machines.
+    #[error(
+        "{key} = {address}: unencrypted connections from other machines are refused; bind a loopback address or \
+         give --allow-plaintext"
+    )]
+    Plaintext {
+        /// Which listener.
+        key: &'static str,
+        /// Its address.
+        address: SocketAddr,
+    },
+}
+
+/// One setting. `topic-prefix` is the flag's name; the file's key is `topic_prefix`, the variable `TASKD_TOPIC_PREFIX`.
+struct Setting {
+    name: &'static str,
+    value_name: &'static str,
+    help: &'static str,
+    set: fn(&mut Config, &str) -> Result<(), String>,
+}
+
+impl Setting {
+    fn key(&self) -> String {
+        self.name.replace('-', "_")
+    }
+
+    fn by_key(key: &str) -> Option<&'static Self> {
+        SETTINGS.iter().find(|setting| setting.key() == key)
+    }
+}
+
+const SETTINGS: &[Setting] = &[
+    Setting {
+        name: "data",
+        value_name: "DIR",
+        help: "Directory that holds all state; created on the first start [default: ~/.local/share/taskd]",
+        set: |config, text| {
+            config.data = PathBuf::from(non_empty(text)?);
+            Ok(())
+        },
+    },
+    Setting {
+        name: "http",
+        value_name: "ADDR",
+        help: "Where HTTP listens; port 0 takes a free one [default: 127.0.0.1:8080]",
+        set: |config, text| address(text).map(|address| config.http = address),
+    },
+    Setting {
+        name: "mqtt",
+        value_name: "ADDR",
+        help: "Where MQTT listens; port 0 takes a free one [default: 127.0.0.1:1883]",
+        set: |config, text| address(text).map(|address| config.mqtt = address),
+    },
+    Setting {
+        name: "database",
+        value_name: "URL",
+        help: "sqlite:PATH or postgres://… [default: SQLite in the data directory]",
+        set: |config, text| database_url(text).map(|url| config.database = Some(url)),
+    },
+    Setting {
+        name: "topic-prefix",
+        value_name: "PREFIX",
+        help: "What all MQTT topics start with [default: taskd/v1]",
+        set: |config, text| parsed(text).map(|prefix| config.topic_prefix = prefix),
+    },
+    Setting {
+        name: "allow-plaintext",
+        value_name: "BOOL",
+        help: "Let unencrypted listeners be reached from other machines",
+        set: |config, text| boolean(text).map(|allow| config.allow_plaintext = allow),
+    },
+    Setting {
+        name: "assignment-expiry",
+        value_name: "TIME",
+        help: "How long an assignment may stay undone [default: 7d]",
+        set: |config, text| lifetime(text).map(|time| config.assignment_expiry = time),
+    },
+    Setting {
+        name: "desired-lifetime",
+        value_name: "TIME",
+        help: "How long a signed desired state allows new work to be begun [default: 30d]",
+        set: |config, text| lifetime(text).map(|time| config.desired_lifetime = time),
+    },
+    Setting {
+        name: "public-mqtt-host",
+        value_name: "HOST",
+        help: "MQTT host that robots are told [default: the host of the URL they use]",
+        set: |config, text| {
+            config.public_mqtt_host = Some(non_empty(text)?);
+            Ok(())
+        },
+    },
+    Setting {
+        name: "public-mqtt-port",
+        value_name: "PORT",
+        help: "MQTT port that robots are told [default: the port that is bound]",
+        set: |config, text| match text.parse() {
+            Ok(port) if port > 0 => {
+                config.public_mqtt_port = Some(port);
+                Ok(())
+            }
+            _ => Err(format!("{text:?} is not a port: expected 1 to 65535")),
+        },
+    },
+    Setting {
+        name: "presence-timeout",
+        value_name: "TIME",
+        help: "After how long a silent robot that polls counts as offline [default: 90s]",
+        set: |config, text| lifetime(text).map(|time| config.presence_timeout = time),
+    },
+    Setting {
+        name: "blob-read",
+        value_name: "mmap|pread",
+        help: "How blobs are read [default: mmap]",
+        set: |config, text| {
+            config.blob_read = match text {
+                "mmap" => BlobRead::Mmap,
+                "pread" => BlobRead::Pread,
+                _ => return Err(format!("{text:?} is neither \"mmap\" nor \"pread\"")),
+            };
+            Ok(())
+        },
+    },
+    Setting {
+        name: "blob-grace",
+        value_name: "TIME",
+        help: "How long unfinished uploads and unreferenced blobs are kept [default: 1d]",
+        set: |config, text| lifetime(text).map(|time| config.blob_grace = time),
+    },
+    Setting {
+        name: "max-http-connections",
+        value_name: "N",
+        help: "Most HTTP connections at once [default: 20000]",
+        set: |config, text| count(text, 1_000_000).map(|n| config.max_http_connections = n as usize),
+    },
+    Setting {
+        name: "max-mqtt-connections",
+        value_name: "N",
+        help: "Most MQTT connections at once [default: 20000]",
+        set: |config, text| count(text, 1_000_000).map(|n| config.max_mqtt_connections = n as usize),
+    },
+    Setting {
+        name: "max-blob-bytes",
+        value_name: "BYTES",
+        help: "Most bytes of one blob [default: 17179869184]",
+        set: |config, text| count(text, 1 << 50).map(|n| config.max_blob_bytes = n),
+    },
+];
+
+/// Variables that other commands and tasks use; `serve` is not confused by finding them.
+const FOREIGN_VARIABLES: [&str; 4] = ["TASKD_SERVER", "TASKD_TOKEN", "TASKD_ASSIGNMENT", "TASKD_LOG"];
+/// What the test suite's own variables start with.
+const TEST_VARIABLES: &str = "TASKD_TEST_";
+/// The largest configuration file that is read.
+const MAX_FILE_BYTES: u64 = 1024 * 1024;
+
+impl Config {
+    /// The defaults, with all state in `data`.
+    pub fn with_data(data: PathBuf) -> Self {
+        const DAY: Duration = Duration::from_secs(24 * 60 * 60);
+        Self {
+            data,
+            http: SocketAddr::from(([127, 0, 0, 1], 8080)),
+            mqtt: SocketAddr::from(([127, 0, 0, 1], 1883)),
+            database: None,
+            topic_prefix: TopicPrefix::default(),
+            allow_plaintext: false,
+            assignment_expiry: 7 * DAY,
+            desired_lifetime: 30 * DAY,
+            public_mqtt_host: None,
+            public_mqtt_port: None,
+            presence_timeout: Duration::from_secs(90),
+            blob_read: BlobRead::Mmap,
+            blob_grace: DAY,
+            max_http_connections: 20_000,
+            max_mqtt_connections: 20_000,
+            max_blob_bytes: 16 << 30,
+        }
+    }
+
+    /// Merges the sources. `environment` is the process's, handed in so that tests need not change it.
+    pub fn load(
+        flags: &ServeFlags,
+        environment: impl IntoIterator<Item = (OsString, OsString)>,
+    ) -> Result<Self, ConfigError> {
+        let environment: Vec<(OsString, OsString)> = environment.into_iter().collect();
+        let variable = |name: &str| environment.iter().find(|(key, _)| key == name).map(|(_, value)| value.clone());
+        let mut config = Self::with_data(PathBuf::new());
+        let file = flags.config.clone().or_else(|| variable("TASKD_CONFIG").map(PathBuf::from));
+        if let Some(path) = file {
+            config.apply_file(&path)?;
+        }
+        config.apply_environment(&environment)?;
+        for (name, text) in &flags.settings {
+            config.apply(&name.replace('-', "_"), text, Origin::Flag(format!("--{name}")))?;
+        }
+        if config.data.as_os_str().is_empty() {
+            config.data = default_data_directory(variable).ok_or(ConfigError::NoDataDirectory)?;
+        }
+        for (key, address) in [("http", config.http), ("mqtt", config.mqtt)] {
+            if !address.ip().is_loopback() && !config.allow_plaintext {
+                return Err(ConfigError::Plaintext { key, address });
+            }
+        }
+        Ok(config)
+    }
+
+    /// The database's URL, with the default filled in.
+    pub fn database_url(&self) -> String {
+        self.database.clone().unwrap_or_else(|| format!("sqlite:{}", self.data.join("taskd.sqlite").display()))
+    }
+
+    fn apply(&mut self, key: &str, text: &str, origin: Origin) -> Result<(), ConfigError> {
+        let Some(setting) = Setting::by_key(key) else {
+            return Err(ConfigError::Unknown { hint: nearest(key), origin });
+        };
+        (setting.set)(self, text).map_err(|reason| ConfigError::Value { origin, reason })
+    }
+
+    fn apply_file(&mut self, path: &Path) -> Result<(), ConfigError> {
+        let unreadable = |source| ConfigError::Unreadable { path: path.to_owned(), source };
+        let syntax = |reason| ConfigError::Syntax { path: path.to_owned(), reason };
+        if std::fs::metadata(path).map_err(unreadable)?.len() > MAX_FILE_BYTES {
+            return Err(syntax(format!("it has more than {MAX_FILE_BYTES} bytes")));
+        }
+        let text = std::fs::read_to_string(path).map_err(unreadable)?;
+        let table: toml::Table = text.parse().map_err(|error: toml::de::Error| syntax(error.to_string()))?;
+        for (key, value) in table {
+            let text = match value {
+                toml::Value::String(text) => text,
+                toml::Value::Integer(number) => number.to_string(),
+                toml::Value::Boolean(yes) => yes.to_string(),
+                other => {
+                    let origin = Origin::File { key: key.clone(), path: path.to_owned() };
+                    if Setting::by_key(&key).is_none() {
+                        return Err(ConfigError::Unknown { hint: nearest(&key), origin });
+                    }
+                    let reason =
+                        format!("expected a text, a whole number or a truth value, not a {}", other.type_str());
+                    return Err(ConfigError::Value { origin, reason });
+                }
+            };
+            self.apply(&key, &text, Origin::File { key: key.clone(), path: path.to_owned() })?;
+        }
+        Ok(())
+    }
+
+    fn apply_environment(&mut self, environment: &[(OsString, OsString)]) -> Result<(), ConfigError> {
+        for (name, value) in environment {
+            let Some(name) = name.to_str().filter(|name| name.starts_with("TASKD_")) else { continue };
+            if name == "TASKD_CONFIG" || FOREIGN_VARIABLES.contains(&name) || name.starts_with(TEST_VARIABLES) {
+                continue;
+            }
+            let origin = Origin::Variable(name.to_owned());
+            let Some(text) = value.to_str() else {
+                return Err(ConfigError::Value { origin, reason: "the value is not UTF-8".to_owned() });
+            };
+            self.apply(&name["TASKD_".len()..].to_ascii_lowercase(), text, origin)?;
+        }
+        Ok(())
+    }
+}
+
+/// The data directory of someone who names none.
+pub fn default_data_directory(variable: impl Fn(&str) -> Option<OsString>) -> Option<PathBuf> {
+    let set = |name| variable(name).filter(|value| !value.is_empty()).map(PathBuf::from);
+    let base = set("XDG_DATA_HOME").or_else(|| set("HOME").map(|home| home.join(".local/share")))?;
+    Some(base.join("taskd"))
+}
+
+/// The flags of `taskd serve`: `--config FILE` and one per setting.
+#[derive(Debug, Clone, Default)]
+pub struct ServeFlags {
+    /// The TOML file.
+    pub config: Option<PathBuf>,
+    /// Settings by flag name.
+    pub settings: Vec<(&'static str, String)>,
+}
+
+impl clap::Args for ServeFlags {
+    fn augment_args(command: clap::Command) -> clap::Command {
+        let config = Arg::new("config").long("config").value_name("FILE").value_parser(clap::value_parser!(PathBuf));
+        let mut command = command.arg(config.help("TOML file with the settings below, '_' in place of '-'"));
+        for setting in SETTINGS {
+            let arg = Arg::new(setting.name).long(setting.name).help(setting.help);
+            let arg = arg.value_name(setting.value_name).action(ArgAction::Set);
+            let is_switch = setting.value_name == "BOOL";
+            let arg =
+                if is_switch { arg.num_args(0..=1).require_equals(true).default_missing_value("true") } else { arg };
+            command = command.arg(arg);
+        }
+        command
+    }
+
+    fn augment_args_for_update(command: clap::Command) -> clap::Command {
+        Self::augment_args(command)
+    }
+}
+
+impl clap::FromArgMatches for ServeFlags {
+    fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
+        let text = |name: &'static str| matches.get_one::<String>(name).map(|text| (name, text.clone()));
+        Ok(Self {
+            config: matches.get_one::<PathBuf>("config").cloned(),
+            settings: SETTINGS.iter().filter_map(|setting| text(setting.name)).collect(),
+        })
+    }
+
+    fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
+        *self = Self::from_arg_matches(matches)?;
+        Ok(())
+    }
+}
+
+fn non_empty(text: &str) -> Result<String, String> {
+    if text.is_empty() { Err("it is empty".to_owned()) } else { Ok(text.to_owned()) }
+}
+
+fn parsed<T: std::str::FromStr<Err: std::fmt::Display>>(text: &str) -> Result<T, String> {
+    text.parse().map_err(|error: T::Err| error.to_string())
+}
+
+fn boolean(text: &str) -> Result<bool, String> {
+    match text {
+        "true" | "1" | "yes" => Ok(true),
+        "false" | "0" | "no" => Ok(false),
+        _ => Err(format!("{text:?} is neither \"true\" nor \"false\"")),
+    }
+}
+
+fn address(text: &str) -> Result<SocketAddr, String> {
+    let expected = || format!("{text:?} is not an address: expected host:port, for example 127.0.0.1:8080");
+    text.to_socket_addrs().ok().and_then(|mut found| found.next()).ok_or_else(expected)
+}
+
+fn database_url(text: &str) -> Result<String, String> {
+    let known = ["sqlite:", "postgres://", "postgresql://"].iter().any(|scheme| text.starts_with(scheme));
+    // The URL may hold a password: it is not repeated.
+    if known { Ok(text.to_owned()) } else { Err("expected a URL that starts with sqlite: or postgres://".to_owned()) }
+}
+
+fn count(text: &str, most: u64) -> Result<u64, String> {
+    match text.parse() {
+        Ok(number) if (1..=most).contains(&number) => Ok(number),
+        _ => Err(format!("{text:?} is not a whole number from 1 to {most}")),
+    }
+}
+
+fn lifetime(text: &str) -> Result<Duration, String> {
+    const MOST: Duration = Duration::from_secs(3650 * 24 * 60 * 60);
+    match parse_duration(text) {
+        Some(time) if !time.is_zero() && time <= MOST => Ok(time),
+        _ => Err(format!("{text:?} is not a time: expected for example 90s, 15m, 12h or 7d, at most 3650d")),
+    }
+}
+
+/// Reads a whole number with a unit of time: `ms`, `s`, `m`, `h` or `d`. A number alone means seconds.
+pub fn parse_duration(text: &str) -> Option<Duration> {
+    let split = text.find(|c: char| !c.is_ascii_digit()).unwrap_or(text.len());
+    let number: u64 = text[..split].parse().ok()?;
+    let unit_ms = match &text[split..] {
+        "ms" => 1,
+        "s" | "" => 1_000,
+        "m" => 60_000,
+        "h" => 3_600_000,
+        "d" => 86_400_000,
+        _ => return None,
+    };
+    number.checked_mul(unit_ms).map(Duration::from_millis)
+}
+
+/// A suggestion for a mistyped key: the setting that shares its first letters or contains it.
+fn nearest(key: &str) -> String {
+    let shared = |other: &str| key.bytes().zip(other.bytes()).take_while(|(a, b)| a == b).count();
+    let best = SETTINGS.iter().map(Setting::key).max_by_key(|other| shared(other));
+    match best {
+        Some(best) if shared(&best) >= 3 => format!("; {best} is the closest one"),
+        _ => String::new(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn load(flags: &[(&'static str, &str)], env: &[(&str, &str)], file: Option<&str>) -> Result<Config, String> {
+        let directory = tempfile::tempdir().expect("temp dir");
+        let path = directory.path().join("taskd.toml");
+        if let Some(text) = file {
+            std::fs::write(&path, text).expect("written");
+        }
+        let flags = ServeFlags {
+            config: file.map(|_| path.clone()),
+            settings: flags.iter().map(|(key, text)| (*key, (*text).to_owned())).collect(),
+        };
+        let env = env.iter().map(|(name, value)| (OsString::from(name), OsString::from(value)));
+        let env = env.chain([(OsString::from("HOME"), OsString::from("/home/ada"))]);
+        Config::load(&flags, env).map_err(|error| error.to_string().replace(&path.display().to_string(), "taskd.toml"))
+    }
+
+    #[test]
+    fn flags_win_over_variables_over_the_file_over_defaults() {
+        let file = Some("http = \"127.0.0.1:1\"\nmqtt = \"127.0.0.1:1\"\ndata = \"/file\"\nassignment_expiry = \"2d\"");
+        let env = [("TASKD_HTTP", "127.0.0.1:2"), ("TASKD_MQTT", "127.0.0.1:2"), ("PATH", "/bin")];
+        let config = load(&[("http", "127.0.0.1:3")], &env, file).expect("loads");
+        assert_eq!((config.http.port(), config.mqtt.port()), (3, 2));
+        assert_eq!(config.data, PathBuf::from("/file"));
+        assert_eq!(config.assignment_expiry, Duration::from_secs(172_800));
+        assert_eq!(config.desired_lifetime, Duration::from_secs(30 * 86_400));
+        assert_eq!(load(&[], &[], None).expect("loads").data, PathBuf::from("/home/ada/.local/share/taskd"));
+    }
+
+    #[test]
+    fn what_is_unknown_or_wrong_is_refused_by_name() {
+        let cases: [(&[(&str, &str)], Option<&str>, &str); 9] = [
+            (&[("TASKD_HTPT", "x")], None, "TASKD_HTPT: there is no such setting"),
+            (&[("TASKD_MQTTS", "x")], None, "TASKD_MQTTS: there is no such setting; mqtt is the closest one"),
+            (&[("TASKD_HTTP", "x")], None, "TASKD_HTTP: \"x\" is not an address"),
+            (&[], Some("htpt = 1"), "htpt in taskd.toml: there is no such setting"),
+            (&[], Some("[limits]\nx = 1"), "limits in taskd.toml: there is no such setting"),
+            (
+                &[],
+                Some("http = [1]"),
+                "http in taskd.toml: expected a text, a whole number or a truth value, not a array",
+            ),
+            (&[], Some("blob_read = \"sendfile\""), "blob_read in taskd.toml: \"sendfile\" is neither"),
+            (&[], Some("assignment_expiry = \"0s\""), "assignment_expiry in taskd.toml: \"0s\" is not a time"),
+            (&[], Some("http ="), "taskd.toml is not valid TOML"),
+        ];
+        for (env, file, expected) in cases {
+            let message = load(&[], env, file).expect_err(expected);
+            assert!(message.starts_with(expected), "{message}");
+        }
+        let config = load(&[], &[("TASKD_SERVER", "http://x"), ("TASKD_TEST_POSTGRES", "x")], None);
+        assert!(config.is_ok());
+    }
+
+    #[test]
+    fn plain_text_beyond_loopback_must_be_allowed() {
+        let message = load(&[("mqtt", "0.0.0.0:1883")], &[], None).expect_err("refused");
+        assert!(message.starts_with("mqtt = 0.0.0.0:1883: unencrypted"), "{message}");
+        let flags = [("mqtt", "0.0.0.0:1883"), ("allow-plaintext", "true")];
+        assert!(load(&flags, &[], None).expect("allowed").allow_plaintext);
+    }
+
+    #[test]
+    fn a_database_password_is_not_repeated() {
+        let message = load(&[("database", "mysql://ada:secret@host/db")], &[], None).expect_err("refused");
+        assert!(!message.contains("secret"), "{message}");
+    }
+
+    #[test]
+    fn durations_have_units() {
+        for (text, ms) in [("250ms", 250), ("90s", 90_000), ("90", 90_000), ("2m", 120_000), ("1h", 3_600_000)] {
+            assert_eq!(parse_duration(text), Some(Duration::from_millis(ms)), "{text}");
+        }
+        for bad in ["", "s", "-1s", "1.5h", "1w", "99999999999999999999s", "18446744073709551615d"] {
+            assert_eq!(parse_duration(bad), None, "{bad}");
+        }
+    }
+}

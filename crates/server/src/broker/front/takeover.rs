@@ -1,0 +1,127 @@
+//! Who has which seat: one session for each robot and each operator's client id. A newcomer takes the seat over only
+//! after the session before it has fully ended. It never touches a socket.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use task_proto::RobotId;
+use tokio_util::sync::CancellationToken;
+
+use super::doorbell::Doorbell;
+
+/// What a session is known by. Robots and operators can't take over each other, whatever client id they give.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub(super) enum SeatName {
+    Robot(RobotId),
+    Operator(String),
+    Canary,
+}
+
+/// All seats that are taken.
+#[derive(Default)]
+pub(super) struct Seats {
+    table: Mutex<Table>,
+}
+
+#[derive(Default)]
+struct Table {
+    occupants: HashMap<SeatName, Arc<Occupant>>,
+    robots: usize,
+    last_number: u64,
+}
+
+struct Occupant {
+    number: u64,
+    leave: CancellationToken,
+    left: CancellationToken,
+    doorbell: Arc<Doorbell>,
+}
+
+/// A session's hold on its seat; dropping it says that the session has fully ended.
+pub(super) struct Seat {
+    seats: Arc<Seats>,
+    name: SeatName,
+    occupant: Arc<Occupant>,
+}
+
+impl Seats {
+    /// Asks whoever has the seat to leave, waits until they have, and sits down. Sessions that want the same seat get it
+    /// one after another in the order of their arrival; all but the last find that they should leave again.
+    pub(super) async fn take(self: &Arc<Self>, name: SeatName) -> Seat {
+        let (seat, before) = self.claim(name);
+        if let Some(before) = before {
+            before.leave.cancel();
+            before.left.cancelled().await;
+        }
+        seat
+    }
+
+    fn claim(self: &Arc<Self>, name: SeatName) -> (Seat, Option<Arc<Occupant>>) {
+        let mut table = self.table();
+        table.last_number += 1;
+        let occupant = Arc::new(Occupant {
+            number: table.last_number,
+            leave: CancellationToken::new(),
+            left: CancellationToken::new(),
+            doorbell: Arc::new(Doorbell::default()),
+        });
+        let before = table.occupants.insert(name.clone(), occupant.clone());
+        if before.is_none() && matches!(name, SeatName::Robot(_)) {
+            table.robots += 1;
+        }
+        (Seat { seats: self.clone(), name, occupant }, before)
+    }
+
+    /// The doorbell of the robot's session.
+    pub(super) fn doorbell(&self, robot: &RobotId) -> Option<Arc<Doorbell>> {
+        self.table().occupants.get(&SeatName::Robot(robot.clone())).map(|occupant| occupant.doorbell.clone())
+    }
+
+    /// Asks the robot's session to leave.
+    pub(super) fn ask_to_leave(&self, robot: &RobotId) {
+        if let Some(occupant) = self.table().occupants.get(&SeatName::Robot(robot.clone())) {
+            occupant.leave.cancel();
+        }
+    }
+
+    /// How many robots have a seat.
+    pub(super) fn robots(&self) -> usize {
+        self.table().robots
+    }
+
+    fn table(&self) -> MutexGuard<'_, Table> {
+        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing half-done.
+        self.table.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Seat {
+    /// The session's number; later sessions have higher ones.
+    pub(super) fn number(&self) -> u64 {
+        self.occupant.number
+    }
+
+    /// Ends when the session should leave.
+    pub(super) fn leave(&self) -> &CancellationToken {
+        &self.occupant.leave
+    }
+
+    /// What rings for this session.
+    pub(super) fn doorbell(&self) -> &Doorbell {
+        &self.occupant.doorbell
+    }
+}
+
+impl Drop for Seat {
+    fn drop(&mut self) {
+        let mut table = self.seats.table();
+        if table.occupants.get(&self.name).is_some_and(|occupant| occupant.number == self.occupant.number) {
+            table.occupants.remove(&self.name);
+            if matches!(self.name, SeatName::Robot(_)) {
+                table.robots -= 1;
+            }
+        }
+        drop(table);
+        self.occupant.left.cancel();
+    }
+}

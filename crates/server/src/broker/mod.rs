@@ -1,0 +1,256 @@
+//! The MQTT broker as the rest of the server sees it: ring a robot, receive what robots send, know who is there.
+//! It asks a [`Gatekeeper`] who may come in and hands messages to an [`Inbox`]; it never stores anything and knows no
+//! payloads. An external broker would be another start function that returns the same [`Broker`].
+
+mod front;
+mod router;
+mod watchdog;
+
+use std::fmt;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::Bytes;
+use futures_util::future::BoxFuture;
+use task_proto::RobotId;
+use task_proto::topic::{RobotTopic, TopicPrefix};
+use tokio::sync::watch;
+
+use front::Front;
+
+/// What a client shows at the door.
+#[derive(Clone)]
+pub struct Login {
+    /// The MQTT client id; empty if the client left the choice to us.
+    pub client_id: String,
+    /// The user name, if there is one.
+    pub user_name: Option<String>,
+    /// The password, if there is one: a token.
+    pub password: Option<String>,
+    /// Where the connection comes from.
+    pub peer: SocketAddr,
+}
+
+/// Who a client turned out to be.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Principal {
+    /// A robot: speaks and listens on its own topics only. Its client id must be its robot id.
+    Robot(RobotId),
+    /// A person or program with an operator's token: may listen below the prefix.
+    Operator,
+}
+
+/// Why a client is not let in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum Refusal {
+    /// No such user, or the wrong password (CONNACK 4).
+    #[error("bad user name or password")]
+    BadCredentials,
+    /// Known, but not allowed: a revoked token, another robot's name (CONNACK 5).
+    #[error("not authorised")]
+    NotAuthorised,
+    /// Nobody could say just now (CONNACK 3).
+    #[error("the server cannot check credentials at the moment")]
+    Unavailable,
+}
+
+/// Decides who may come in.
+pub trait Gatekeeper: Send + Sync + 'static {
+    /// Who this is, or why they may not enter. Given up on after [`Limits::admit_timeout`], which counts as
+    /// [`Refusal::Unavailable`].
+    fn admit(&self, login: Login) -> BoxFuture<'_, Result<Principal, Refusal>>;
+}
+
+/// A message from a robot on its `report`, `status` or `reply` topic.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RobotMessage {
+    /// Who sent it; proven by the connection.
+    pub robot: RobotId,
+    /// Which of the three topics.
+    pub topic: RobotTopic,
+    /// The bytes, unread.
+    pub payload: Bytes,
+    /// The peer's address.
+    pub peer: SocketAddr,
+    /// The connection it came by, as in [`Inbox::connected`].
+    pub connection: u64,
+}
+
+/// The message could not be stored; the robot keeps it and sends it again.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("the message was not stored")]
+pub struct NotStored;
+
+/// Receives what robots send.
+pub trait Inbox: Send + Sync + 'static {
+    /// A message arrived. The robot gets its acknowledgement once this resolves to `Ok`; on `Err`, or after
+    /// [`Limits::inbox_timeout`], its connection is closed instead, so that it sends again. A message whose content is
+    /// nonsense must resolve to `Ok`, or the robot would send it for ever. May be dropped half-way.
+    fn receive(&self, message: RobotMessage) -> BoxFuture<'_, Result<(), NotStored>>;
+
+    /// A robot's session is live: [`Broker::ring`] reaches it from now on, so this is the moment to send its state.
+    /// `connection` grows with every connection of this process. Any earlier session of this robot has fully ended.
+    fn connected(&self, robot: &RobotId, peer: SocketAddr, connection: u64);
+
+    /// The robot's session with this number has ended. Comes exactly once for each `connected`, after it.
+    fn disconnected(&self, robot: &RobotId, connection: u64);
+}
+
+/// Where the broker listens and what bounds it.
+#[derive(Debug, Clone)]
+pub struct BrokerConfig {
+    /// The plain TCP listener's address; port 0 picks a free one.
+    pub listen: SocketAddr,
+    /// What all topics start with.
+    pub prefix: TopicPrefix,
+    /// The bounds.
+    pub limits: Limits,
+}
+
+/// Bounds on everything a client may take up.
+#[derive(Debug, Clone)]
+pub struct Limits {
+    /// Connections at a time, those not yet admitted included.
+    pub max_connections: usize,
+    /// Operators among them.
+    pub max_operators: usize,
+    /// The largest packet of an admitted client, in bytes after the fixed header.
+    pub max_packet_bytes: usize,
+    /// Filters in one SUBSCRIBE or UNSUBSCRIBE, and subscriptions of one client.
+    pub max_filters: usize,
+    /// From accepting a connection until its CONNECT must be complete.
+    pub connect_timeout: Duration,
+    /// How long the gatekeeper may think.
+    pub admit_timeout: Duration,
+    /// How long the inbox may take to store a message.
+    pub inbox_timeout: Duration,
+    /// How long a client may leave our bytes unread.
+    pub write_timeout: Duration,
+    /// When a client that asked for no keepalive is taken for gone.
+    pub max_silence: Duration,
+    /// How often the watchdog sends its canary through the listener.
+    pub canary_interval: Duration,
+    /// How long the canary may take.
+    pub canary_timeout: Duration,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self {
+            max_connections: 20_000,
+            max_operators: 256,
+            max_packet_bytes: 256 * 1024,
+            max_filters: 64,
+            connect_timeout: Duration::from_secs(10),
+            admit_timeout: Duration::from_secs(10),
+            inbox_timeout: Duration::from_secs(15),
+            write_timeout: Duration::from_secs(20),
+            max_silence: Duration::from_secs(1800),
+            canary_interval: Duration::from_secs(5),
+            canary_timeout: Duration::from_secs(5),
+        }
+    }
+}
+
+/// How the broker is. Watch it; on [`Health::Failed`] the server should say so and end.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Health {
+    /// The canary came through.
+    Serving,
+    /// It did not, and a remedy is under way; says what was seen.
+    Recovering(String),
+    /// The remedies are used up; says what was seen last.
+    Failed(String),
+}
+
+/// Why the broker did not start.
+#[derive(Debug, thiserror::Error)]
+pub enum BrokerError {
+    /// The address is taken, or not ours.
+    #[error("cannot listen for MQTT on {address}")]
+    Listen {
+        /// The configured address.
+        address: SocketAddr,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The router thread did not come up.
+    #[error("the message router did not start: {reason}")]
+    Router {
+        /// What was seen.
+        reason: String,
+    },
+}
+
+/// The robot has no live session here.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("the robot is not connected over MQTT")]
+pub struct NotConnected;
+
+/// A handle on the running broker; clones are cheap.
+#[derive(Clone)]
+pub struct Broker {
+    front: Arc<Front>,
+    health: watch::Receiver<Health>,
+}
+
+impl Broker {
+    /// Binds the listener and starts serving on the current runtime.
+    pub async fn start(
+        config: BrokerConfig,
+        gatekeeper: Arc<dyn Gatekeeper>,
+        inbox: Arc<dyn Inbox>,
+    ) -> Result<Self, BrokerError> {
+        let front = Front::start(config, gatekeeper, inbox).await?;
+        let health = watchdog::start(front.clone());
+        Ok(Self { front, health })
+    }
+
+    /// Sends `payload` on the robot's `desired` topic, QoS 1, straight into its session. Never waits: a session holds
+    /// one undelivered payload, and a newer one takes its place, also before the robot has subscribed.
+    pub fn ring(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotConnected> {
+        self.front.ring(robot, payload)
+    }
+
+    /// Ends the robot's session, if it has one: its token was revoked or it was removed. Its will counts as unsaid.
+    pub fn disconnect(&self, robot: &RobotId) {
+        self.front.disconnect(robot);
+    }
+
+    /// How many robots are connected.
+    pub fn connected_count(&self) -> usize {
+        self.front.connected_count()
+    }
+
+    /// The listener's address as bound.
+    pub fn local_addr(&self) -> SocketAddr {
+        self.front.local_addr()
+    }
+
+    /// How the broker is, now and from now on.
+    pub fn health(&self) -> watch::Receiver<Health> {
+        self.health.clone()
+    }
+
+    /// Stops accepting, ends every session and waits until all have ended, at most for `patience`.
+    pub async fn shutdown(&self, patience: Duration) {
+        self.front.shutdown(patience).await;
+    }
+}
+
+impl fmt::Debug for Login {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Login")
+            .field("client_id", &self.client_id)
+            .field("user_name", &self.user_name)
+            .field("peer", &self.peer)
+            .finish_non_exhaustive()
+    }
+}
+
+impl fmt::Debug for Broker {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Broker").field("local_addr", &self.local_addr()).finish_non_exhaustive()
+    }
+}

@@ -1,0 +1,303 @@
+//! Who is there: which robot is connected over MQTT or polls over HTTP, from where and since when, and which robots have
+//! two instances that displace each other. Kept in memory only; it never talks to anyone and never reads a clock.
+
+use std::collections::{HashMap, VecDeque};
+use std::net::SocketAddr;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use task_proto::{InstanceId, RobotId};
+
+/// Within this time two returns of a displaced instance mean a duplicate, and after this much quiet it is over.
+pub const DUPLICATE_WINDOW_MS: u64 = 10 * 60 * 1000;
+/// Robots remembered at most; beyond it whoever was silent for longest is forgotten.
+const MAX_ROBOTS: usize = 100_000;
+/// Changes of instance remembered for each robot.
+const MAX_CHANGES: usize = 8;
+
+/// Everyone who was seen by this process.
+pub struct Presence {
+    window_ms: u64,
+    robots: Mutex<HashMap<RobotId, Sightings>>,
+}
+
+/// What is known of one robot.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Sighting {
+    /// Connected over MQTT, or heard within the window.
+    pub online: bool,
+    /// Where it was last heard from.
+    pub address: SocketAddr,
+    /// Since when it is connected over MQTT, if it is.
+    pub connected_since_ms: Option<u64>,
+    /// The number of that connection.
+    pub connection: Option<u64>,
+    /// When it was last heard.
+    pub last_seen_ms: u64,
+    /// Two instances of it keep displacing each other.
+    pub duplicate: bool,
+}
+
+struct Sightings {
+    address: SocketAddr,
+    connection: Option<Connection>,
+    last_seen_ms: u64,
+    instances: InstanceHistory,
+}
+
+#[derive(Clone, Copy)]
+struct Connection {
+    number: u64,
+    since_ms: u64,
+}
+
+impl Presence {
+    /// Nobody seen yet. A robot that polls is online for `window_ms` after it was heard.
+    pub fn new(window_ms: u64) -> Self {
+        Self { window_ms, robots: Mutex::default() }
+    }
+
+    /// The robot's MQTT session number `connection` began.
+    pub fn connected(&self, robot: &RobotId, address: SocketAddr, connection: u64, now_ms: u64) {
+        let mut robots = self.robots();
+        let sightings = heard(&mut robots, robot, address, now_ms);
+        if sightings.connection.is_none_or(|known| known.number < connection) {
+            sightings.connection = Some(Connection { number: connection, since_ms: now_ms });
+        }
+    }
+
+    /// The robot's MQTT session number `connection` ended. An end that comes after the next beginning changes nothing.
+    pub fn disconnected(&self, robot: &RobotId, connection: u64, now_ms: u64) {
+        if let Some(sightings) = self.robots().get_mut(robot)
+            && sightings.connection.is_some_and(|known| known.number == connection)
+        {
+            sightings.connection = None;
+            sightings.last_seen_ms = sightings.last_seen_ms.max(now_ms);
+        }
+    }
+
+    /// The robot was heard: a poll over HTTP, a report by either way.
+    pub fn seen(&self, robot: &RobotId, address: SocketAddr, now_ms: u64) {
+        heard(&mut self.robots(), robot, address, now_ms);
+    }
+
+    /// The robot named its instance. Returns whether it is a duplicate identity now.
+    pub fn instance_seen(&self, robot: &RobotId, address: SocketAddr, instance: &InstanceId, now_ms: u64) -> bool {
+        let mut robots = self.robots();
+        let sightings = heard(&mut robots, robot, address, now_ms);
+        sightings.instances.observe(instance, now_ms);
+        sightings.instances.is_duplicate(now_ms)
+    }
+
+    /// What is known of the robot; `None` if it was not seen by this process.
+    pub fn get(&self, robot: &RobotId, now_ms: u64) -> Option<Sighting> {
+        self.robots().get(robot).map(|sightings| sightings.view(self.window_ms, now_ms))
+    }
+
+    /// Whether the robot is online.
+    pub fn is_online(&self, robot: &RobotId, now_ms: u64) -> bool {
+        self.get(robot, now_ms).is_some_and(|sighting| sighting.online)
+    }
+
+    /// Whether two instances of the robot keep displacing each other.
+    pub fn is_duplicate(&self, robot: &RobotId, now_ms: u64) -> bool {
+        self.robots().get(robot).is_some_and(|sightings| sightings.instances.is_duplicate(now_ms))
+    }
+
+    /// The robot was removed.
+    pub fn forget(&self, robot: &RobotId) {
+        self.robots().remove(robot);
+    }
+
+    fn robots(&self) -> MutexGuard<'_, HashMap<RobotId, Sightings>> {
+        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing half-done.
+        self.robots.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+fn heard<'a>(
+    robots: &'a mut HashMap<RobotId, Sightings>,
+    robot: &RobotId,
+    address: SocketAddr,
+    now_ms: u64,
+) -> &'a mut Sightings {
+    if robots.len() >= MAX_ROBOTS && !robots.contains_key(robot) {
+        make_room(robots);
+    }
+    let sightings = robots.entry(robot.clone()).or_insert_with(|| Sightings {
+        address,
+        connection: None,
+        last_seen_ms: now_ms,
+        instances: InstanceHistory::default(),
+    });
+    sightings.address = address;
+    sightings.last_seen_ms = sightings.last_seen_ms.max(now_ms);
+    sightings
+}
+
+/// Forgets the sixteenth that was silent for longest, so that the next scan is far off.
+fn make_room(robots: &mut HashMap<RobotId, Sightings>) {
+    let mut silent: Vec<(bool, u64, RobotId)> = robots
+        .iter()
+        .map(|(robot, sightings)| (sightings.connection.is_some(), sightings.last_seen_ms, robot.clone()))
+        .collect();
+    silent.sort_unstable();
+    for (_, _, robot) in silent.into_iter().take(MAX_ROBOTS / 16) {
+        robots.remove(&robot);
+    }
+}
+
+impl Sightings {
+    fn view(&self, window_ms: u64, now_ms: u64) -> Sighting {
+        Sighting {
+            online: self.connection.is_some() || now_ms.saturating_sub(self.last_seen_ms) < window_ms,
+            address: self.address,
+            connected_since_ms: self.connection.map(|connection| connection.since_ms),
+            connection: self.connection.map(|connection| connection.number),
+            last_seen_ms: self.last_seen_ms,
+            duplicate: self.instances.is_duplicate(now_ms),
+        }
+    }
+}
+
+/// The instances of one robot, by when each took the place of another.
+///
+/// A restarted agent is a new instance and an old one never comes back, except for a message that was late. So two
+/// *returns* within [`DUPLICATE_WINDOW_MS`] (A, B, A again, B again) mean that two machines share the identity.
+#[derive(Debug, Clone, Default)]
+pub struct InstanceHistory {
+    changes: VecDeque<Change>,
+    /// The last return that made, or kept, the robot a duplicate.
+    duplicate_at_ms: Option<u64>,
+}
+
+#[derive(Debug, Clone)]
+struct Change {
+    instance: InstanceId,
+    at_ms: u64,
+    is_return: bool,
+}
+
+impl InstanceHistory {
+    /// `instance` was heard.
+    pub fn observe(&mut self, instance: &InstanceId, now_ms: u64) {
+        if self.changes.back().is_some_and(|last| last.instance == *instance) {
+            return;
+        }
+        let is_return = self.changes.iter().any(|change| change.instance == *instance);
+        self.changes.push_back(Change { instance: instance.clone(), at_ms: now_ms, is_return });
+        if self.changes.len() > MAX_CHANGES {
+            self.changes.pop_front();
+        }
+        let recent = |change: &&Change| now_ms.saturating_sub(change.at_ms) < DUPLICATE_WINDOW_MS;
+        let returns = self.changes.iter().filter(recent).filter(|change| change.is_return).count();
+        if is_return && (returns >= 2 || self.is_duplicate(now_ms)) {
+            self.duplicate_at_ms = Some(now_ms);
+        }
+    }
+
+    /// Whether instances displaced each other and have not been quiet since.
+    pub fn is_duplicate(&self, now_ms: u64) -> bool {
+        self.duplicate_at_ms.is_some_and(|at_ms| now_ms.saturating_sub(at_ms) < DUPLICATE_WINDOW_MS)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MINUTE_MS: u64 = 60_000;
+
+    fn address() -> SocketAddr {
+        "127.0.0.1:4000".parse().expect("an address")
+    }
+
+    fn history(sightings: &[(&InstanceId, u64)]) -> InstanceHistory {
+        let mut history = InstanceHistory::default();
+        for (instance, at_ms) in sightings {
+            history.observe(instance, *at_ms);
+        }
+        history
+    }
+
+    #[test]
+    fn two_returns_within_the_window_are_a_duplicate() {
+        let (a, b) = (InstanceId::random(), InstanceId::random());
+        let three = history(&[(&a, 0), (&b, 1), (&b, 2), (&a, 3)]);
+        assert!(!three.is_duplicate(3), "one return may be a late message");
+        let mut four = three;
+        four.observe(&b, 4);
+        assert!(four.is_duplicate(4));
+        assert!(four.is_duplicate(4 + DUPLICATE_WINDOW_MS - 1));
+        assert!(!four.is_duplicate(4 + DUPLICATE_WINDOW_MS), "ten quiet minutes clear it");
+    }
+
+    #[test]
+    fn returns_keep_a_duplicate_alive_and_repeats_do_not() {
+        let (a, b) = (InstanceId::random(), InstanceId::random());
+        let mut both = history(&[(&a, 0), (&b, 1), (&a, 2), (&b, 3)]);
+        both.observe(&a, 9 * MINUTE_MS);
+        both.observe(&a, 18 * MINUTE_MS);
+        assert!(both.is_duplicate(18 * MINUTE_MS));
+        assert!(!both.is_duplicate(19 * MINUTE_MS));
+    }
+
+    #[test]
+    fn restarts_and_slow_alternation_are_no_duplicate() {
+        let fresh: Vec<InstanceId> = (0..40).map(|_| InstanceId::random()).collect();
+        let mut restarts = InstanceHistory::default();
+        for (second, instance) in (0..).zip(&fresh) {
+            restarts.observe(instance, second * 1000);
+            assert!(!restarts.is_duplicate(second * 1000));
+        }
+        let (a, b) = (&fresh[0], &fresh[1]);
+        let slow = history(&[(a, 0), (b, 8 * MINUTE_MS), (a, 16 * MINUTE_MS), (b, 27 * MINUTE_MS)]);
+        assert!(!slow.is_duplicate(27 * MINUTE_MS));
+    }
+
+    #[test]
+    fn three_clones_are_a_duplicate_too() {
+        let (a, b, c) = (InstanceId::random(), InstanceId::random(), InstanceId::random());
+        assert!(history(&[(&a, 0), (&b, 1), (&c, 2), (&a, 3), (&b, 4)]).is_duplicate(4));
+    }
+
+    #[test]
+    fn a_connection_or_a_recent_poll_is_online() {
+        let presence = Presence::new(1000);
+        let robot = RobotId::random();
+        assert_eq!(presence.get(&robot, 0), None);
+        presence.seen(&robot, address(), 10);
+        assert!(presence.is_online(&robot, 1009));
+        assert!(!presence.is_online(&robot, 1010));
+        presence.connected(&robot, address(), 7, 2000);
+        let sighting = presence.get(&robot, 90_000).expect("seen");
+        assert!(sighting.online);
+        assert_eq!((sighting.connection, sighting.connected_since_ms), (Some(7), Some(2000)));
+        presence.disconnected(&robot, 7, 100_000);
+        assert!(presence.is_online(&robot, 100_500));
+        assert!(!presence.is_online(&robot, 101_000));
+        presence.forget(&robot);
+        assert_eq!(presence.get(&robot, 100_000), None);
+    }
+
+    #[test]
+    fn a_late_end_of_the_old_connection_leaves_the_new_one() {
+        let presence = Presence::new(1000);
+        let robot = RobotId::random();
+        presence.connected(&robot, address(), 2, 0);
+        presence.connected(&robot, address(), 1, 1);
+        presence.disconnected(&robot, 1, 2);
+        assert_eq!(presence.get(&robot, 50_000).and_then(|sighting| sighting.connection), Some(2));
+    }
+
+    #[test]
+    fn memory_is_bounded() {
+        let mut robots = HashMap::new();
+        let silent = RobotId::random();
+        heard(&mut robots, &silent, address(), 1);
+        for at_ms in 2..=MAX_ROBOTS as u64 + 1 {
+            heard(&mut robots, &RobotId::random(), address(), at_ms);
+        }
+        assert!(robots.len() <= MAX_ROBOTS);
+        assert!(!robots.contains_key(&silent));
+    }
+}

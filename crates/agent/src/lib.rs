@@ -1,6 +1,12 @@
 //! The robot's half: everything `task-agent` does. Imports run downward only; see ARCHITECTURE.md.
 
 pub mod commands;
+pub mod containment;
 pub mod disk;
 pub mod durable;
 pub mod layout;
+pub mod logs;
+pub mod process;
+pub mod run_dir;
+pub mod shim;
+pub mod supervisor;

@@ -1,0 +1,155 @@
+//! Everything a run has started, whatever it did to get away: all that carry the run directory in their environment
+//! (it survives `fork`, `setsid` and the shim's death) and all that descend from the shim, which is their subreaper
+//! (that survives a cleared environment). It signals them and proves that none is left; it never signals the shim.
+
+use std::collections::HashSet;
+use std::io;
+use std::path::Path;
+use std::time::Duration;
+
+use nix::sys::signal::Signal;
+
+use crate::process::{ProcessEntry, ProcessIdentity, boot_id};
+
+/// The variable by which a run's processes are found: the path of its run directory, which no other run shares, not
+/// even one of the same deployment by a second agent on this machine.
+pub const RUN_DIR_VARIABLE: &str = "TASKD_RUN_DIR";
+/// The variable that names the deployment in every process of a task.
+pub const ASSIGNMENT_VARIABLE: &str = "TASKD_ASSIGNMENT";
+/// How often a set of processes that goes on forking is hunted before it counts as not killable.
+const MAX_ROUNDS: usize = 100;
+
+/// The processes of one run.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Containment {
+    marker: String,
+    shim: Option<ProcessIdentity>,
+}
+
+/// Processes that SIGKILL did not end in time: they hang in the kernel.
+#[derive(Debug, thiserror::Error)]
+pub enum ContainmentError {
+    /// The process table could not be read, or a process not be signalled.
+    #[error("cannot look through the process table")]
+    Io(#[from] io::Error),
+    /// These are still there.
+    #[error("processes {pids:?} do not end, not even by SIGKILL")]
+    Survivors {
+        /// Their pids.
+        pids: Vec<u32>,
+    },
+}
+
+impl Containment {
+    /// The processes that were started for the directory `dir`, and those below `shim`.
+    pub fn new(dir: &Path, shim: Option<ProcessIdentity>) -> Self {
+        Self { marker: format!("{RUN_DIR_VARIABLE}={}", dir.display()), shim }
+    }
+
+    /// Those that live now.
+    pub fn members(&self) -> io::Result<Vec<ProcessIdentity>> {
+        Ok(self.entries()?.1)
+    }
+
+    /// Sends `signal` to the members of process group `group`.
+    pub fn signal_group(&self, group: u32, signal: Signal) -> io::Result<()> {
+        let (table, members) = self.entries()?;
+        let in_group: HashSet<u32> = table.iter().filter(|e| e.group == group).map(|e| e.pid).collect();
+        members.iter().filter(|member| in_group.contains(&member.pid)).try_for_each(|member| member.signal(signal))
+    }
+
+    /// Sends `signal` to all members.
+    pub fn signal_all(&self, signal: Signal) -> io::Result<()> {
+        self.members()?.iter().try_for_each(|member| member.signal(signal))
+    }
+
+    /// Kills all members. They are stopped first, until a look finds no new one, so that none forks away between the
+    /// look and the kill. Returns those that were killed; they may take a moment to be gone.
+    pub fn kill(&self) -> io::Result<Vec<ProcessIdentity>> {
+        let mut stopped = HashSet::new();
+        for _ in 0..MAX_ROUNDS {
+            let new: Vec<_> = self.members()?.into_iter().filter(|member| !stopped.contains(member)).collect();
+            if new.is_empty() {
+                break;
+            }
+            for member in new {
+                member.signal(Signal::SIGSTOP)?;
+                stopped.insert(member);
+            }
+        }
+        let killed: Vec<_> = stopped.into_iter().collect();
+        killed.iter().try_for_each(|member| member.signal(Signal::SIGKILL))?;
+        Ok(killed)
+    }
+
+    /// Kills all members and waits until they are gone. Afterwards none is left.
+    pub async fn end(&self, timeout: Duration) -> Result<(), ContainmentError> {
+        let ended = tokio::time::timeout(timeout, async {
+            loop {
+                let killed = self.kill()?;
+                if killed.is_empty() {
+                    return Ok(());
+                }
+                for member in killed {
+                    if let Some(handle) = member.open()? {
+                        handle.ended().await?;
+                    }
+                }
+            }
+        });
+        match ended.await {
+            Ok(result) => result,
+            Err(_) => {
+                let pids = self.members()?.into_iter().map(|member| member.pid).collect();
+                Err(ContainmentError::Survivors { pids })
+            }
+        }
+    }
+
+    fn entries(&self) -> io::Result<(Vec<ProcessEntry>, Vec<ProcessIdentity>)> {
+        let boot_id = boot_id()?;
+        let table = ProcessEntry::all()?;
+        let below = match &self.shim {
+            Some(shim) if shim.is_alive() => descendants(&table, shim.pid),
+            _ => HashSet::new(),
+        };
+        let is_member = |entry: &&ProcessEntry| {
+            !entry.is_zombie && (below.contains(&entry.pid) || entry.was_started_with(&self.marker))
+        };
+        let members = table.iter().filter(is_member).map(|entry| entry.identity(&boot_id)).collect();
+        Ok((table, members))
+    }
+}
+
+fn descendants(table: &[ProcessEntry], ancestor: u32) -> HashSet<u32> {
+    let mut below = HashSet::new();
+    let mut parents = vec![ancestor];
+    while let Some(parent) = parents.pop() {
+        let children = table.iter().filter(|entry| entry.parent == parent).map(|entry| entry.pid);
+        parents.extend(children.filter(|pid| below.insert(*pid)));
+    }
+    below
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn entry(pid: u32, parent: u32) -> ProcessEntry {
+        ProcessEntry { pid, parent, group: pid, start_ticks: 0, is_zombie: false }
+    }
+
+    #[test]
+    fn descendants_are_found_in_any_order_and_loops_end() {
+        let table = [entry(5, 4), entry(4, 2), entry(2, 1), entry(3, 1), entry(9, 9)];
+        assert_eq!(descendants(&table, 2), HashSet::from([4, 5]));
+        assert_eq!(descendants(&table, 9), HashSet::from([9]));
+        assert_eq!(descendants(&table, 7), HashSet::new());
+    }
+
+    #[test]
+    fn nothing_belongs_to_a_directory_nobody_was_started_for() {
+        let containment = Containment::new(Path::new("/nonexistent/run"), None);
+        assert_eq!(containment.members().expect("table"), []);
+    }
+}

@@ -1,0 +1,215 @@
+//! The run directory: where one start of a task is written down, by the supervisor before it and by the shim during it.
+//! One directory is one start; it is never used again. It holds `spec.json` (what to run), `pid.json` (who runs it),
+//! `exit.json` (how it ended) and `lock` (held while the start is in progress). It never starts or signals a process.
+
+use std::collections::BTreeMap;
+use std::fs::{File, OpenOptions};
+use std::io;
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::{Path, PathBuf};
+
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use task_proto::DeploymentId;
+
+use crate::durable;
+use crate::process::ProcessIdentity;
+
+/// One start of a task, by its directory.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RunDir(PathBuf);
+
+/// What a shim runs.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RunSpec {
+    /// The deployment this run belongs to; every process of the task carries it as `TASKD_ASSIGNMENT`.
+    pub assignment: DeploymentId,
+    /// The generated script, run by bash.
+    pub script: PathBuf,
+    /// The directory it runs in.
+    pub directory: PathBuf,
+    /// The whole environment; nothing is inherited. The supervisor adds `TASKD_ASSIGNMENT` and `TASKD_RUN_DIR`.
+    pub environment: BTreeMap<String, String>,
+    /// Where the task's output goes.
+    pub log: LogSpec,
+}
+
+/// Where a task's output goes and how much of it is kept.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LogSpec {
+    /// The current file; older ones are beside it with `.1`, `.2`, … added.
+    pub path: PathBuf,
+    /// The size at which a file is rotated.
+    pub max_bytes: u64,
+    /// How many files are kept, the current one included.
+    pub files: u32,
+}
+
+/// The processes of a run that has begun.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Started {
+    /// The shim.
+    pub shim: ProcessIdentity,
+    /// The task's first process, which leads its own process group.
+    pub task: ProcessIdentity,
+}
+
+/// How a task's first process ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ExitStatus {
+    /// It exited with this code.
+    Code(i32),
+    /// This signal killed it.
+    Signal(i32),
+}
+
+/// The end of a run. When this is on disk, none of the run's processes is left that the shim could see.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Ended {
+    /// How the first process ended.
+    #[serde(flatten)]
+    pub status: ExitStatus,
+    /// When: milliseconds since the machine booted, because a robot's clock may lie.
+    pub at_uptime_ms: u64,
+}
+
+/// A file of the run directory that could not be used.
+#[derive(Debug, thiserror::Error)]
+pub enum RunDirError {
+    /// Reading or writing it failed.
+    #[error("cannot use {}", path.display())]
+    Io {
+        /// Which file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// It is not what this version writes.
+    #[error("{} is not readable as what it should be", path.display())]
+    Malformed {
+        /// Which file.
+        path: PathBuf,
+        /// What the parser said.
+        source: serde_json::Error,
+    },
+}
+
+impl RunDir {
+    /// The run directory at `path`, created if absent. The path becomes absolute and free of links, because it is also
+    /// the key by which the run's processes are found.
+    pub fn create(path: &Path) -> Result<Self, RunDirError> {
+        let failed = |source| RunDirError::Io { path: path.to_owned(), source };
+        durable::create_dir_all(path).map_err(failed)?;
+        Ok(Self(path.canonicalize().map_err(failed)?))
+    }
+
+    /// The directory.
+    pub fn path(&self) -> &Path {
+        &self.0
+    }
+
+    /// What was to be run.
+    pub fn spec(&self) -> Result<Option<RunSpec>, RunDirError> {
+        self.read("spec.json")
+    }
+
+    /// Who runs it.
+    pub fn started(&self) -> Result<Option<Started>, RunDirError> {
+        self.read("pid.json")
+    }
+
+    /// How it ended.
+    pub fn ended(&self) -> Result<Option<Ended>, RunDirError> {
+        self.read("exit.json")
+    }
+
+    /// Writes down what to run.
+    pub fn write_spec(&self, spec: &RunSpec) -> Result<(), RunDirError> {
+        self.write("spec.json", spec)
+    }
+
+    /// Writes down who runs it.
+    pub fn write_started(&self, started: &Started) -> Result<(), RunDirError> {
+        self.write("pid.json", started)
+    }
+
+    /// Writes down how it ended.
+    pub fn write_ended(&self, ended: &Ended) -> Result<(), RunDirError> {
+        self.write("exit.json", ended)
+    }
+
+    /// Takes the start lock, waiting for a start in progress. The lock goes with the file, also into a child that
+    /// inherits it, so there is no moment at which a start is under way and the lock is free.
+    pub fn lock(&self) -> Result<File, RunDirError> {
+        let path = self.0.join("lock");
+        let locked = || {
+            let file = OpenOptions::new().write(true).create(true).truncate(false).mode(0o600).open(&path)?;
+            file.lock()?;
+            Ok(file)
+        };
+        locked().map_err(|source| RunDirError::Io { path: path.clone(), source })
+    }
+
+    fn read<T: DeserializeOwned>(&self, name: &str) -> Result<Option<T>, RunDirError> {
+        let path = self.0.join(name);
+        match std::fs::read(&path) {
+            Ok(bytes) => {
+                serde_json::from_slice(&bytes).map(Some).map_err(|source| RunDirError::Malformed { path, source })
+            }
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+            Err(source) => Err(RunDirError::Io { path, source }),
+        }
+    }
+
+    fn write<T: Serialize>(&self, name: &str, value: &T) -> Result<(), RunDirError> {
+        let path = self.0.join(name);
+        let bytes =
+            serde_json::to_vec(value).map_err(|source| RunDirError::Malformed { path: path.clone(), source })?;
+        durable::write(&path, &bytes, 0o600).map_err(|source| RunDirError::Io { path, source })
+    }
+}
+
+impl LogSpec {
+    /// A log at `path` of at most 50 MiB in five files.
+    pub fn at(path: PathBuf) -> Self {
+        Self { path, max_bytes: 10 * 1024 * 1024, files: 5 }
+    }
+}
+
+impl std::fmt::Display for ExitStatus {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Code(code) => write!(f, "exited with code {code}"),
+            Self::Signal(signal) => match nix::sys::signal::Signal::try_from(*signal) {
+                Ok(known) => write!(f, "killed by {known}"),
+                Err(_) => write!(f, "killed by signal {signal}"),
+            },
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_files_read_back_and_have_the_documented_shape() {
+        let temp = tempfile::tempdir().expect("temp dir");
+        let dir = RunDir::create(&temp.path().join("run")).expect("create");
+        assert_eq!(dir.ended().expect("read"), None);
+        let ended = Ended { status: ExitStatus::Signal(9), at_uptime_ms: 77 };
+        dir.write_ended(&ended).expect("write");
+        assert_eq!(dir.ended().expect("read"), Some(ended));
+        let text = std::fs::read_to_string(dir.path().join("exit.json")).expect("read");
+        assert_eq!(text, r#"{"signal":9,"at_uptime_ms":77}"#);
+    }
+
+    #[test]
+    fn a_damaged_file_is_named() {
+        let temp = tempfile::tempdir().expect("temp dir");
+        let dir = RunDir::create(temp.path()).expect("create");
+        std::fs::write(dir.path().join("pid.json"), "{").expect("write");
+        assert!(dir.started().expect_err("malformed").to_string().contains("pid.json"));
+    }
+}

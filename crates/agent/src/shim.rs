@@ -1,0 +1,177 @@
+//! The process between agent and task: `task-agent shim --dir RUNDIR`. It starts the task, owns its output, collects
+//! every orphan below it and writes down how it all ended. It lives exactly as long as its task, needs nothing of the
+//! agent after the start and never decides anything: no restart, no stop.
+//!
+//! It has no async runtime: a thread copies the output, the main thread waits for children.
+
+use std::io::{self, Write};
+use std::path::Path;
+use std::sync::mpsc;
+use std::time::{Duration, Instant};
+
+use nix::sys::signal::Signal;
+use serde::{Deserialize, Serialize};
+
+use crate::containment::Containment;
+use crate::logs::RotatedLog;
+use crate::process::{self, ChildEvent, ProcessIdentity};
+use crate::run_dir::{Ended, ExitStatus, RunDir, RunDirError, Started};
+
+/// How long what a task leaves behind may take to end after SIGTERM.
+const LEFTOVER_GRACE: Duration = Duration::from_secs(2);
+/// How long it may take after SIGKILL; what is still there then hangs in the kernel.
+const KILL_TIMEOUT: Duration = Duration::from_secs(10);
+/// How long the rest of the output may take once nobody is left to write any.
+const DRAIN_TIMEOUT: Duration = Duration::from_secs(2);
+
+/// What the shim tells the supervisor, one JSON line on its standard output.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Answer {
+    /// The task was started; `pid.json` is on disk.
+    Started(Started),
+    /// It was not, and nothing is left of the try.
+    Failed(String),
+}
+
+/// Why a shim could not do its work.
+#[derive(Debug, thiserror::Error)]
+pub enum ShimError {
+    /// A file of the run directory failed.
+    #[error(transparent)]
+    RunDir(#[from] RunDirError),
+    /// The directory has no `spec.json`.
+    #[error("{0} has no spec.json")]
+    NoSpec(String),
+    /// The task's process could not be started.
+    #[error("cannot start {script} in {directory}")]
+    Start {
+        /// The script.
+        script: String,
+        /// Where it was to run.
+        directory: String,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// Something that every process may do was refused.
+    #[error("cannot watch the task's processes")]
+    Io(#[from] io::Error),
+}
+
+/// A started task and the end of its output.
+struct Task {
+    started: Started,
+    drained: mpsc::Receiver<()>,
+}
+
+/// Runs the task of the run directory at `path` to its end. Call it before any other thread exists.
+pub fn run(path: &Path) -> Result<(), ShimError> {
+    let dir = RunDir::create(path)?;
+    let begun = process::become_shim().map_err(ShimError::Io).and_then(|()| begin(&dir));
+    let answer = match &begun {
+        Ok(task) => Answer::Started(task.started.clone()),
+        Err(error) => Answer::Failed(with_causes(error)),
+    };
+    tell(&answer);
+    process::close_standard_streams()?;
+    let task = begun?;
+    let own = &task.started.shim;
+    let status = wait_for_task(task.started.task.pid)?;
+    end_leftovers(&Containment::new(dir.path(), Some(own.clone())))?;
+    // What is still unread after this is in the hands of a process that hangs in the kernel.
+    let _ = task.drained.recv_timeout(DRAIN_TIMEOUT);
+    let at_uptime_ms = u64::try_from(process::uptime()?.as_millis()).unwrap_or(u64::MAX);
+    Ok(dir.write_ended(&Ended { status, at_uptime_ms })?)
+}
+
+fn begin(dir: &RunDir) -> Result<Task, ShimError> {
+    let spec = dir.spec()?.ok_or_else(|| ShimError::NoSpec(dir.path().display().to_string()))?;
+    let own = identity(std::process::id())?;
+    let (output, writer) = io::pipe()?;
+    let pid = process::spawn_task(&spec.script, &spec.directory, &spec.environment, writer).map_err(|source| {
+        let (script, directory) = (spec.script.display().to_string(), spec.directory.display().to_string());
+        ShimError::Start { script, directory, source }
+    })?;
+    let (done, drained) = mpsc::channel();
+    std::thread::spawn(move || {
+        RotatedLog::new(spec.log).copy_from(output);
+        // The main thread no longer listens when it has given up on the rest.
+        let _ = done.send(());
+    });
+    let written = identity(pid).and_then(|task| {
+        let started = Started { shim: own.clone(), task };
+        dir.write_started(&started).map_err(ShimError::RunDir).map(|()| started)
+    });
+    match written {
+        Ok(started) => Ok(Task { started, drained }),
+        Err(error) => {
+            // A task that nobody could find again must not run.
+            end_leftovers(&Containment::new(dir.path(), Some(own)))?;
+            Err(error)
+        }
+    }
+}
+
+fn identity(pid: u32) -> Result<ProcessIdentity, ShimError> {
+    ProcessIdentity::of(pid)?.ok_or_else(|| io::Error::from(io::ErrorKind::NotFound).into())
+}
+
+/// The supervisor may be gone; the task runs on all the same.
+fn tell(answer: &Answer) {
+    if let Ok(mut line) = serde_json::to_vec(answer) {
+        line.push(b'\n');
+        let mut output = io::stdout();
+        let _ = output.write_all(&line).and_then(|()| output.flush());
+    }
+}
+
+fn wait_for_task(task: u32) -> io::Result<ExitStatus> {
+    loop {
+        match process::next_child(None)? {
+            ChildEvent::Ended(pid, status) if pid == task => return Ok(status),
+            ChildEvent::NoChildren => return Err(io::Error::other("the task was collected by someone else")),
+            ChildEvent::Ended(..) | ChildEvent::TimedOut => {}
+        }
+    }
+}
+
+/// Ends what the task left behind: first asked, then killed.
+fn end_leftovers(containment: &Containment) -> io::Result<()> {
+    if containment.members()?.is_empty() {
+        return Ok(());
+    }
+    containment.signal_all(Signal::SIGTERM)?;
+    // A stopped process does not see the SIGTERM before it continues.
+    containment.signal_all(Signal::SIGCONT)?;
+    if collect_until_empty(containment, LEFTOVER_GRACE)? {
+        return Ok(());
+    }
+    containment.kill()?;
+    collect_until_empty(containment, KILL_TIMEOUT).map(|_| ())
+}
+
+/// Collects children until the containment is empty; false when it is not within `timeout`.
+fn collect_until_empty(containment: &Containment, timeout: Duration) -> io::Result<bool> {
+    let deadline = Instant::now() + timeout;
+    loop {
+        if containment.members()?.is_empty() {
+            return Ok(true);
+        }
+        let rest = deadline.saturating_duration_since(Instant::now());
+        match process::next_child(Some(rest))? {
+            ChildEvent::Ended(..) => {}
+            ChildEvent::NoChildren | ChildEvent::TimedOut => return Ok(containment.members()?.is_empty()),
+        }
+    }
+}
+
+fn with_causes(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(inner) = cause {
+        text.push_str(": ");
+        text.push_str(&inner.to_string());
+        cause = inner.source();
+    }
+    text
+}

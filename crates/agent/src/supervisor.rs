@@ -1,0 +1,213 @@
+//! Starts runs, finds them again and ends them. The run directory is all it knows: a new agent sees what the last one
+//! saw. It never restarts anything by itself and never decides what should run.
+//!
+//! ```text
+//!   NeverStarted ── start ──▶ Running ── task ends ──▶ Exited
+//!                                │ shim killed, or the machine rebooted
+//!                                └──▶ Gone
+//! ```
+
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use nix::sys::signal::Signal;
+
+use crate::containment::{ASSIGNMENT_VARIABLE, Containment, ContainmentError, RUN_DIR_VARIABLE};
+use crate::process;
+use crate::run_dir::{ExitStatus, RunDir, RunDirError, RunSpec, Started};
+use crate::shim::Answer;
+
+/// How long a start may take; it is a fork, an exec and two small files.
+const START_TIMEOUT: Duration = Duration::from_secs(20);
+/// How long killed processes may take to be gone.
+const KILL_TIMEOUT: Duration = Duration::from_secs(10);
+/// The longest answer a shim gives.
+const MAX_ANSWER_BYTES: u64 = 64 * 1024;
+
+/// Starts shims and talks to what they leave on disk.
+#[derive(Debug, Clone)]
+pub struct Supervisor {
+    program: PathBuf,
+}
+
+/// What a run directory and the process table say together.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Observed {
+    /// Nothing was ever started in it.
+    NeverStarted,
+    /// Its shim lives.
+    Running {
+        /// The task's first process.
+        pid: u32,
+        /// How long ago it was started.
+        age: Duration,
+    },
+    /// The task ended and the shim wrote down how.
+    Exited(ExitStatus),
+    /// It was started, but how it ended is not known: its shim was killed, or the machine went down. None of its
+    /// processes is left.
+    Gone,
+}
+
+/// Why a run could not be started, looked at or ended.
+#[derive(Debug, thiserror::Error)]
+pub enum SupervisorError {
+    /// A file of the run directory failed.
+    #[error(transparent)]
+    RunDir(#[from] RunDirError),
+    /// The run directory holds an earlier run that has ended.
+    #[error("{} belongs to a run that has ended; a start needs a directory of its own", .0.display())]
+    Used(PathBuf),
+    /// The shim said why not.
+    #[error("the task was not started: {0}")]
+    Refused(String),
+    /// The shim said nothing within its time.
+    #[error("the task's shim did not answer within {} s", START_TIMEOUT.as_secs())]
+    NoAnswer,
+    /// Processes could not be found or ended.
+    #[error(transparent)]
+    Containment(#[from] ContainmentError),
+    /// The system refused something.
+    #[error("cannot {what}")]
+    Io {
+        /// What was tried.
+        what: &'static str,
+        /// What it said.
+        source: io::Error,
+    },
+}
+
+impl Supervisor {
+    /// A supervisor whose shims are `program shim`.
+    pub fn new(program: impl Into<PathBuf>) -> Self {
+        Self { program: program.into() }
+    }
+
+    /// A supervisor whose shims are this very program, also after its file was replaced by a newer version.
+    pub fn of_this_program() -> Self {
+        Self::new("/proc/self/exe")
+    }
+
+    /// Starts `spec` in the run directory at `path`; a run that already runs there is left as it is. The run survives
+    /// the caller from the moment the shim exists: dropping this future does not take it back.
+    pub async fn start(&self, path: &Path, spec: &RunSpec) -> Result<Started, SupervisorError> {
+        let (program, path, mut spec) = (self.program.clone(), path.to_owned(), spec.clone());
+        let begun = tokio::task::spawn_blocking(move || {
+            let dir = RunDir::create(&path)?;
+            let lock = dir.lock()?;
+            if let Some(started) = dir.started()? {
+                let runs = dir.ended()?.is_none() && started.shim.is_alive();
+                return if runs { Ok(started) } else { Err(SupervisorError::Used(path)) };
+            }
+            spec.environment.insert(ASSIGNMENT_VARIABLE.to_owned(), spec.assignment.to_string());
+            spec.environment.insert(RUN_DIR_VARIABLE.to_owned(), dir.path().display().to_string());
+            dir.write_spec(&spec)?;
+            let answer = process::spawn_shim(&program, dir.path(), lock).map_err(failed("start the shim"))?;
+            let mut line = Vec::new();
+            answer.take(MAX_ANSWER_BYTES).read_to_end(&mut line).map_err(failed("read the shim's answer"))?;
+            match serde_json::from_slice(&line) {
+                Ok(Answer::Started(started)) => Ok(started),
+                Ok(Answer::Failed(reason)) => Err(SupervisorError::Refused(reason)),
+                Err(_) => Err(SupervisorError::Refused("its shim ended without a word".to_owned())),
+            }
+        });
+        match tokio::time::timeout(START_TIMEOUT, begun).await {
+            Ok(joined) => joined.map_err(|error| failed("start the shim")(error.into()))?,
+            Err(_) => Err(SupervisorError::NoAnswer),
+        }
+    }
+
+    /// What has become of the run at `path`. Waits for a start in progress. When the shim was killed, what it left
+    /// behind is ended here: nobody reads its output any more or could tell how it ends.
+    pub async fn observe(&self, path: &Path) -> Result<Observed, SupervisorError> {
+        if !path.join("spec.json").exists() {
+            return Ok(Observed::NeverStarted);
+        }
+        let (dir, started) = read(path).await?;
+        let Some(started) = started else {
+            // The shim died before it wrote who it had started.
+            Containment::new(dir.path(), None).end(KILL_TIMEOUT).await?;
+            return Ok(Observed::NeverStarted);
+        };
+        // The order matters: a shim that is gone has written `exit.json` before, if it could.
+        let shim_lives = started.shim.is_alive();
+        if let Some(ended) = dir.ended()? {
+            return Ok(Observed::Exited(ended.status));
+        }
+        if shim_lives {
+            let age = started.task.age().map_err(failed("read the machine's uptime"))?;
+            return Ok(Observed::Running { pid: started.task.pid, age });
+        }
+        Containment::new(dir.path(), None).end(KILL_TIMEOUT).await?;
+        Ok(Observed::Gone)
+    }
+
+    /// Resolves when the run at `path` does not run any more, at once if it doesn't now. Nothing is polled. Cancel-safe.
+    pub async fn wait(&self, path: &Path) -> Result<Observed, SupervisorError> {
+        loop {
+            let observed = self.observe(path).await?;
+            if !matches!(observed, Observed::Running { .. }) {
+                return Ok(observed);
+            }
+            let Some(started) = read(path).await?.1 else { continue };
+            if let Some(shim) = started.shim.open().map_err(failed("watch the shim"))? {
+                shim.ended().await.map_err(failed("watch the shim"))?;
+            }
+        }
+    }
+
+    /// Ends the run at `path`: SIGINT to the task's process group, `grace`, SIGTERM to all of it, `grace`, SIGKILL.
+    /// Afterwards none of its processes is left, wherever they had hidden. Dropping the future leaves a run that may
+    /// still be ending; calling again begins with SIGINT again, and on a run that has ended only makes sure.
+    pub async fn stop(&self, path: &Path, grace: Duration) -> Result<Observed, SupervisorError> {
+        let mut observed = self.observe(path).await?;
+        if observed == Observed::NeverStarted && !path.exists() {
+            return Ok(observed);
+        }
+        let (dir, started) = read(path).await?;
+        let containment = Containment::new(dir.path(), started.as_ref().map(|started| started.shim.clone()));
+        if let (Observed::Running { .. }, Some(started)) = (&observed, &started) {
+            observed = self.end_run(path, &containment, started.task.pid, grace).await?;
+        }
+        containment.end(KILL_TIMEOUT).await?;
+        Ok(observed)
+    }
+
+    async fn end_run(
+        &self,
+        path: &Path,
+        containment: &Containment,
+        group: u32,
+        grace: Duration,
+    ) -> Result<Observed, SupervisorError> {
+        let signalled = failed("signal the task");
+        containment.signal_group(group, Signal::SIGINT).map_err(&signalled)?;
+        if let Ok(ended) = tokio::time::timeout(grace, self.wait(path)).await {
+            return ended;
+        }
+        containment.signal_all(Signal::SIGTERM).map_err(&signalled)?;
+        if let Ok(ended) = tokio::time::timeout(grace, self.wait(path)).await {
+            return ended;
+        }
+        containment.end(KILL_TIMEOUT).await?;
+        // The shim needs a moment to write the end down; should it hang, the run is over all the same.
+        tokio::time::timeout(KILL_TIMEOUT, self.wait(path)).await.unwrap_or(Ok(Observed::Gone))
+    }
+}
+
+/// The run directory and who runs it, once no start is in progress.
+async fn read(path: &Path) -> Result<(RunDir, Option<Started>), SupervisorError> {
+    let path = path.to_owned();
+    let reading = tokio::task::spawn_blocking(move || {
+        let dir = RunDir::create(&path)?;
+        let _no_start_in_progress = dir.lock()?;
+        let started = dir.started()?;
+        Ok((dir, started))
+    });
+    reading.await.map_err(|error| failed("read the run directory")(error.into()))?
+}
+
+fn failed(what: &'static str) -> impl Fn(io::Error) -> SupervisorError {
+    move |source| SupervisorError::Io { what, source }
+}

@@ -1,7 +1,11 @@
 //! The server half: everything `taskd` does. Imports run downward only; see ARCHITECTURE.md.
 
+pub mod actions;
 pub mod broker;
+pub mod changes;
 pub mod clock;
 pub mod config;
 pub mod http;
 pub mod presence;
+pub mod report_writer;
+pub mod store;

@@ -1,0 +1,161 @@
+//! What people and robots may order. Each order is one write to the store; after its commit the change is announced and
+//! the robots concerned are rung. No HTTP and no MQTT here, and no SQL.
+
+mod deployments;
+mod desired;
+mod robots;
+mod tasks;
+
+use std::fmt;
+use std::str::FromStr;
+use std::sync::Arc;
+
+use task_proto::envelope::SigningKey;
+use task_proto::{DeploymentId, MacAddress, RobotId, RobotName};
+
+use crate::changes::Changes;
+use crate::clock::Clock;
+use crate::store::{Store, StoreError};
+
+pub use crate::store::TaskOrder;
+pub use desired::Desired;
+pub use robots::Enrolled;
+
+/// The orders. Clones are the same.
+#[derive(Clone)]
+pub struct Actions {
+    store: Store,
+    clock: Clock,
+    changes: Changes,
+    key: Arc<SigningKey>,
+    settings: ActionSettings,
+    envelopes: Arc<desired::Envelopes>,
+}
+
+/// Lifetimes the operator may set.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ActionSettings {
+    /// How long an assignment may take when the order does not say.
+    pub assignment_lifetime_ms: u64,
+    /// How long a signed desired state may be acted upon.
+    pub desired_lifetime_ms: u64,
+    /// How long an enrolment token is good for when its maker does not say.
+    pub enrolment_token_lifetime_ms: u64,
+}
+
+const DAY_MS: u64 = 24 * 60 * 60 * 1000;
+/// The longest lifetime anyone may ask for.
+const MAX_LIFETIME_MS: u64 = 10 * 365 * DAY_MS;
+
+impl Default for ActionSettings {
+    fn default() -> Self {
+        Self {
+            assignment_lifetime_ms: 7 * DAY_MS,
+            desired_lifetime_ms: 30 * DAY_MS,
+            enrolment_token_lifetime_ms: DAY_MS,
+        }
+    }
+}
+
+impl Actions {
+    /// Orders that go to `store` and are announced to `changes`; desired states are signed with `key`.
+    pub fn new(store: Store, clock: Clock, changes: Changes, key: SigningKey, settings: ActionSettings) -> Self {
+        Self { store, clock, changes, key: Arc::new(key), settings, envelopes: Arc::default() }
+    }
+}
+
+/// Why an order was not carried out. Nothing of it was.
+#[derive(Debug, thiserror::Error)]
+pub enum ActionError {
+    /// The selector means nobody, or nobody who has the task.
+    #[error("no robots match {0:?}")]
+    NoRobotsMatch(String),
+    /// The key came with another order before.
+    #[error("the idempotency key {0:?} was used for another order")]
+    IdempotencyKeyReused(String),
+    /// Text that is no idempotency key.
+    #[error("an idempotency key has 1 to 128 visible ASCII characters")]
+    InvalidIdempotencyKey,
+    /// A request that makes no sense.
+    #[error("{key}: {reason}")]
+    Invalid {
+        /// The request's key.
+        key: &'static str,
+        /// What is wrong with its value.
+        reason: String,
+    },
+    /// Someone is registered by this MAC.
+    #[error("a robot with MAC {mac} is registered as {name}; to register it again, make a token for that robot")]
+    MacKnown {
+        /// The MAC.
+        mac: MacAddress,
+        /// Who has it.
+        name: RobotName,
+    },
+    /// A token made for one robot was used by another.
+    #[error("this token is for the robot {name} with MAC {mac}")]
+    TokenForOther {
+        /// Whose it is.
+        name: RobotName,
+        /// The MAC of that robot.
+        mac: MacAddress,
+    },
+    /// Someone has this name.
+    #[error("a robot named {0} exists")]
+    NameTaken(RobotName),
+    /// The enrolment token is unknown, used up, expired or revoked.
+    #[error("the enrolment token is unknown, used up, expired or revoked")]
+    TokenRefused,
+    /// There is no such robot.
+    #[error("there is no robot {0:?}")]
+    RobotNotFound(String),
+    /// There is no such deployment.
+    #[error("there is no deployment {0}")]
+    DeploymentNotFound(DeploymentId),
+    /// The deployment was cancelled before.
+    #[error("deployment {0} was cancelled")]
+    DeploymentCancelled(DeploymentId),
+    /// The robot's generation is higher than ours: the database was restored. It is left alone until its next order.
+    #[error("robot {0} reports a later state than the server knows; it is left alone until its next order")]
+    Diverged(RobotId),
+    /// The database failed.
+    #[error("the database failed")]
+    Store(#[from] StoreError),
+}
+
+impl ActionError {
+    /// The stable code of the error on the wire.
+    pub fn code(&self) -> &'static str {
+        match self {
+            Self::NoRobotsMatch(_) => "no_robots_match",
+            Self::IdempotencyKeyReused(_) => "idempotency_key_reused",
+            Self::InvalidIdempotencyKey | Self::Invalid { .. } => "invalid_request",
+            Self::MacKnown { .. } => "mac_known",
+            Self::TokenForOther { .. } => "token_for_other_robot",
+            Self::NameTaken(_) => "name_taken",
+            Self::TokenRefused => "unauthorized",
+            Self::RobotNotFound(_) | Self::DeploymentNotFound(_) => "not_found",
+            Self::DeploymentCancelled(_) => "deployment_cancelled",
+            Self::Diverged(_) => "diverged",
+            Self::Store(_) => "internal",
+        }
+    }
+}
+
+/// What makes an order safe to repeat: 1 to 128 visible ASCII characters.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct IdempotencyKey(String);
+
+impl FromStr for IdempotencyKey {
+    type Err = ActionError;
+    fn from_str(text: &str) -> Result<Self, ActionError> {
+        let valid = (1..=128).contains(&text.len()) && text.bytes().all(|byte| byte.is_ascii_graphic());
+        if valid { Ok(Self(text.to_owned())) } else { Err(ActionError::InvalidIdempotencyKey) }
+    }
+}
+
+impl fmt::Display for IdempotencyKey {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}

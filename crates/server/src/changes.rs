@@ -1,0 +1,102 @@
+//! What has changed, told to whoever listens after the commit: notices for the event stream, and the robots whose
+//! desired state is new. It holds nothing that would be missed after a crash: both sides compare again on connect.
+
+use std::collections::BTreeSet;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use task_proto::{DeploymentId, RobotId, TaskName};
+use tokio::sync::{Notify, broadcast};
+
+/// Notices a slow listener may fall behind before it misses some.
+const NOTICES: usize = 16 * 1024;
+
+/// One thing that is new, changed or gone. The listener reads the store for what it is now.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Change {
+    /// A robot is new or has changed.
+    Robot(RobotId),
+    /// A robot was removed.
+    RobotRemoved(RobotId),
+    /// A deployment is new or has changed.
+    Deployment(DeploymentId),
+    /// A package was pushed or deleted.
+    Package(TaskName),
+}
+
+/// Where changes are announced. Clones announce to the same listeners.
+#[derive(Debug, Clone)]
+pub struct Changes {
+    notices: broadcast::Sender<Change>,
+    bells: Arc<Bells>,
+}
+
+/// Robots to ring: a set, so however often a robot's desired state changes it waits here once.
+#[derive(Debug, Default)]
+struct Bells {
+    waiting: Mutex<BTreeSet<RobotId>>,
+    rung: Notify,
+}
+
+impl Changes {
+    /// Nothing announced yet.
+    pub fn new() -> Self {
+        Self { notices: broadcast::Sender::new(NOTICES), bells: Arc::default() }
+    }
+
+    /// Every notice from now on.
+    pub fn subscribe(&self) -> broadcast::Receiver<Change> {
+        self.notices.subscribe()
+    }
+
+    /// Tells all listeners; nobody listening is fine.
+    pub fn announce(&self, change: Change) {
+        let _ = self.notices.send(change);
+    }
+
+    /// Asks that `robots` be told of their new desired state.
+    pub fn ring(&self, robots: impl IntoIterator<Item = RobotId>) {
+        let mut waiting = self.bells.waiting.lock().unwrap_or_else(PoisonError::into_inner);
+        waiting.extend(robots);
+        if !waiting.is_empty() {
+            self.bells.rung.notify_one();
+        }
+    }
+
+    /// Waits until there are robots to ring and takes them all. Made for one caller, the downlink; dropping the future
+    /// loses none.
+    pub async fn take_rings(&self) -> BTreeSet<RobotId> {
+        loop {
+            let taken = std::mem::take(&mut *self.bells.waiting.lock().unwrap_or_else(PoisonError::into_inner));
+            if !taken.is_empty() {
+                return taken;
+            }
+            self.bells.rung.notified().await;
+        }
+    }
+}
+
+impl Default for Changes {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_robot_rung_twice_is_taken_once() {
+        let changes = Changes::new();
+        let robot = RobotId::random();
+        changes.ring([robot.clone()]);
+        changes.ring([robot.clone()]);
+        assert_eq!(changes.take_rings().await, BTreeSet::from([robot.clone()]));
+        let waiting = tokio::spawn({
+            let changes = changes.clone();
+            async move { changes.take_rings().await }
+        });
+        changes.ring([robot.clone()]);
+        assert_eq!(waiting.await.expect("no panic"), BTreeSet::from([robot]));
+    }
+}

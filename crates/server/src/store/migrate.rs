@@ -1,0 +1,18 @@
+//! The tables, as a list of migrations that only grows: a migration that has shipped is never edited. Each is one SQL text
+//! for both databases, so it keeps to TEXT and BIGINT columns. A noun's tables are in its own file.
+
+use std::borrow::Cow;
+
+use sqlx::migrate::{MigrateError, Migration, MigrationType, Migrator};
+use sqlx::{AnyPool, SqlSafeStr};
+
+/// Version, name and text of every migration.
+const MIGRATIONS: &[(i64, &str, &str)] = &[(1, "fleet", include_str!("../migrations/0001_fleet.sql"))];
+
+/// Applies what has not been applied yet.
+pub(super) async fn run(pool: &AnyPool) -> Result<(), MigrateError> {
+    let migrations = MIGRATIONS.iter().map(|&(version, name, sql)| {
+        Migration::new(version, Cow::Borrowed(name), MigrationType::Simple, sql.into_sql_str(), false)
+    });
+    Migrator::with_migrations(migrations.collect()).run(pool).await
+}

@@ -1,0 +1,185 @@
+//! The database: the truth about robots, packages, orders and tokens. One SQL text serves SQLite and Postgres. It never
+//! decides what should happen (that is [`crate::deployment`] and [`crate::rollout`]) and never reads the clock.
+
+#![expect(clippy::disallowed_methods, reason = "SQL is at home here")]
+
+mod assignments;
+mod deployments;
+mod migrate;
+mod orders;
+mod reports;
+mod robots;
+mod rows;
+mod tokens;
+
+use std::path::Path;
+use std::time::Duration;
+
+use sqlx::any::{Any, AnyPoolOptions};
+use sqlx::{AnyConnection, AnyPool, Transaction};
+
+pub use assignments::TaskOrder;
+pub use tokens::TokenHolder;
+
+/// Connections that read at the same time.
+const READERS: u32 = 4;
+/// How long a statement waits for a connection or for another process's write.
+const PATIENCE: Duration = Duration::from_secs(30);
+
+/// The database. Clones share its connections.
+#[derive(Debug, Clone)]
+pub struct Store {
+    reads: AnyPool,
+    writes: AnyPool,
+}
+
+/// Why the database did not do as it was told.
+#[derive(Debug, thiserror::Error)]
+pub enum StoreError {
+    /// It can't be opened.
+    #[error("database {url} can't be opened")]
+    Open {
+        /// Which, without its password.
+        url: String,
+        /// Why.
+        source: sqlx::Error,
+    },
+    /// Its tables can't be brought up to date.
+    #[error("database {url} can't be migrated")]
+    Migrate {
+        /// Which, without its password.
+        url: String,
+        /// Why.
+        source: sqlx::migrate::MigrateError,
+    },
+    /// A statement failed.
+    #[error("the database refused a statement")]
+    Statement(#[from] sqlx::Error),
+    /// A row holds what this version can't read.
+    #[error("column {column} of the database holds what this version of taskd can't read")]
+    Unreadable {
+        /// Table and column.
+        column: &'static str,
+    },
+}
+
+impl StoreError {
+    /// Whether a unique index refused the row: someone else has the name or the key.
+    pub fn is_unique_violation(&self) -> bool {
+        matches!(self, Self::Statement(sqlx::Error::Database(error)) if error.is_unique_violation())
+    }
+}
+
+/// A write in progress: the only one, for it holds the write lock. Dropped without [`Write::commit`], it never was.
+pub struct Write {
+    transaction: Transaction<'static, Any>,
+    turn: u64,
+}
+
+impl Write {
+    /// The number of this write; a later write has a higher one.
+    pub fn turn(&self) -> u64 {
+        self.turn
+    }
+
+    /// Makes it so.
+    pub async fn commit(self) -> Result<(), StoreError> {
+        Ok(self.transaction.commit().await?)
+    }
+
+    /// Where the store's own statements run.
+    fn connection(&mut self) -> &mut AnyConnection {
+        &mut self.transaction
+    }
+}
+
+/// The URL of a SQLite database in a file, which is created if it is missing.
+pub fn sqlite_url(path: &Path) -> String {
+    let mut url = String::from("sqlite://");
+    for &byte in path.as_os_str().as_encoded_bytes() {
+        if byte.is_ascii_alphanumeric() || matches!(byte, b'/' | b'.' | b'_' | b'-' | b'~') {
+            url.push(char::from(byte));
+        } else {
+            url.push_str(&format!("%{byte:02X}"));
+        }
+    }
+    url.push_str("?mode=rwc");
+    url
+}
+
+impl Store {
+    /// Opens the database at a `sqlite:` or `postgres:` URL and brings its tables up to date.
+    pub async fn open(url: &str) -> Result<Self, StoreError> {
+        sqlx::any::install_default_drivers();
+        let open_error = |source| StoreError::Open { url: without_password(url), source };
+        // One writer: its transactions queue for this connection instead of failing each other.
+        let writes = pool_options(url, 1).connect(url).await.map_err(open_error)?;
+        migrate::run(&writes).await.map_err(|source| StoreError::Migrate { url: without_password(url), source })?;
+        let reads = pool_options(url, READERS).connect(url).await.map_err(open_error)?;
+        Ok(Self { reads, writes })
+    }
+
+    /// Ends all connections, after the writes that are under way.
+    pub async fn close(&self) {
+        self.writes.close().await;
+        self.reads.close().await;
+    }
+
+    /// Whether the database answers.
+    pub async fn ping(&self) -> Result<(), StoreError> {
+        sqlx::query("SELECT 1").execute(&self.reads).await?;
+        Ok(())
+    }
+
+    /// Begins a write. Its first statement is an update of one row that every write updates, so on both databases a
+    /// second write waits here, before it has read anything, until the first has ended.
+    pub async fn begin(&self) -> Result<Write, StoreError> {
+        let mut transaction = self.writes.begin().await?;
+        let turn: i64 = sqlx::query_scalar("UPDATE write_lock SET turn = turn + 1 WHERE id = 1 RETURNING turn")
+            .fetch_one(&mut *transaction)
+            .await?;
+        Ok(Write { transaction, turn: rows::number(turn) })
+    }
+}
+
+fn pool_options(url: &str, connections: u32) -> AnyPoolOptions {
+    let is_sqlite = url.starts_with("sqlite:");
+    AnyPoolOptions::new().max_connections(connections).acquire_timeout(PATIENCE).after_connect(move |connection, _| {
+        Box::pin(async move {
+            if is_sqlite {
+                // The pool can't carry SQLite's own options through `Any`. FULL: a commit survives a power cut.
+                sqlx::raw_sql(
+                    "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; PRAGMA foreign_keys = ON;
+                     PRAGMA busy_timeout = 30000; PRAGMA cache_size = -16384;",
+                )
+                .execute(connection)
+                .await?;
+            }
+            Ok(())
+        })
+    })
+}
+
+/// A URL as it may be shown: `user:password@` cut out.
+fn without_password(url: &str) -> String {
+    match (url.find("://"), url.rfind('@')) {
+        (Some(scheme), Some(at)) if scheme + 3 < at => format!("{}{}", &url[..scheme + 3], &url[at + 1..]),
+        _ => url.to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_shown_url_has_no_password() {
+        assert_eq!(without_password("postgres://u:p@ss@host/db"), "postgres://host/db");
+        assert_eq!(without_password("sqlite:///a.db"), "sqlite:///a.db");
+    }
+
+    #[test]
+    fn a_path_may_hold_any_character() {
+        assert_eq!(sqlite_url(Path::new("/a b?/c%.db")), "sqlite:///a%20b%3F/c%25.db?mode=rwc");
+    }
+}

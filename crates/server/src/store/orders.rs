@@ -1,0 +1,1 @@
+//! Idempotency keys of orders and the answers that were given.

@@ -1,0 +1,1 @@
+//! Reports: a batch read and written at a time.

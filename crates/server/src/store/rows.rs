@@ -1,0 +1,98 @@
+//! Between columns and types: numbers, JSON and ids, and lists of rows as one statement's `VALUES`. It knows no table.
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use std::str::FromStr;
+
+use super::StoreError;
+
+/// The most rows one statement carries; with [`groups`], a statement comes in few lengths, so its plan is reused.
+const MAX_ROWS: usize = 512;
+
+/// A stored number, which is never negative.
+pub(super) fn number(stored: i64) -> u64 {
+    u64::try_from(stored).unwrap_or(0)
+}
+
+/// A number to be stored. What a robot makes up beyond 2^63 is stored as that.
+pub(super) fn stored(number: u64) -> i64 {
+    i64::try_from(number).unwrap_or(i64::MAX)
+}
+
+/// A wire value as JSON text.
+pub(super) fn json<T: Serialize>(value: &T) -> String {
+    serde_json::to_string(value).expect("a wire type always has a JSON form")
+}
+
+/// JSON text of `column` read back.
+pub(super) fn from_json<T: DeserializeOwned>(column: &'static str, text: &str) -> Result<T, StoreError> {
+    serde_json::from_str(text).map_err(|_| StoreError::Unreadable { column })
+}
+
+/// The same for a column that may be empty.
+pub(super) fn from_optional_json<T: DeserializeOwned>(
+    column: &'static str,
+    text: Option<String>,
+) -> Result<Option<T>, StoreError> {
+    text.map(|text| from_json(column, &text)).transpose()
+}
+
+/// A wire value that is one word, without JSON's quotes.
+pub(super) fn word<T: Serialize>(value: &T) -> String {
+    json(value).trim_matches('"').to_owned()
+}
+
+/// The word of `column` read back.
+pub(super) fn from_word<T: DeserializeOwned>(column: &'static str, text: &str) -> Result<T, StoreError> {
+    serde_json::from_value(serde_json::Value::String(text.to_owned())).map_err(|_| StoreError::Unreadable { column })
+}
+
+/// An id of `column` read back.
+pub(super) fn id<T: FromStr>(column: &'static str, text: &str) -> Result<T, StoreError> {
+    text.parse().map_err(|_| StoreError::Unreadable { column })
+}
+
+/// Cuts rows into groups of 512, 64, 8 and 1.
+pub(super) fn groups<T>(mut rows: &[T]) -> impl Iterator<Item = &[T]> {
+    std::iter::from_fn(move || {
+        let size = [MAX_ROWS, MAX_ROWS / 8, MAX_ROWS / 64, 1].into_iter().find(|&size| size <= rows.len())?;
+        let (group, rest) = rows.split_at(size);
+        rows = rest;
+        Some(group)
+    })
+}
+
+/// `VALUES (CAST($n AS TEXT), …), …` for `rows` rows whose columns have `types`, counting parameters from `first`.
+pub(super) fn values(first: usize, rows: usize, types: &[&str]) -> String {
+    let mut text = String::from("VALUES ");
+    for row in 0..rows {
+        text.push_str(if row == 0 { "(" } else { ", (" });
+        for (column, kind) in types.iter().enumerate() {
+            let separator = if column == 0 { "" } else { ", " };
+            text.push_str(&format!("{separator}CAST(${} AS {kind})", first + row * types.len() + column));
+        }
+        text.push(')');
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn groups_cover_all_rows_in_few_lengths() {
+        let rows: Vec<u32> = (0..1_100).collect();
+        let lengths: Vec<usize> = groups(&rows).map(<[u32]>::len).collect();
+        assert_eq!(lengths, [512, 512, 64, 8, 1, 1, 1, 1]);
+        assert_eq!(groups(&rows).flatten().copied().collect::<Vec<_>>(), rows);
+    }
+
+    #[test]
+    fn values_count_on_from_the_first_parameter() {
+        assert_eq!(
+            values(3, 2, &["TEXT", "BIGINT"]),
+            "VALUES (CAST($3 AS TEXT), CAST($4 AS BIGINT)), (CAST($5 AS TEXT), CAST($6 AS BIGINT))"
+        );
+    }
+}

@@ -1,3 +1,11 @@
 //! The end-to-end tests: the real programs, started as processes, and the rules all of the source keeps.
 
+mod crash;
+mod harness;
+mod hostile;
+mod orders;
+mod proxy;
+mod registry;
+mod restore;
+mod talker;
 mod tidy;

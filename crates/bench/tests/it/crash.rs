@@ -1,0 +1,149 @@
+//! Power cuts: `kill -9` of agent and server at every kind of moment. Nothing is stuck, nothing is lost.
+
+use std::io::Write as _;
+
+use rand::RngExt as _;
+use rand::SeedableRng as _;
+use task_proto::api::RobotView;
+use task_proto::report::Phase;
+
+use crate::harness::{Fleet, Robot, Server, eventually, write_package};
+use crate::proxy::Proxy;
+
+fn pid_of(robot: &RobotView, task: &str) -> Option<u32> {
+    Some(robot.tasks.iter().find(|t| t.task.as_str() == task)?.active.as_ref()?.pid)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_fetch_goes_on_where_the_power_cut_stopped_it() {
+    const SIZE: usize = 200_000_000;
+    let dir = tempfile::tempdir().expect("temp dir");
+    let server = Server::start(&dir.path().join("server")).await;
+    let proxy = Proxy::start(server.http, 30_000_000).await;
+    let url = format!("http://{}", proxy.address);
+    let mut robot = Robot::start_with(&server, dir.path(), "robot-1", 1, &url, &[]).await;
+
+    let package = dir.path().join("heavy");
+    write_package(&package, "heavy", "1.0.0", "service", "exec sleep 1000\n");
+    // Random bytes do not compress, so what travels is what was asked for.
+    let mut random = rand::rngs::SmallRng::seed_from_u64(1);
+    let mut file = std::fs::File::create(package.join("ballast.bin")).expect("ballast");
+    let mut chunk = vec![0; 1_000_000];
+    for _ in 0..SIZE / chunk.len() {
+        random.fill(&mut chunk[..]);
+        file.write_all(&chunk).expect("written");
+    }
+    let deployment = server.push(&package, "*").await;
+    let total = deployment.package.content.size;
+
+    eventually("a third of the package to arrive", async || (proxy.bytes_to_clients() > total / 3).then_some(())).await;
+    robot.kill();
+    let part_bytes: u64 = std::fs::read_dir(robot.data().join("blobs/sha256"))
+        .expect("blob directory")
+        .filter_map(|entry| entry.ok())
+        .filter(|entry| entry.path().extension().is_some_and(|e| e == "part"))
+        .map(|entry| entry.metadata().expect("metadata").len())
+        .sum();
+    assert!(part_bytes > total / 4, "only {part_bytes} of {total} bytes were kept");
+    let before = proxy.bytes_to_clients();
+    proxy.set_rate(1_000_000_000);
+    robot.restart();
+    server.wait_phase("robot-1", "heavy", Phase::Running).await;
+    let after_restart = proxy.bytes_to_clients() - before;
+    let left = total - part_bytes;
+    assert!(after_restart < left + 1_000_000, "{after_restart} bytes were fetched, {left} were left");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_running_task_outlives_its_agent() {
+    let mut fleet = Fleet::start(1).await;
+    let package = fleet.package("steady", "1.0.0", "service", "exec sleep 1000\n");
+    fleet.server.push(&package, "*").await;
+    let before = fleet.server.wait_phase("robot-1", "steady", Phase::Running).await;
+    let pid = pid_of(&before, "steady").expect("a pid");
+
+    fleet.robots[0].kill();
+    fleet.robots[0].restart();
+    let start = before.host.clone();
+    eventually("the new agent to report the same process", async || {
+        let robot = fleet.server.robot("robot-1").await?;
+        (robot.online && pid_of(&robot, "steady") == Some(pid) && robot.host == start).then_some(())
+    })
+    .await;
+    assert!(std::path::Path::new(&format!("/proc/{pid}")).exists());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_order_survives_the_server() {
+    let mut fleet = Fleet::start(2).await;
+    let package = fleet.package("steady", "1.0.0", "service", "exec sleep 1000\n");
+    fleet.server.push(&package, "*").await;
+    fleet.server.kill();
+    fleet.server.restart().await;
+    for robot in ["robot-1", "robot-2"] {
+        fleet.server.wait_phase(robot, "steady", Phase::Running).await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn nothing_is_stuck_or_lost_after_a_hundred_power_cuts() {
+    let seed = rand::random::<u64>();
+    println!("seed {seed}");
+    let mut random = rand::rngs::SmallRng::seed_from_u64(seed);
+    let mut fleet = Fleet::start(2).await;
+    // Each job leaves a line per start, so that a second start of one run would show.
+    let starts = fleet.dir.path().join("starts");
+    std::fs::create_dir(&starts).expect("directory");
+    let mut newest = String::new();
+    let mut jobs = Vec::new();
+    for cut in 0..100 {
+        if cut % 10 == 0 {
+            newest = format!("1.0.{cut}");
+            let service = fleet.package("worker", &newest, "service", "exec sleep 1000\n");
+            fleet.server.push(&service, "*").await;
+            let script = format!("echo start >> {}/$TASKD_ASSIGNMENT-$$\n", starts.display());
+            let job = fleet.package(&format!("job-{cut}"), "1.0.0", "job", &script);
+            jobs.push(fleet.server.push(&job, "*").await.id);
+        }
+        let pause = std::time::Duration::from_millis(random.random_range(0..400));
+        match random.random_range(0..3) {
+            2 => {
+                // A moment picked at random is the point of this test.
+                tokio::time::sleep(pause).await;
+                fleet.server.kill();
+                fleet.server.restart().await;
+            }
+            robot => {
+                tokio::time::sleep(pause).await;
+                fleet.robots[robot].kill();
+                fleet.robots[robot].restart();
+            }
+        }
+    }
+    for robot in ["robot-1", "robot-2"] {
+        eventually(&format!("{robot} to run worker {newest}"), async || {
+            let view = fleet.server.robot(robot).await?;
+            let worker = view.tasks.iter().find(|t| t.task.as_str() == "worker")?;
+            let active = worker.active.as_ref()?;
+            (worker.phase == Phase::Running && active.version.as_str() == newest).then_some(())
+        })
+        .await;
+    }
+    for job in &jobs {
+        eventually(&format!("job {job} to settle"), async || {
+            let deployment = fleet.server.deployment(job.as_str()).await?;
+            deployment.assignments?.iter().all(|a| a.phase.is_final()).then_some(())
+        })
+        .await;
+        let deployment = fleet.server.deployment(job.as_str()).await.expect("known");
+        for assignment in deployment.assignments.expect("assignments") {
+            let started = std::fs::read_dir(&starts)
+                .expect("directory")
+                .filter(|f| f.as_ref().expect("entry").file_name().to_string_lossy().starts_with(job.as_str()))
+                .count();
+            assert!(started <= 2, "{job} was started {started} times on two robots");
+            let interrupted = assignment.failure.as_ref().is_some_and(|f| f.code.as_str() == "interrupted");
+            assert!(assignment.phase == Phase::Succeeded || interrupted, "{job}: {assignment:?}");
+        }
+    }
+}

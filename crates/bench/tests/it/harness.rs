@@ -1,0 +1,366 @@
+//! Starts the real programs with data directories of their own, on ports of their own, and ends them.
+//! It asks them only through their public faces: commands, the HTTP API, files an operator may read.
+#![expect(clippy::disallowed_methods, reason = "a test harness starts processes")]
+
+use std::ffi::OsStr;
+use std::fs::File;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+use task_proto::RobotId;
+use task_proto::api::{DeploymentView, RobotView};
+use task_proto::report::Phase;
+use tempfile::TempDir;
+
+/// How long anything that should happen may take on a busy machine.
+pub const PATIENCE: Duration = Duration::from_secs(90);
+
+/// The path of one of the workspace's programs.
+pub fn program(name: &str) -> PathBuf {
+    let test = std::env::current_exe().expect("own path");
+    let dir = test.parent().and_then(Path::parent).expect("target/debug");
+    let path = dir.join(name);
+    assert!(path.exists(), "{} is missing: run `cargo build --bins`, or ./scripts/test", path.display());
+    path
+}
+
+/// A variable that `./scripts/test` sets.
+pub fn required(variable: &str) -> String {
+    std::env::var(variable).unwrap_or_else(|_| panic!("{variable} is not set: run the tests with ./scripts/test"))
+}
+
+/// Asks again until there is an answer; fails with `what` when patience ends.
+pub async fn eventually<T>(what: &str, mut ask: impl AsyncFnMut() -> Option<T>) -> T {
+    let start = Instant::now();
+    let mut tick = tokio::time::interval(Duration::from_millis(50));
+    loop {
+        tick.tick().await;
+        if let Some(answer) = ask().await {
+            return answer;
+        }
+        assert!(start.elapsed() < PATIENCE, "after {PATIENCE:?} still waiting for {what}");
+    }
+}
+
+/// A child process that is killed when the test ends.
+pub struct Process(Child);
+
+impl Process {
+    pub fn spawn(command: &mut Command) -> Self {
+        Self(command.stdin(Stdio::null()).spawn().expect("program starts"))
+    }
+
+    pub fn pid(&self) -> i32 {
+        i32::try_from(self.0.id()).expect("pid")
+    }
+
+    /// What a power cut or `kill -9` does.
+    pub fn kill(&mut self) {
+        self.0.kill().expect("killable");
+        self.0.wait().expect("reaped");
+    }
+
+    /// SIGTERM, and its exit code.
+    pub fn terminate(&mut self) -> Option<i32> {
+        let pid = nix::unistd::Pid::from_raw(self.pid());
+        nix::sys::signal::kill(pid, nix::sys::signal::Signal::SIGTERM).expect("signalled");
+        self.0.wait().expect("reaped").code()
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// A `taskd serve` with its own data directory; it keeps its ports over restarts.
+pub struct Server {
+    process: Option<Process>,
+    data: PathBuf,
+    settings: Vec<(String, String)>,
+    pub http: SocketAddr,
+    pub mqtt: SocketAddr,
+    client: reqwest::Client,
+}
+
+impl Server {
+    pub async fn start(data: &Path) -> Self {
+        Self::start_with(data, &[]).await
+    }
+
+    /// Starts with further `TASKD_*` settings.
+    pub async fn start_with(data: &Path, settings: &[(&str, &str)]) -> Self {
+        let _ = rustls::crypto::ring::default_provider().install_default();
+        let any: SocketAddr = ([127, 0, 0, 1], 0).into();
+        let mut server = Self {
+            process: None,
+            data: data.to_owned(),
+            settings: settings.iter().map(|(k, v)| ((*k).to_owned(), (*v).to_owned())).collect(),
+            http: any,
+            mqtt: any,
+            client: reqwest::Client::builder().timeout(Duration::from_secs(20)).build().expect("client"),
+        };
+        server.launch().await;
+        server
+    }
+
+    async fn launch(&mut self) {
+        let addresses = self.data.join("addresses.json");
+        let _ = std::fs::remove_file(&addresses);
+        let log = log_file(&self.data.with_extension("server.log"));
+        let mut command = Command::new(program("taskd"));
+        command.arg("serve").arg("--data").arg(&self.data);
+        command.args(["--http", &self.http.to_string(), "--mqtt", &self.mqtt.to_string()]);
+        command.envs(self.settings.iter().map(|(k, v)| (k, v)));
+        command.stdout(log.try_clone().expect("log")).stderr(log);
+        self.process = Some(Process::spawn(&mut command));
+        let found: Value = eventually("taskd to write its addresses", async || {
+            serde_json::from_slice(&std::fs::read(&addresses).ok()?).ok()
+        })
+        .await;
+        let address = |key: &str| found[key].as_str().and_then(|a| a.parse().ok()).unwrap_or_else(|| panic!("{found}"));
+        (self.http, self.mqtt) = (address("http"), address("mqtt"));
+        let url = self.url("/readyz");
+        eventually("taskd to be ready", async || {
+            self.client.get(&url).send().await.ok().filter(|answer| answer.status().is_success())
+        })
+        .await;
+    }
+
+    pub fn pid(&self) -> i32 {
+        self.process.as_ref().expect("server runs").pid()
+    }
+
+    pub fn data(&self) -> &Path {
+        &self.data
+    }
+
+    pub fn kill(&mut self) {
+        self.process.take().expect("server runs").kill();
+    }
+
+    pub fn terminate(&mut self) -> Option<i32> {
+        self.process.take().expect("server runs").terminate()
+    }
+
+    /// Starts it again on the same data and ports.
+    pub async fn restart(&mut self) {
+        self.launch().await;
+    }
+
+    pub fn url(&self, path: &str) -> String {
+        format!("http://{}{path}", self.http)
+    }
+
+    pub fn operator_token(&self) -> String {
+        std::fs::read_to_string(self.data.join("operator.token")).expect("operator.token").trim().to_owned()
+    }
+
+    /// `GET` as the operator; `None` while the server is away.
+    pub async fn get(&self, path: &str) -> Option<Value> {
+        let answer = self.client.get(self.url(path)).bearer_auth(self.operator_token()).send().await.ok()?;
+        answer.status().is_success().then_some(())?;
+        answer.json().await.ok()
+    }
+
+    pub async fn robot(&self, robot: &str) -> Option<RobotView> {
+        serde_json::from_value(self.get(&format!("/api/v1/robots/{robot}")).await?).ok()
+    }
+
+    pub async fn deployment(&self, id: &str) -> Option<DeploymentView> {
+        serde_json::from_value(self.get(&format!("/api/v1/deployments/{id}")).await?).ok()
+    }
+
+    /// Waits until `robot` has `task` in `phase`, and gives the robot.
+    pub async fn wait_phase(&self, robot: &str, task: &str, phase: Phase) -> RobotView {
+        eventually(&format!("{task} on {robot} to be {phase}"), async || {
+            let view = self.robot(robot).await?;
+            view.tasks.iter().any(|t| t.task.as_str() == task && t.phase == phase).then_some(view)
+        })
+        .await
+    }
+
+    /// The operator's command line, ready to run.
+    pub fn command<S: AsRef<OsStr>>(&self, args: impl IntoIterator<Item = S>) -> Command {
+        let mut command = Command::new(program("taskd"));
+        command.args(args);
+        command.env("TASKD_SERVER", self.url("")).env("TASKD_TOKEN", self.operator_token());
+        command.stdin(Stdio::null());
+        command
+    }
+
+    /// Runs an operator's command that must end with status 0.
+    pub async fn operate<S: AsRef<OsStr>>(&self, args: impl IntoIterator<Item = S>) -> String {
+        let output = self.try_operate(args).await;
+        let (out, err) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+        assert!(output.status.success(), "{}\nstdout: {out}\nstderr: {err}", output.status);
+        out.into_owned()
+    }
+
+    /// Runs an operator's command, whatever its status.
+    pub async fn try_operate<S: AsRef<OsStr>>(&self, args: impl IntoIterator<Item = S>) -> Output {
+        let mut command = self.command(args);
+        tokio::task::spawn_blocking(move || command.output().expect("taskd runs")).await.expect("no panic")
+    }
+
+    /// Uploads `package` and orders it for `selector`; gives the deployment.
+    pub async fn push(&self, package: &Path, selector: &str) -> DeploymentView {
+        let package = package.to_str().expect("utf-8 path");
+        let out = self.operate(["push", package, "--to", selector, "--yes", "-o", "json"]).await;
+        serde_json::from_str(&out).unwrap_or_else(|error| panic!("{error}: {out}"))
+    }
+
+    pub async fn enrollment_token(&self) -> String {
+        let out = self.operate(["enroll-token", "create", "-o", "json"]).await;
+        let token: Value = serde_json::from_str(&out).expect("json");
+        token["token"].as_str().expect("a token").to_owned()
+    }
+}
+
+/// A `task-agent` with its own data directory and MAC.
+pub struct Robot {
+    process: Option<Process>,
+    data: PathBuf,
+    environment: Vec<(String, String)>,
+    pub name: String,
+    pub id: RobotId,
+}
+
+impl Robot {
+    /// Enrols over `url` (the server's own, or a proxy's before it) and starts.
+    pub async fn start(server: &Server, dir: &Path, name: &str, number: u8) -> Self {
+        Self::start_with(server, dir, name, number, &server.url(""), &[]).await
+    }
+
+    pub async fn start_with(
+        server: &Server,
+        dir: &Path,
+        name: &str,
+        number: u8,
+        url: &str,
+        environment: &[(&str, &str)],
+    ) -> Self {
+        let data = dir.join(name);
+        let token = server.enrollment_token().await;
+        let mut enroll = Command::new(program("task-agent"));
+        enroll.args(["enroll", "--server", url, "--token", &token, "--name", name]);
+        enroll.args(["--mac", &format!("02:00:00:00:00:{number:02x}")]).arg("--data").arg(&data);
+        let output =
+            tokio::task::spawn_blocking(move || enroll.output().expect("task-agent runs")).await.expect("no panic");
+        assert!(output.status.success(), "enroll: {}", String::from_utf8_lossy(&output.stderr));
+        let id = server.robot(name).await.expect("an enrolled robot").id;
+        let environment = environment.iter().map(|(k, v)| ((*k).to_owned(), (*v).to_owned())).collect();
+        let mut robot = Self { process: None, data, environment, name: name.to_owned(), id };
+        robot.restart();
+        robot
+    }
+
+    /// Starts the agent, which must not be running.
+    pub fn restart(&mut self) {
+        assert!(self.process.is_none(), "the agent of {} already runs", self.name);
+        let log = log_file(&self.data.with_extension("agent.log"));
+        let mut command = Command::new(program("task-agent"));
+        command.arg("run").arg("--data").arg(&self.data);
+        command.envs(self.environment.iter().map(|(k, v)| (k, v)));
+        command.stdout(log.try_clone().expect("log")).stderr(log);
+        self.process = Some(Process::spawn(&mut command));
+    }
+
+    pub fn kill(&mut self) {
+        self.process.take().expect("agent runs").kill();
+    }
+
+    pub fn terminate(&mut self) -> Option<i32> {
+        self.process.take().expect("agent runs").terminate()
+    }
+
+    pub fn pid(&self) -> i32 {
+        self.process.as_ref().expect("agent runs").pid()
+    }
+
+    pub fn data(&self) -> &Path {
+        &self.data
+    }
+}
+
+impl Drop for Robot {
+    /// Tasks outlive the agent on purpose; they must not outlive the test.
+    fn drop(&mut self) {
+        self.process = None;
+        end_processes_below(&self.data);
+    }
+}
+
+/// Kills every process of ours whose environment or command line names `dir`.
+fn end_processes_below(dir: &Path) {
+    let needle = dir.to_str().expect("utf-8 path").as_bytes().to_owned();
+    // Killing a shim frees its children; a few rounds find those too.
+    for _ in 0..3 {
+        for pid in processes_with(&needle) {
+            let _ = nix::sys::signal::kill(nix::unistd::Pid::from_raw(pid), nix::sys::signal::Signal::SIGKILL);
+        }
+    }
+}
+
+/// Pids whose environment or command line contains `needle`, our own process left out.
+pub fn processes_with(needle: &[u8]) -> Vec<i32> {
+    let own = i32::try_from(std::process::id()).expect("pid");
+    std::fs::read_dir("/proc")
+        .expect("/proc")
+        .filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok())
+        .filter(|&pid| pid != own)
+        .filter(|pid| {
+            ["environ", "cmdline"].iter().any(|file| {
+                std::fs::read(format!("/proc/{pid}/{file}"))
+                    .is_ok_and(|bytes| bytes.windows(needle.len()).any(|window| window == needle))
+            })
+        })
+        .collect()
+}
+
+/// A server and robots named `robot-1`, `robot-2`, …, each in a directory below one that goes with the test.
+pub struct Fleet {
+    // Robots end before the server, and both before their directory is removed.
+    pub robots: Vec<Robot>,
+    pub server: Server,
+    pub dir: TempDir,
+}
+
+impl Fleet {
+    pub async fn start(robots: u8) -> Self {
+        let dir = TempDir::new().expect("temp dir");
+        let server = Server::start(&dir.path().join("server")).await;
+        let mut fleet = Self { robots: Vec::new(), server, dir };
+        for number in 1..=robots {
+            let robot = Robot::start(&fleet.server, fleet.dir.path(), &format!("robot-{number}"), number).await;
+            fleet.robots.push(robot);
+        }
+        fleet
+    }
+
+    /// Writes a package that runs `script` with `sh`, and gives its directory.
+    pub fn package(&self, name: &str, version: &str, kind: &str, script: &str) -> PathBuf {
+        let dir = self.dir.path().join(format!("{name}-{version}"));
+        write_package(&dir, name, version, kind, script);
+        dir
+    }
+}
+
+/// Writes a package without ROS that runs `script` with `sh`.
+pub fn write_package(dir: &Path, name: &str, version: &str, kind: &str, script: &str) {
+    std::fs::create_dir_all(dir).expect("package directory");
+    let toml = format!(
+        "name = {name:?}\nversion = {version:?}\n[run]\nexec = [\"sh\", \"main.sh\"]\nkind = {kind:?}\nstop_timeout_s = 2\n[ready]\nhold_s = 0\n"
+    );
+    std::fs::write(dir.join("task.toml"), toml).expect("task.toml");
+    std::fs::write(dir.join("main.sh"), script).expect("main.sh");
+}
+
+fn log_file(path: &Path) -> File {
+    File::options().create(true).append(true).open(path).expect("log file")
+}

@@ -1,0 +1,174 @@
+//! What someone with an operator's or one robot's credentials may try: hostile archives, other robots' topics.
+
+use std::path::Path;
+use std::time::Duration;
+
+use rumqttc::{AsyncClient, ConnectReturnCode, ConnectionError, Event, MqttOptions, Packet, QoS, SubscribeReasonCode};
+use serde_json::json;
+use task_proto::Digest;
+use task_proto::desired::BlobRef;
+use task_proto::oci::ImageManifest;
+use task_proto::report::Phase;
+
+use crate::harness::{Fleet, Server, eventually};
+
+/// One tar entry, header written by hand: the `tar` crate refuses to write most of these.
+fn entry(name: &str, kind: u8, link: &str, data: &[u8]) -> Vec<u8> {
+    let mut header = [0_u8; 512];
+    header[..name.len()].copy_from_slice(name.as_bytes());
+    header[100..107].copy_from_slice(b"0000644");
+    header[108..115].copy_from_slice(b"0000000");
+    header[116..123].copy_from_slice(b"0000000");
+    header[124..135].copy_from_slice(format!("{:011o}", data.len()).as_bytes());
+    header[136..147].copy_from_slice(b"00000000000");
+    header[156] = kind;
+    header[157..157 + link.len()].copy_from_slice(link.as_bytes());
+    header[257..263].copy_from_slice(b"ustar\0");
+    header[263..265].copy_from_slice(b"00");
+    header[148..156].copy_from_slice(b"        ");
+    let sum: u32 = header.iter().map(|&b| u32::from(b)).sum();
+    header[148..156].copy_from_slice(format!("{sum:06o}\0 ").as_bytes());
+    let mut bytes = header.to_vec();
+    bytes.extend_from_slice(data);
+    bytes.resize(bytes.len().next_multiple_of(512), 0);
+    bytes
+}
+
+fn archive(entries: &[Vec<u8>]) -> Vec<u8> {
+    let mut tar = entries.concat();
+    tar.extend_from_slice(&[0; 1024]);
+    tar
+}
+
+/// Uploads a package whose content is `tar`, past `taskd push` and its checks, as any OCI client could; gives its digest.
+async fn upload(server: &Server, name: &str, tar: &[u8], entries: usize) -> Digest {
+    let content = zstd::encode_all(tar, 3).expect("compressed");
+    let config = json!({
+        "name": name, "version": "1.0.0", "run": {"exec": ["sh", "-c", "exec sleep 1000"]},
+        "content": {"tar_digest": Digest::of(tar), "tar_size": tar.len(), "entries": entries},
+    });
+    let config = serde_json::to_vec(&config).expect("json");
+    let blob = |bytes: &[u8]| BlobRef { digest: Digest::of(bytes), size: bytes.len() as u64 };
+    let manifest = serde_json::to_vec(&ImageManifest::package(blob(&config), blob(&content))).expect("json");
+    let client = reqwest::Client::new();
+    for bytes in [&config, &content] {
+        let url = server.url(&format!("/v2/{name}/blobs/uploads/?digest={}", Digest::of(bytes)));
+        let answer =
+            client.post(url).bearer_auth(server.operator_token()).body(bytes.clone()).send().await.expect("sent");
+        assert_eq!(answer.status(), 201);
+    }
+    let answer = client
+        .put(server.url(&format!("/v2/{name}/manifests/1.0.0")))
+        .bearer_auth(server.operator_token())
+        .header("content-type", task_proto::oci::MANIFEST_TYPE)
+        .body(manifest.clone())
+        .send()
+        .await
+        .expect("sent");
+    assert_eq!(answer.status(), 201, "{}", answer.text().await.unwrap_or_default());
+    Digest::of(&manifest)
+}
+
+fn tree(dir: &Path) -> Vec<std::path::PathBuf> {
+    let mut found: Vec<_> = std::fs::read_dir(dir).expect("readable").map(|e| e.expect("entry").path()).collect();
+    found.sort();
+    found
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn hostile_archives_fail_with_their_reason() {
+    let fleet = Fleet::start(1).await;
+    let robot = fleet.robots[0].data();
+    let outside = tree(fleet.dir.path());
+    let file = |name: &str| entry(name, b'0', "", b"x");
+    let cases: Vec<(&str, Vec<Vec<u8>>, &str)> = vec![
+        ("dotdot", vec![file("../escape")], ".."),
+        ("absolute", vec![file("/tmp/taskd-escape")], "absolute"),
+        ("symlink", vec![entry("link", b'2', "/etc", b""), file("link/escape")], "link"),
+        ("hardlink", vec![entry("link", b'1', "../../ledger.json", b"")], "link"),
+        ("device", vec![entry("null", b'3', "", b"")], "device"),
+        ("fifo", vec![entry("pipe", b'6', "", b"")], "fifo"),
+        ("duplicate", vec![file("twice"), file("./twice")], "twice"),
+        ("bomb", vec![entry("zeros", b'0', "", &vec![0; 300_000_000])], "ratio"),
+    ];
+    for (name, entries, reason) in cases {
+        let digest = upload(&fleet.server, name, &archive(&entries), entries.len()).await;
+        let answer = reqwest::Client::new()
+            .post(fleet.server.url("/api/v1/deployments"))
+            .bearer_auth(fleet.server.operator_token())
+            .header("idempotency-key", name)
+            .json(&json!({"package": name, "manifest": digest, "selector": "*"}))
+            .send()
+            .await
+            .expect("sent");
+        assert!(answer.status().is_success(), "{}", answer.text().await.unwrap_or_default());
+        let view = fleet.server.wait_phase("robot-1", name, Phase::Failed).await;
+        let task = view.tasks.iter().find(|t| t.task.as_str() == name).expect("task");
+        let failure = task.failure.as_ref().expect("a reason");
+        assert_eq!(failure.code.as_str(), "archive_refused", "{name}: {failure}");
+        assert!(failure.text.to_lowercase().contains(reason), "{name}: {failure}");
+    }
+    assert_eq!(tree(fleet.dir.path()), outside, "something was written outside the robot's directory");
+    assert!(!Path::new("/tmp/taskd-escape").exists());
+    assert!(!robot.join("escape").exists() && !robot.join("tasks/escape").exists());
+}
+
+async fn next_packet(events: &mut rumqttc::EventLoop) -> Result<Packet, ConnectionError> {
+    loop {
+        if let Event::Incoming(packet) =
+            tokio::time::timeout(Duration::from_secs(20), events.poll()).await.expect("an answer")?
+        {
+            return Ok(packet);
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn one_robots_credentials_reach_no_other_robot() {
+    let mut fleet = Fleet::start(2).await;
+    let identity: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(fleet.robots[0].data().join("identity.json")).expect("identity"))
+            .expect("json");
+    fleet.robots[0].terminate();
+    let (own, other) = (fleet.robots[0].id.to_string(), fleet.robots[1].id.to_string());
+    let options = |password: &str| {
+        let mut options = MqttOptions::new(&own, fleet.server.mqtt.ip().to_string(), fleet.server.mqtt.port());
+        options.set_credentials(&own, password);
+        options
+    };
+    let (_client, mut events) = AsyncClient::new(options("wrong"), 10);
+    match next_packet(&mut events).await {
+        Err(ConnectionError::ConnectionRefused(ConnectReturnCode::BadUserNamePassword)) => {}
+        other => panic!("expected CONNACK 4, got {other:?}"),
+    }
+
+    let token = identity["token"].as_str().expect("token");
+    let (client, mut events) = AsyncClient::new(options(token), 10);
+    assert!(matches!(next_packet(&mut events).await, Ok(Packet::ConnAck(_))));
+    for filter in ["#", "taskd/v1/#", "+/+/+/+/+", &format!("taskd/v1/r/{other}/desired"), "$SYS/#"] {
+        client.subscribe(filter, QoS::AtMostOnce).await.expect("queued");
+        loop {
+            match next_packet(&mut events).await {
+                Ok(Packet::SubAck(ack)) => {
+                    assert_eq!(ack.return_codes, [SubscribeReasonCode::Failure], "{filter}");
+                    break;
+                }
+                Ok(_) => {}
+                Err(error) => panic!("{filter}: {error}"),
+            }
+        }
+    }
+    client.publish(format!("taskd/v1/r/{other}/report"), QoS::AtLeastOnce, false, "{}").await.expect("queued");
+    let refused = async {
+        loop {
+            match next_packet(&mut events).await {
+                Ok(Packet::PubAck(_)) => panic!("a forged report was acknowledged"),
+                Ok(_) => {}
+                Err(_) => return,
+            }
+        }
+    };
+    refused.await;
+    // The other robot is none the worse.
+    eventually("the other robot to be online", async || fleet.server.robot(&other).await?.online.then_some(())).await;
+}

@@ -1,0 +1,68 @@
+//! A TCP proxy that counts what passes and can slow it down: bad Wi-Fi, and a witness of what was transferred.
+//! It never looks into the bytes.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpListener, TcpStream};
+
+/// A running proxy; it ends with the test's runtime.
+pub struct Proxy {
+    pub address: SocketAddr,
+    to_client: Arc<AtomicU64>,
+    bytes_per_s: Arc<AtomicU64>,
+}
+
+impl Proxy {
+    /// Listens on a port of its own and forwards to `target`, downstream at most `bytes_per_s` per connection.
+    pub async fn start(target: SocketAddr, bytes_per_s: u64) -> Self {
+        let listener = TcpListener::bind("127.0.0.1:0").await.expect("port");
+        let proxy = Self {
+            address: listener.local_addr().expect("bound"),
+            to_client: Arc::default(),
+            bytes_per_s: Arc::new(AtomicU64::new(bytes_per_s)),
+        };
+        let (counter, rate) = (proxy.to_client.clone(), proxy.bytes_per_s.clone());
+        tokio::spawn(async move {
+            while let Ok((client, _)) = listener.accept().await {
+                tokio::spawn(forward(client, target, counter.clone(), rate.clone()));
+            }
+        });
+        proxy
+    }
+
+    /// Bytes that were passed to clients so far.
+    pub fn bytes_to_clients(&self) -> u64 {
+        self.to_client.load(Ordering::SeqCst)
+    }
+
+    pub fn set_rate(&self, bytes_per_s: u64) {
+        self.bytes_per_s.store(bytes_per_s, Ordering::SeqCst);
+    }
+}
+
+async fn forward(client: TcpStream, target: SocketAddr, counter: Arc<AtomicU64>, rate: Arc<AtomicU64>) {
+    let Ok(server) = TcpStream::connect(target).await else { return };
+    let (mut from_client, mut to_client) = client.into_split();
+    let (mut from_server, mut to_server) = server.into_split();
+    let upstream = async {
+        let _ = tokio::io::copy(&mut from_client, &mut to_server).await;
+    };
+    let downstream = async {
+        let mut buffer = vec![0; 64 * 1024];
+        while let Ok(count @ 1..) = from_server.read(&mut buffer).await {
+            let pause = Duration::from_secs_f64(count as f64 / rate.load(Ordering::SeqCst) as f64);
+            // A timer, not a guess: this is what makes the link slow.
+            let (written, ()) = tokio::join!(to_client.write_all(&buffer[..count]), tokio::time::sleep(pause));
+            if written.is_err() {
+                return;
+            }
+            counter.fetch_add(count as u64, Ordering::SeqCst);
+        }
+    };
+    // Either side closing ends both, as a broken link does.
+    tokio::select! { () = upstream => {}, () = downstream => {} }
+}

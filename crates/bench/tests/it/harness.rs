@@ -53,10 +53,6 @@ impl Process {
         Self(command.stdin(Stdio::null()).spawn().expect("program starts"))
     }
 
-    pub fn pid(&self) -> i32 {
-        i32::try_from(self.0.id()).expect("pid")
-    }
-
     /// What a power cut or `kill -9` does.
     pub fn kill(&mut self) {
         self.0.kill().expect("killable");
@@ -65,7 +61,7 @@ impl Process {
 
     /// SIGTERM, and its exit code.
     pub fn terminate(&mut self) -> Option<i32> {
-        let pid = nix::unistd::Pid::from_raw(self.pid());
+        let pid = nix::unistd::Pid::from_raw(i32::try_from(self.0.id()).expect("pid"));
         nix::sys::signal::kill(pid, nix::sys::signal::Signal::SIGTERM).expect("signalled");
         self.0.wait().expect("reaped").code()
     }
@@ -130,10 +126,6 @@ impl Server {
             self.client.get(&url).send().await.ok().filter(|answer| answer.status().is_success())
         })
         .await;
-    }
-
-    pub fn pid(&self) -> i32 {
-        self.process.as_ref().expect("server runs").pid()
     }
 
     pub fn data(&self) -> &Path {
@@ -277,10 +269,6 @@ impl Robot {
 
     pub fn terminate(&mut self) -> Option<i32> {
         self.process.take().expect("agent runs").terminate()
-    }
-
-    pub fn pid(&self) -> i32 {
-        self.process.as_ref().expect("agent runs").pid()
     }
 
     pub fn data(&self) -> &Path {

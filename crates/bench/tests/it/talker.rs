@@ -1,4 +1,5 @@
 //! The foundation's promise: a real ROS 2 package travels from a directory to two robots, is built there, runs and reports.
+#![expect(clippy::disallowed_methods, reason = "a test starts processes")]
 
 use std::path::Path;
 
@@ -22,7 +23,6 @@ async fn trigger(venv: &Path, domain: &str, name: &str) -> String {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-#[expect(clippy::disallowed_methods, reason = "a test starts processes")]
 async fn the_talker_runs_on_two_robots_and_answers() {
     let venv = required("TASKD_TEST_ROS");
     let venv = Path::new(&venv);

@@ -116,6 +116,22 @@ text_id!(
     }
 );
 text_id!(
+    /// An OCI repository's name; that of a package's repository is its [`TaskName`].
+    RepositoryName, "repository name",
+    "at most 255 bytes of components joined by '/', each lower-case letters and digits joined by one '.', one or two '_' \
+     or any number of '-'", |t| {
+        t.len() <= 255 && t.split('/').all(is_repository_component)
+    }
+);
+text_id!(
+    /// A name for a manifest inside its repository.
+    Tag, "tag", "at most 128 letters, digits, '.', '_' and '-', not starting with '.' or '-'", |t| {
+        t.len() <= 128
+            && t.bytes().next().is_some_and(|b| b.is_ascii_alphanumeric() || b == b'_')
+            && t.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-'))
+    }
+);
+text_id!(
     /// The name people give a robot.
     RobotName, "robot name", "1 to 64 letters, digits, '.', '_' and '-', not starting with '.' or '-'", |t| {
         t.len() <= 64
@@ -133,6 +149,15 @@ text_id!(
     /// A label's value; it may be empty.
     LabelValue, "label value", "at most 63 letters, digits, '.', '_', '/' and '-'", is_label_text
 );
+
+fn is_repository_component(text: &str) -> bool {
+    let is_word = |b: u8| b.is_ascii_lowercase() || b.is_ascii_digit();
+    let is_separator = |s: &[u8]| matches!(s, b"." | b"_" | b"__") || s.iter().all(|&b| b == b'-');
+    let bytes = text.as_bytes();
+    bytes.first().is_some_and(|&b| is_word(b))
+        && bytes.last().is_some_and(|&b| is_word(b))
+        && bytes.chunk_by(|&a, &b| is_word(a) == is_word(b)).all(|run| is_word(run[0]) || is_separator(run))
+}
 
 fn is_label_text(text: &str) -> bool {
     text.len() <= 63 && text.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'/' | b'-'))
@@ -247,6 +272,21 @@ mod tests {
         let long = "a".repeat(65);
         for bad in ["", "A", "a__b", "_a", "a-", "..", "a/b", "a b", "ä", long.as_str()] {
             assert!(bad.parse::<TaskName>().is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn repository_names_and_tags_follow_the_oci_grammar() {
+        for good in ["talker", "a/b/c", "a__b/c.d-e", "a---b", "7/8"] {
+            assert!(good.parse::<RepositoryName>().is_ok(), "{good}");
+        }
+        let long = "a/".repeat(200);
+        for bad in ["", "/", "a/", "/a", "a//b", "a___b", "a..b", "a_-b", "-a", "a/B", "a/..", "a b", long.as_str()] {
+            assert!(bad.parse::<RepositoryName>().is_err(), "{bad}");
+        }
+        assert!("v1.0_x-Y".parse::<Tag>().is_ok());
+        for bad in ["", ".a", "-a", "a b", "a:b", "a".repeat(129).as_str()] {
+            assert!(bad.parse::<Tag>().is_err(), "{bad}");
         }
     }
 

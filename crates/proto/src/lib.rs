@@ -14,4 +14,6 @@ pub mod token;
 pub mod topic;
 
 pub use digest::Digest;
-pub use id::{DeploymentId, Generation, InstanceId, MacAddress, RobotId, RobotName, TaskName, Version};
+pub use id::{
+    DeploymentId, Generation, InstanceId, MacAddress, RepositoryName, RobotId, RobotName, Tag, TaskName, Version,
+};

@@ -1,6 +1,7 @@
 //! The server half: everything `taskd` does. Imports run downward only; see ARCHITECTURE.md.
 
 pub mod actions;
+pub mod blobs;
 pub mod broker;
 pub mod changes;
 pub mod clock;

@@ -1,0 +1,380 @@
+//! The blob store: bytes on disk under the digest they hash to, in `blobs/sha256/<hex>`. A blob is renamed into place
+//! when it is whole, verified and synced, and never modified afterwards. It knows no repositories and no references: what
+//! may be deleted is [`crate::collector`]'s decision. A blob's modification time is when it was last asked for by someone
+//! who pushes; its content is never judged by it.
+
+mod body;
+mod upload;
+
+use std::collections::VecDeque;
+use std::fs::{self, File};
+use std::io::{self, Write as _};
+use std::os::unix::fs::FileExt as _;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, SystemTime};
+
+use bytes::Bytes;
+use task_proto::Digest;
+use tokio::sync::{OwnedRwLockReadGuard, OwnedRwLockWriteGuard, RwLock};
+
+pub use body::BlobBody;
+use upload::Uploads;
+pub use upload::{InvalidUploadId, UploadId};
+
+/// How a blob's bytes are read.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Reading {
+    /// From a shared mapping of the file: the fastest.
+    #[default]
+    Mmap,
+    /// By `pread` into fresh memory: a failing disk is an error here, where a mapping would end the process.
+    Pread,
+}
+
+/// The blob store's limits and choices.
+#[derive(Debug, Clone, Copy)]
+pub struct BlobSettings {
+    /// How blobs are read.
+    pub reading: Reading,
+    /// The largest blob that is accepted.
+    pub max_blob_bytes: u64,
+    /// The most uploads that may be unfinished at once.
+    pub max_uploads: usize,
+    /// The most blobs kept open for the next reader.
+    pub max_open_blobs: usize,
+}
+
+impl Default for BlobSettings {
+    fn default() -> Self {
+        Self { reading: Reading::Mmap, max_blob_bytes: 16 << 30, max_uploads: 256, max_open_blobs: 64 }
+    }
+}
+
+/// Why the blob store did not do it.
+#[derive(Debug, thiserror::Error)]
+pub enum BlobError {
+    /// There is no such unfinished upload.
+    #[error("no such upload: it was finished, cancelled or given up")]
+    UploadUnknown,
+    /// Another request writes to the same upload.
+    #[error("another request is writing to this upload")]
+    UploadBusy,
+    /// [`BlobSettings::max_uploads`] is reached.
+    #[error("{max} uploads are unfinished already; finish or cancel one")]
+    TooManyUploads {
+        /// The limit.
+        max: usize,
+    },
+    /// A chunk does not begin where the upload stands.
+    #[error("the chunk begins at byte {given}, the upload stands at {offset}")]
+    OutOfOrder {
+        /// Where the chunk begins.
+        given: u64,
+        /// Where it has to begin.
+        offset: u64,
+    },
+    /// More bytes than a blob may have.
+    #[error("the blob is larger than this server's limit of {max} bytes")]
+    TooLarge {
+        /// The limit.
+        max: u64,
+    },
+    /// A chunk was shorter or longer than announced.
+    #[error("{expected} bytes were announced, {received} came")]
+    WrongLength {
+        /// What was announced.
+        expected: u64,
+        /// What came.
+        received: u64,
+    },
+    /// The bytes hash to something else.
+    #[error("the bytes hash to {actual}, not to {expected}")]
+    WrongDigest {
+        /// What was announced.
+        expected: Digest,
+        /// What they hash to.
+        actual: Digest,
+    },
+    /// The sender went away.
+    #[error("the upload's body broke off")]
+    Interrupted(#[source] Box<dyn std::error::Error + Send + Sync>),
+    /// The disk is full.
+    #[error("the server's disk is full")]
+    DiskFull,
+    /// The disk refused.
+    #[error("the blob store can't {action} {path}")]
+    Disk {
+        /// What was tried.
+        action: &'static str,
+        /// On which file.
+        path: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+}
+
+impl BlobError {
+    fn disk(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Self {
+        let path = path.to_owned();
+        move |source| match source.kind() {
+            io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => Self::DiskFull,
+            _ => Self::Disk { action, path, source },
+        }
+    }
+}
+
+/// The blob store. Clones are the same store.
+#[derive(Clone)]
+pub struct Blobs {
+    shared: Arc<Shared>,
+}
+
+struct Shared {
+    directory: PathBuf,
+    settings: BlobSettings,
+    uploads: Uploads,
+    /// Blobs opened before, the latest first: opening and mapping costs more than a small blob's bytes.
+    open: Mutex<VecDeque<Blob>>,
+    collection: Arc<RwLock<()>>,
+}
+
+/// A blob to read. It stays readable while this lives, even if the blob is deleted.
+#[derive(Clone)]
+pub struct Blob {
+    digest: Digest,
+    size: u64,
+    source: Source,
+}
+
+#[derive(Clone)]
+enum Source {
+    Mapped(Bytes),
+    File(Arc<File>),
+}
+
+/// While this lives, no blob is collected: whoever found one present can still rely on it.
+pub struct NoCollection {
+    _guard: OwnedRwLockReadGuard<()>,
+}
+
+/// While this lives, nobody relies on what [`NoCollection`] protects.
+pub struct Collection {
+    _guard: OwnedRwLockWriteGuard<()>,
+}
+
+impl Blobs {
+    /// Opens the store in `data`, which gets the directories `blobs` and `uploads`.
+    pub fn open(data: &Path, settings: BlobSettings) -> Result<Self, BlobError> {
+        let directory = data.join("blobs/sha256");
+        fs::create_dir_all(&directory).map_err(BlobError::disk("create", &directory))?;
+        let uploads = Uploads::open(data.join("uploads"), settings)?;
+        let open = Mutex::new(VecDeque::with_capacity(settings.max_open_blobs));
+        let shared = Shared { directory, settings, uploads, open, collection: Arc::default() };
+        Ok(Self { shared: Arc::new(shared) })
+    }
+
+    /// The limits and choices this store was opened with.
+    pub fn settings(&self) -> BlobSettings {
+        self.shared.settings
+    }
+
+    /// Holds back the collector.
+    pub async fn hold_collection(&self) -> NoCollection {
+        NoCollection { _guard: Arc::clone(&self.shared.collection).read_owned().await }
+    }
+
+    /// Waits until nobody holds back the collector, and holds back everybody else.
+    pub async fn begin_collection(&self) -> Collection {
+        Collection { _guard: Arc::clone(&self.shared.collection).write_owned().await }
+    }
+
+    /// The blob, if it is here.
+    pub async fn get(&self, digest: Digest) -> Result<Option<Blob>, BlobError> {
+        if let Some(blob) = self.take_from_open(digest) {
+            return Ok(Some(blob));
+        }
+        let path = self.path(digest);
+        let reading = self.shared.settings.reading;
+        let opened = on_disk(move || match Blob::open(digest, &path, reading) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+            opened => opened.map(Some).map_err(BlobError::disk("open", &path)),
+        });
+        let blob = opened.await?;
+        if let Some(blob) = &blob {
+            self.put_in_open(blob.clone());
+        }
+        Ok(blob)
+    }
+
+    /// Stores small bytes that are in memory already, and says what they hash to.
+    pub async fn put(&self, bytes: Bytes) -> Result<Digest, BlobError> {
+        let digest = Digest::of(&bytes);
+        let partial = self.shared.uploads.fresh_path();
+        let target = self.path(digest);
+        on_disk(move || {
+            let write = || {
+                let mut file = File::create_new(&partial)?;
+                file.write_all(&bytes)?;
+                file.sync_all()
+            };
+            let stored =
+                write().map_err(BlobError::disk("write", &partial)).and_then(|()| move_into_place(&partial, &target));
+            if stored.is_err() {
+                // Best effort: what stays is removed at the next start.
+                let _ = fs::remove_file(&partial);
+            }
+            stored
+        })
+        .await?;
+        Ok(digest)
+    }
+
+    /// Notes that somebody who pushes counts on the blob; false if it is not here.
+    pub async fn touch(&self, digest: Digest, now_ms: u64) -> Result<bool, BlobError> {
+        let path = self.path(digest);
+        on_disk(move || {
+            let modified = SystemTime::UNIX_EPOCH + Duration::from_millis(now_ms);
+            match File::open(&path).and_then(|file| file.set_modified(modified)) {
+                Ok(()) => Ok(true),
+                Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
+                Err(error) => Err(BlobError::disk("touch", &path)(error)),
+            }
+        })
+        .await
+    }
+
+    /// The blobs last touched before `before_ms`.
+    pub async fn untouched_since(&self, before_ms: u64) -> Result<Vec<Digest>, BlobError> {
+        let directory = self.shared.directory.clone();
+        on_disk(move || {
+            let list = || {
+                let mut found = Vec::new();
+                for entry in fs::read_dir(&directory)? {
+                    let entry = entry?;
+                    let name = entry.file_name();
+                    let Some(Ok(digest)) = name.to_str().map(|hex| format!("sha256:{hex}").parse()) else { continue };
+                    if modified_ms(&entry.metadata()?)? < before_ms {
+                        found.push(digest);
+                    }
+                }
+                Ok(found)
+            };
+            list().map_err(BlobError::disk("list", &directory))
+        })
+        .await
+    }
+
+    /// Deletes a blob. Only the collector may, which knows that nothing refers to it.
+    pub async fn delete(&self, digest: Digest, _collection: &Collection) -> Result<(), BlobError> {
+        self.take_from_open(digest);
+        let path = self.path(digest);
+        on_disk(move || match fs::remove_file(&path) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => Err(BlobError::disk("delete", &path)(error)),
+            _ => Ok(()),
+        })
+        .await?;
+        // A reader may have opened it in between; it keeps its copy, later ones shall not find it.
+        self.take_from_open(digest);
+        Ok(())
+    }
+
+    fn path(&self, digest: Digest) -> PathBuf {
+        self.shared.directory.join(digest.hex())
+    }
+
+    fn take_from_open(&self, digest: Digest) -> Option<Blob> {
+        let mut open = self.shared.open.lock().unwrap_or_else(PoisonError::into_inner);
+        let at = open.iter().position(|blob| blob.digest == digest)?;
+        open.remove(at)
+    }
+
+    fn put_in_open(&self, blob: Blob) {
+        let mut open = self.shared.open.lock().unwrap_or_else(PoisonError::into_inner);
+        open.retain(|other| other.digest != blob.digest);
+        open.push_front(blob);
+        open.truncate(self.shared.settings.max_open_blobs);
+    }
+}
+
+impl Blob {
+    fn open(digest: Digest, path: &Path, reading: Reading) -> io::Result<Self> {
+        let file = File::open(path)?;
+        let size = file.metadata()?.len();
+        let source = match reading {
+            // An empty file can't be mapped.
+            Reading::Mmap if size > 0 => {
+                // SAFETY: nothing modifies or truncates a file after it was renamed into the store; deleting it leaves
+                // the mapping intact.
+                let mapping = unsafe { memmap2::Mmap::map(&file) }?;
+                Source::Mapped(Bytes::from_owner(mapping))
+            }
+            Reading::Mmap | Reading::Pread => Source::File(Arc::new(file)),
+        };
+        Ok(Self { digest, size, source })
+    }
+
+    /// What it hashes to.
+    pub fn digest(&self) -> Digest {
+        self.digest
+    }
+
+    /// Its size in bytes.
+    pub fn size(&self) -> u64 {
+        self.size
+    }
+
+    /// The bytes of `range`, which lies inside the blob, as the body of an answer.
+    pub fn body(&self, range: std::ops::Range<u64>) -> BlobBody {
+        BlobBody::new(self.clone(), range)
+    }
+
+    /// All of it in memory. For small blobs: the caller has checked [`Blob::size`].
+    pub async fn read(&self) -> Result<Bytes, BlobError> {
+        let blob = self.clone();
+        on_disk(move || {
+            let length = usize::try_from(blob.size).unwrap_or(usize::MAX);
+            blob.read_at(0, length).map_err(BlobError::disk("read", Path::new(&blob.digest.hex())))
+        })
+        .await
+    }
+
+    fn read_at(&self, offset: u64, length: usize) -> io::Result<Bytes> {
+        match &self.source {
+            Source::Mapped(bytes) => {
+                let start = usize::try_from(offset).map_err(io::Error::other)?;
+                Ok(bytes.slice(start..start + length))
+            }
+            Source::File(file) => {
+                let mut bytes = vec![0; length];
+                file.read_exact_at(&mut bytes, offset)?;
+                Ok(bytes.into())
+            }
+        }
+    }
+}
+
+/// Runs disk work where waiting hurts nobody.
+async fn on_disk<T, F>(work: F) -> Result<T, BlobError>
+where
+    T: Send + 'static,
+    F: FnOnce() -> Result<T, BlobError> + Send + 'static,
+{
+    match tokio::task::spawn_blocking(work).await {
+        Ok(done) => done,
+        Err(panic) => std::panic::resume_unwind(panic.into_panic()),
+    }
+}
+
+/// Renames a synced file into the store, so that it survives a power cut under its new name.
+fn move_into_place(partial: &Path, target: &Path) -> Result<(), BlobError> {
+    fs::rename(partial, target).map_err(BlobError::disk("rename", partial))?;
+    let directory = target.parent().unwrap_or(target);
+    File::open(directory).and_then(|file| file.sync_all()).map_err(BlobError::disk("sync", directory))
+}
+
+fn modified_ms(metadata: &fs::Metadata) -> io::Result<u64> {
+    let since = metadata.modified()?.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    Ok(u64::try_from(since.as_millis()).unwrap_or(u64::MAX))
+}

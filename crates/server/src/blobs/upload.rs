@@ -1,0 +1,293 @@
+//! Unfinished uploads: `uploads/<id>` holds the bytes that came, memory holds their running hash; a restart ends them all.
+//! It never lets bytes become a blob before they hash to what was announced.
+
+use std::collections::HashMap;
+use std::fs::{self, File};
+use std::io;
+use std::os::unix::fs::FileExt as _;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use bytes::Bytes;
+use futures_util::{Stream, StreamExt as _};
+use sha2::{Digest as _, Sha256};
+use task_proto::{Digest, RepositoryName};
+use tokio::sync::OwnedMutexGuard;
+
+use super::{BlobError, BlobSettings, Blobs, modified_ms, move_into_place, on_disk};
+
+/// How much of a body is gathered before it is hashed and written in one go.
+const GATHERED_BYTES: usize = 1024 * 1024;
+/// How long a sender may be silent in the middle of a body.
+const SILENCE: Duration = Duration::from_secs(60);
+const ID_DIGITS: usize = 32;
+
+/// Names an upload.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub struct UploadId(String);
+
+/// A text that no upload is named by.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("not the name of an upload")]
+pub struct InvalidUploadId;
+
+impl UploadId {
+    fn random() -> Self {
+        Self(format!("{:0width$x}", rand::random::<u128>(), width = ID_DIGITS))
+    }
+
+    /// The id as text.
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+impl FromStr for UploadId {
+    type Err = InvalidUploadId;
+    fn from_str(text: &str) -> Result<Self, InvalidUploadId> {
+        let is_digit = |b: u8| b.is_ascii_digit() || (b'a'..=b'f').contains(&b);
+        let valid = text.len() == ID_DIGITS && text.bytes().all(is_digit);
+        if valid { Ok(Self(text.to_owned())) } else { Err(InvalidUploadId) }
+    }
+}
+
+/// All unfinished uploads.
+pub(super) struct Uploads {
+    directory: PathBuf,
+    settings: BlobSettings,
+    active: Mutex<HashMap<UploadId, Active>>,
+}
+
+/// An upload and where it was begun.
+#[derive(Clone)]
+struct Active {
+    repository: RepositoryName,
+    upload: Arc<tokio::sync::Mutex<Upload>>,
+}
+
+/// One upload. Whoever holds its lock is the only writer.
+struct Upload {
+    path: PathBuf,
+    file: File,
+    offset: u64,
+    hasher: Sha256,
+    /// Finished or cancelled by whoever had the lock before.
+    ended: bool,
+}
+
+impl Upload {
+    fn create(path: PathBuf) -> io::Result<Self> {
+        let file = File::create_new(&path)?;
+        Ok(Self { path, file, offset: 0, hasher: Sha256::new(), ended: false })
+    }
+
+    /// Takes all of `chunks` or, on an error, nothing: bytes beyond the offset are overwritten by the next try.
+    fn write(&mut self, chunks: &[Bytes]) -> Result<(), BlobError> {
+        let mut offset = self.offset;
+        for chunk in chunks {
+            self.file.write_all_at(chunk, offset).map_err(BlobError::disk("write", &self.path))?;
+            offset += chunk.len() as u64;
+        }
+        for chunk in chunks {
+            self.hasher.update(chunk);
+        }
+        self.offset = offset;
+        Ok(())
+    }
+
+    fn cancel(&mut self) -> Result<(), BlobError> {
+        self.ended = true;
+        fs::remove_file(&self.path).map_err(BlobError::disk("delete", &self.path))
+    }
+
+    fn finish(&mut self, expected: Digest, target: &Path) -> Result<u64, BlobError> {
+        self.ended = true;
+        let actual = Digest::from_bytes(self.hasher.clone().finalize().into());
+        if actual != expected {
+            return Err(BlobError::WrongDigest { expected, actual });
+        }
+        let sync = || {
+            // A write that failed half way may have left bytes behind the end.
+            self.file.set_len(self.offset)?;
+            self.file.sync_all()
+        };
+        sync().map_err(BlobError::disk("sync", &self.path))?;
+        move_into_place(&self.path, target)?;
+        Ok(self.offset)
+    }
+}
+
+impl Uploads {
+    /// Opens the directory and removes what an earlier process left in it.
+    pub(super) fn open(directory: PathBuf, settings: BlobSettings) -> Result<Self, BlobError> {
+        let clean = || {
+            fs::create_dir_all(&directory)?;
+            for entry in fs::read_dir(&directory)? {
+                fs::remove_file(entry?.path())?;
+            }
+            Ok(())
+        };
+        clean().map_err(BlobError::disk("clean", &directory))?;
+        Ok(Self { directory, settings, active: Mutex::default() })
+    }
+
+    /// A name nothing else in the directory has.
+    pub(super) fn fresh_path(&self) -> PathBuf {
+        self.directory.join(UploadId::random().as_str())
+    }
+
+    fn active(&self) -> MutexGuard<'_, HashMap<UploadId, Active>> {
+        self.active.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn insert(&self, id: UploadId, active: Active) -> Result<(), BlobError> {
+        let max = self.settings.max_uploads;
+        let mut all = self.active();
+        if all.len() >= max {
+            return Err(BlobError::TooManyUploads { max });
+        }
+        all.insert(id, active);
+        Ok(())
+    }
+}
+
+impl Blobs {
+    /// Begins an upload; only requests for the same repository reach it.
+    pub async fn begin_upload(&self, repository: &RepositoryName) -> Result<UploadId, BlobError> {
+        let id = UploadId::random();
+        let path = self.shared.uploads.directory.join(id.as_str());
+        let created = Upload::create(path.clone()).map_err(BlobError::disk("create", &path))?;
+        let active = Active { repository: repository.clone(), upload: Arc::new(tokio::sync::Mutex::new(created)) };
+        if let Err(refused) = self.shared.uploads.insert(id.clone(), active) {
+            // Best effort: what stays is removed at the next start.
+            let _ = fs::remove_file(&path);
+            return Err(refused);
+        }
+        Ok(id)
+    }
+
+    /// How many bytes of an upload are here.
+    pub async fn upload_offset(&self, repository: &RepositoryName, id: &UploadId) -> Result<u64, BlobError> {
+        Ok(self.lock_upload(repository, id)?.offset)
+    }
+
+    /// Appends a body that begins at byte `start` (wherever the upload stands, if absent). What came before an error or
+    /// before the caller gave up is kept, and the next chunk begins there. Returns the new offset.
+    pub async fn append<S, E>(
+        &self,
+        repository: &RepositoryName,
+        id: &UploadId,
+        start: Option<u64>,
+        body: S,
+    ) -> Result<u64, BlobError>
+    where
+        S: Stream<Item = Result<Bytes, E>> + Send,
+        E: Into<Box<dyn std::error::Error + Send + Sync>>,
+    {
+        let mut upload = self.lock_upload(repository, id)?;
+        let offset = upload.offset;
+        if let Some(given) = start.filter(|&given| given != offset) {
+            return Err(BlobError::OutOfOrder { given, offset });
+        }
+        let max = self.shared.settings.max_blob_bytes;
+        let mut body = std::pin::pin!(body);
+        loop {
+            let (chunks, ended) = gather(&mut body).await;
+            let length: usize = chunks.iter().map(Bytes::len).sum();
+            if upload.offset + length as u64 > max {
+                return Err(BlobError::TooLarge { max });
+            }
+            if length > 0 {
+                // The lock travels with the work: if the caller is dropped here, the bytes still count as one piece.
+                upload = on_disk(move || upload.write(&chunks).map(|()| upload)).await?;
+            }
+            match ended {
+                None => {}
+                Some(Ok(())) => return Ok(upload.offset),
+                Some(Err(error)) => return Err(error),
+            }
+        }
+    }
+
+    /// Makes the upload a blob, if it hashes to `expected`; else it is given up. Returns the blob's size.
+    pub async fn finish_upload(
+        &self,
+        repository: &RepositoryName,
+        id: &UploadId,
+        expected: Digest,
+    ) -> Result<u64, BlobError> {
+        let mut upload = self.lock_upload(repository, id)?;
+        let target = self.path(expected);
+        let finished = on_disk(move || {
+            let finished = upload.finish(expected, &target);
+            if finished.is_err() {
+                // Best effort: what stays is removed at the next start.
+                let _ = fs::remove_file(&upload.path);
+            }
+            finished
+        });
+        let finished = finished.await;
+        self.shared.uploads.active().remove(id);
+        finished
+    }
+
+    /// Gives an upload up.
+    pub async fn cancel_upload(&self, repository: &RepositoryName, id: &UploadId) -> Result<(), BlobError> {
+        let mut upload = self.lock_upload(repository, id)?;
+        self.shared.uploads.active().remove(id);
+        on_disk(move || upload.cancel()).await
+    }
+
+    /// Gives up the uploads that got no byte since `before_ms`, and says how many.
+    pub async fn drop_idle_uploads(&self, before_ms: u64) -> Result<usize, BlobError> {
+        let all: Vec<_> = self.shared.uploads.active().iter().map(|(id, a)| (id.clone(), a.clone())).collect();
+        let mut dropped = 0;
+        for (id, active) in all {
+            // Someone writes to it this moment: not idle, whatever the file's time says.
+            let Ok(mut upload) = active.upload.try_lock_owned() else { continue };
+            let is_dropped = on_disk(move || {
+                let metadata = upload.file.metadata().map_err(BlobError::disk("look at", &upload.path))?;
+                let modified_ms = modified_ms(&metadata).map_err(BlobError::disk("look at", &upload.path))?;
+                if upload.ended || modified_ms >= before_ms { Ok(false) } else { upload.cancel().map(|()| true) }
+            });
+            if is_dropped.await? {
+                self.shared.uploads.active().remove(&id);
+                dropped += 1;
+            }
+        }
+        Ok(dropped)
+    }
+
+    /// The only writer's right to an upload. A second writer is refused rather than queued: its chunk would be out of
+    /// order anyway.
+    fn lock_upload(&self, repository: &RepositoryName, id: &UploadId) -> Result<OwnedMutexGuard<Upload>, BlobError> {
+        let active = self.shared.uploads.active().get(id).filter(|active| active.repository == *repository).cloned();
+        let upload = active.ok_or(BlobError::UploadUnknown)?.upload;
+        let upload = upload.try_lock_owned().map_err(|_| BlobError::UploadBusy)?;
+        if upload.ended { Err(BlobError::UploadUnknown) } else { Ok(upload) }
+    }
+}
+
+/// Takes chunks from a body until there are enough for one write, and says if and how the body ended.
+async fn gather<S, E>(body: &mut std::pin::Pin<&mut S>) -> (Vec<Bytes>, Option<Result<(), BlobError>>)
+where
+    S: Stream<Item = Result<Bytes, E>> + Send,
+    E: Into<Box<dyn std::error::Error + Send + Sync>>,
+{
+    let mut chunks = Vec::new();
+    let mut length = 0;
+    while length < GATHERED_BYTES {
+        match tokio::time::timeout(SILENCE, body.next()).await {
+            Ok(Some(Ok(chunk))) => {
+                length += chunk.len();
+                chunks.push(chunk);
+            }
+            Ok(Some(Err(error))) => return (chunks, Some(Err(BlobError::Interrupted(error.into())))),
+            Ok(None) => return (chunks, Some(Ok(()))),
+            Err(elapsed) => return (chunks, Some(Err(BlobError::Interrupted(elapsed.into())))),
+        }
+    }
+    (chunks, None)
+}

@@ -7,7 +7,10 @@ use sqlx::migrate::{MigrateError, Migration, MigrationType, Migrator};
 use sqlx::{AnyPool, SqlSafeStr};
 
 /// Version, name and text of every migration.
-const MIGRATIONS: &[(i64, &str, &str)] = &[(1, "fleet", include_str!("../migrations/0001_fleet.sql"))];
+const MIGRATIONS: &[(i64, &str, &str)] = &[
+    (1, "fleet", include_str!("../migrations/0001_fleet.sql")),
+    (2, "packages", include_str!("../migrations/0002_packages.sql")),
+];
 
 /// Applies what has not been applied yet.
 pub(super) async fn run(pool: &AnyPool) -> Result<(), MigrateError> {

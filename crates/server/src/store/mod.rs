@@ -7,6 +7,7 @@ mod assignments;
 mod deployments;
 mod migrate;
 mod orders;
+mod packages;
 mod reports;
 mod robots;
 mod rows;

@@ -1,0 +1,398 @@
+//! Repositories, manifests, tags and task packages: what the registry knows of the bytes in the blob store. It never
+//! touches those bytes, and never decides what is a valid manifest.
+
+use std::collections::{BTreeMap, HashSet};
+
+use sqlx::Row as _;
+use sqlx::any::AnyRow;
+use task_proto::api::PackageView;
+use task_proto::desired::{BlobRef, PackageRef};
+use task_proto::manifest::TaskManifest;
+use task_proto::oci::Descriptor;
+use task_proto::{Digest, RepositoryName, RobotId, Tag, TaskName};
+
+use super::{Store, StoreError, Write, rows};
+
+/// A manifest's name inside its repository.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Reference {
+    /// By a tag, which may move.
+    Tag(Tag),
+    /// By what it hashes to.
+    Digest(Digest),
+}
+
+/// A manifest that is in a repository.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct StoredManifest {
+    /// What it hashes to.
+    pub digest: Digest,
+    /// Its size in bytes.
+    pub size: u64,
+    /// The content type it was pushed with.
+    pub media_type: String,
+}
+
+/// A manifest to be stored.
+#[derive(Debug, Clone)]
+pub struct NewManifest {
+    /// The manifest itself.
+    pub manifest: StoredManifest,
+    /// What a list of referrers says it is.
+    pub artifact_type: Option<String>,
+    /// What a list of referrers says of it.
+    pub annotations: BTreeMap<String, String>,
+    /// The manifest it refers to: any digest, which need not be here.
+    pub subject: Option<String>,
+    /// The blobs and manifests it is made of.
+    pub parts: Vec<Digest>,
+    /// The tags that shall point to it.
+    pub tags: Vec<Tag>,
+    /// What it says if it is a task package.
+    pub package: Option<(PackageRef, TaskManifest)>,
+}
+
+/// How storing a manifest ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum PutManifest {
+    /// It is stored.
+    Stored,
+    /// Nothing is stored: these parts are not in the repository.
+    PartsMissing(Vec<Digest>),
+}
+
+impl Store {
+    /// Stores a manifest and points its tags to it, if all its parts are in the repository.
+    pub async fn put_manifest(
+        &self,
+        repository: &RepositoryName,
+        new: &NewManifest,
+        now_ms: u64,
+    ) -> Result<PutManifest, StoreError> {
+        let mut write = self.begin().await?;
+        let mut missing = Vec::new();
+        for part in &new.parts {
+            if !write.repository_holds(repository, part).await? {
+                missing.push(*part);
+            }
+        }
+        if !missing.is_empty() {
+            return Ok(PutManifest::PartsMissing(missing));
+        }
+        write.insert_manifest(repository, new, now_ms).await?;
+        for tag in &new.tags {
+            write.point_tag(repository, tag, &new.manifest.digest).await?;
+        }
+        if let Some((package, task_manifest)) = &new.package {
+            write.insert_package(package, task_manifest, now_ms).await?;
+        }
+        write.commit().await?;
+        Ok(PutManifest::Stored)
+    }
+
+    /// The manifest of that name.
+    pub async fn manifest(
+        &self,
+        repository: &RepositoryName,
+        reference: &Reference,
+    ) -> Result<Option<StoredManifest>, StoreError> {
+        let query = match reference {
+            Reference::Digest(digest) => {
+                sqlx::query("SELECT digest, size, media_type FROM manifests WHERE repository = $1 AND digest = $2")
+                    .bind(repository.as_str())
+                    .bind(digest.to_string())
+            }
+            Reference::Tag(tag) => sqlx::query(
+                "SELECT m.digest, m.size, m.media_type FROM tags t
+                 JOIN manifests m ON m.repository = t.repository AND m.digest = t.manifest
+                 WHERE t.repository = $1 AND t.tag = $2",
+            )
+            .bind(repository.as_str())
+            .bind(tag.as_str()),
+        };
+        let row = query.fetch_optional(&self.reads).await?;
+        row.map(|row| {
+            Ok(StoredManifest {
+                digest: rows::id("manifests.digest", row.try_get("digest")?)?,
+                size: rows::number(row.try_get("size")?),
+                media_type: row.try_get("media_type")?,
+            })
+        })
+        .transpose()
+    }
+
+    /// Removes a manifest with all its tags; false if it was not there.
+    pub async fn delete_manifest(&self, repository: &RepositoryName, digest: &Digest) -> Result<bool, StoreError> {
+        let mut write = self.begin().await?;
+        let mut deleted = 0;
+        for sql in [
+            "DELETE FROM packages WHERE name = $1 AND manifest = $2",
+            "DELETE FROM tags WHERE repository = $1 AND manifest = $2",
+            "DELETE FROM manifest_parts WHERE repository = $1 AND manifest = $2",
+            "DELETE FROM manifests WHERE repository = $1 AND digest = $2",
+        ] {
+            let query = sqlx::query(sql).bind(repository.as_str()).bind(digest.to_string());
+            deleted = query.execute(write.connection()).await?.rows_affected();
+        }
+        write.commit().await?;
+        Ok(deleted > 0)
+    }
+
+    /// Removes a tag; false if it was not there.
+    pub async fn delete_tag(&self, repository: &RepositoryName, tag: &Tag) -> Result<bool, StoreError> {
+        let mut write = self.begin().await?;
+        let deleted = sqlx::query("DELETE FROM tags WHERE repository = $1 AND tag = $2")
+            .bind(repository.as_str())
+            .bind(tag.as_str())
+            .execute(write.connection())
+            .await?;
+        write.commit().await?;
+        Ok(deleted.rows_affected() > 0)
+    }
+
+    /// A repository's tags in the order of their bytes; `None` if there is no such repository.
+    pub async fn tags(&self, repository: &RepositoryName) -> Result<Option<Vec<Tag>>, StoreError> {
+        let known: Option<i64> = sqlx::query_scalar(
+            "SELECT CAST(1 AS BIGINT) WHERE EXISTS (SELECT 1 FROM manifests WHERE repository = $1)
+             OR EXISTS (SELECT 1 FROM repository_blobs WHERE repository = $1)",
+        )
+        .bind(repository.as_str())
+        .fetch_optional(&self.reads)
+        .await?;
+        if known.is_none() {
+            return Ok(None);
+        }
+        let names: Vec<String> = sqlx::query_scalar("SELECT tag FROM tags WHERE repository = $1")
+            .bind(repository.as_str())
+            .fetch_all(&self.reads)
+            .await?;
+        let mut tags = names.iter().map(|name| rows::id("tags.tag", name)).collect::<Result<Vec<Tag>, _>>()?;
+        // Sorted here: a database sorts by its locale.
+        tags.sort();
+        Ok(Some(tags))
+    }
+
+    /// The manifests whose subject is `subject`, sorted by digest.
+    pub async fn referrers(&self, repository: &RepositoryName, subject: &str) -> Result<Vec<Descriptor>, StoreError> {
+        let rows = sqlx::query(
+            "SELECT digest, size, media_type, artifact_type, annotations FROM manifests
+             WHERE repository = $1 AND subject = $2 ORDER BY digest",
+        )
+        .bind(repository.as_str())
+        .bind(subject)
+        .fetch_all(&self.reads)
+        .await?;
+        rows.iter().map(descriptor).collect()
+    }
+
+    /// Makes a blob part of a repository.
+    pub async fn link_blob(&self, repository: &RepositoryName, digest: &Digest) -> Result<(), StoreError> {
+        let mut write = self.begin().await?;
+        sqlx::query("INSERT INTO repository_blobs (repository, digest) VALUES ($1, $2) ON CONFLICT DO NOTHING")
+            .bind(repository.as_str())
+            .bind(digest.to_string())
+            .execute(write.connection())
+            .await?;
+        write.commit().await
+    }
+
+    /// Takes a blob out of a repository; false if it was not in it.
+    pub async fn unlink_blob(&self, repository: &RepositoryName, digest: &Digest) -> Result<bool, StoreError> {
+        let mut write = self.begin().await?;
+        let deleted = sqlx::query("DELETE FROM repository_blobs WHERE repository = $1 AND digest = $2")
+            .bind(repository.as_str())
+            .bind(digest.to_string())
+            .execute(write.connection())
+            .await?;
+        write.commit().await?;
+        Ok(deleted.rows_affected() > 0)
+    }
+
+    /// Whether a blob is in `repository`, or in any if that is `None`.
+    pub async fn has_blob(&self, repository: Option<&RepositoryName>, digest: &Digest) -> Result<bool, StoreError> {
+        let query = match repository {
+            Some(repository) => {
+                sqlx::query("SELECT digest FROM repository_blobs WHERE digest = $1 AND repository = $2")
+                    .bind(digest.to_string())
+                    .bind(repository.as_str())
+            }
+            None => {
+                sqlx::query("SELECT digest FROM repository_blobs WHERE digest = $1 LIMIT 1").bind(digest.to_string())
+            }
+        };
+        Ok(query.fetch_optional(&self.reads).await?.is_some())
+    }
+
+    /// Every package, sorted by name, then newest first.
+    pub async fn packages(&self) -> Result<Vec<PackageView>, StoreError> {
+        let rows =
+            sqlx::query("SELECT package, task_manifest, pushed_at_ms FROM packages").fetch_all(&self.reads).await?;
+        let mut packages = rows.iter().map(package_view).collect::<Result<Vec<_>, _>>()?;
+        packages.sort_by(|a, b| {
+            (&a.package.name, b.pushed_at_ms, a.package.manifest.digest).cmp(&(
+                &b.package.name,
+                a.pushed_at_ms,
+                b.package.manifest.digest,
+            ))
+        });
+        Ok(packages)
+    }
+
+    /// One package.
+    pub async fn package(&self, name: &TaskName, manifest: &Digest) -> Result<Option<PackageView>, StoreError> {
+        let row =
+            sqlx::query("SELECT package, task_manifest, pushed_at_ms FROM packages WHERE name = $1 AND manifest = $2")
+                .bind(name.as_str())
+                .bind(manifest.to_string())
+                .fetch_optional(&self.reads)
+                .await?;
+        row.as_ref().map(package_view).transpose()
+    }
+
+    /// Whether the blob belongs to a package that the robot should have now.
+    pub async fn robot_may_read(&self, robot: &RobotId, digest: &Digest) -> Result<bool, StoreError> {
+        let packages: Vec<String> = sqlx::query_scalar(
+            "SELECT DISTINCT d.package FROM assignments a JOIN deployments d ON d.id = a.deployment_id
+             WHERE a.robot_id = $1 AND a.desired = 1",
+        )
+        .bind(robot.as_str())
+        .fetch_all(&self.reads)
+        .await?;
+        for package in packages {
+            let package: PackageRef = rows::from_json("deployments.package", &package)?;
+            if blobs_of(&package).iter().any(|blob| blob.digest == *digest) {
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    }
+
+    /// Those of `candidates` that no manifest and no package in use needs. Repositories that hold one without need forget
+    /// it. The caller holds back everybody who could come to rely on one.
+    pub async fn forget_unneeded(&self, candidates: Vec<Digest>) -> Result<Vec<Digest>, StoreError> {
+        if candidates.is_empty() {
+            return Ok(candidates);
+        }
+        let texts: Vec<String> =
+            sqlx::query_scalar("SELECT digest FROM manifests UNION SELECT digest FROM manifest_parts")
+                .fetch_all(&self.reads)
+                .await?;
+        let needed = texts.iter().map(|text| rows::id("manifests.digest", text));
+        let mut needed = needed.collect::<Result<HashSet<Digest>, _>>()?;
+        let in_use = self.packages_in_use().await?;
+        needed.extend(in_use.iter().flat_map(blobs_of).map(|blob| blob.digest));
+        let unneeded: Vec<Digest> = candidates.into_iter().filter(|digest| !needed.contains(digest)).collect();
+        let mut write = self.begin().await?;
+        for digest in &unneeded {
+            let query = sqlx::query("DELETE FROM repository_blobs WHERE digest = $1").bind(digest.to_string());
+            query.execute(write.connection()).await?;
+        }
+        write.commit().await?;
+        Ok(unneeded)
+    }
+}
+
+impl Write {
+    async fn repository_holds(&mut self, repository: &RepositoryName, part: &Digest) -> Result<bool, StoreError> {
+        let found = sqlx::query(
+            "SELECT digest FROM repository_blobs WHERE repository = $1 AND digest = $2
+             UNION ALL SELECT digest FROM manifests WHERE repository = $1 AND digest = $2",
+        )
+        .bind(repository.as_str())
+        .bind(part.to_string())
+        .fetch_optional(self.connection());
+        Ok(found.await?.is_some())
+    }
+
+    async fn insert_manifest(
+        &mut self,
+        repository: &RepositoryName,
+        new: &NewManifest,
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
+        sqlx::query(
+            "INSERT INTO manifests
+                 (repository, digest, size, media_type, artifact_type, annotations, subject, pushed_at_ms)
+             VALUES ($1, $2, $3, $4, $5, $6, $7, $8)
+             ON CONFLICT (repository, digest) DO UPDATE
+             SET media_type = excluded.media_type, artifact_type = excluded.artifact_type",
+        )
+        .bind(repository.as_str())
+        .bind(new.manifest.digest.to_string())
+        .bind(rows::stored(new.manifest.size))
+        .bind(&new.manifest.media_type)
+        .bind(new.artifact_type.as_ref())
+        .bind(rows::json(&new.annotations))
+        .bind(new.subject.as_ref())
+        .bind(rows::stored(now_ms))
+        .execute(self.connection())
+        .await?;
+        for part in &new.parts {
+            sqlx::query(
+                "INSERT INTO manifest_parts (repository, manifest, digest) VALUES ($1, $2, $3) ON CONFLICT DO NOTHING",
+            )
+            .bind(repository.as_str())
+            .bind(new.manifest.digest.to_string())
+            .bind(part.to_string())
+            .execute(self.connection())
+            .await?;
+        }
+        Ok(())
+    }
+
+    async fn point_tag(&mut self, repository: &RepositoryName, tag: &Tag, manifest: &Digest) -> Result<(), StoreError> {
+        sqlx::query(
+            "INSERT INTO tags (repository, tag, manifest) VALUES ($1, $2, $3)
+             ON CONFLICT (repository, tag) DO UPDATE SET manifest = excluded.manifest",
+        )
+        .bind(repository.as_str())
+        .bind(tag.as_str())
+        .bind(manifest.to_string())
+        .execute(self.connection())
+        .await?;
+        Ok(())
+    }
+
+    /// A package that is pushed again keeps the time of its first push.
+    async fn insert_package(
+        &mut self,
+        package: &PackageRef,
+        task_manifest: &TaskManifest,
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
+        sqlx::query(
+            "INSERT INTO packages (name, manifest, package, task_manifest, pushed_at_ms) VALUES ($1, $2, $3, $4, $5)
+             ON CONFLICT DO NOTHING",
+        )
+        .bind(package.name.as_str())
+        .bind(package.manifest.digest.to_string())
+        .bind(rows::json(package))
+        .bind(rows::json(task_manifest))
+        .bind(rows::stored(now_ms))
+        .execute(self.connection())
+        .await?;
+        Ok(())
+    }
+}
+
+fn blobs_of(package: &PackageRef) -> [BlobRef; 3] {
+    [package.manifest, package.config, package.content]
+}
+
+fn descriptor(row: &AnyRow) -> Result<Descriptor, StoreError> {
+    let digest = rows::id("manifests.digest", row.try_get("digest")?)?;
+    let blob = BlobRef { digest, size: rows::number(row.try_get("size")?) };
+    Ok(Descriptor {
+        artifact_type: row.try_get("artifact_type")?,
+        annotations: rows::from_json("manifests.annotations", row.try_get("annotations")?)?,
+        ..Descriptor::new(row.try_get("media_type")?, blob)
+    })
+}
+
+fn package_view(row: &AnyRow) -> Result<PackageView, StoreError> {
+    Ok(PackageView {
+        package: rows::from_json("packages.package", row.try_get("package")?)?,
+        pushed_at_ms: rows::number(row.try_get("pushed_at_ms")?),
+        manifest: rows::from_json("packages.task_manifest", row.try_get("task_manifest")?)?,
+    })
+}

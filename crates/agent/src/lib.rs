@@ -1,14 +1,18 @@
 //! The robot's half: everything `task-agent` does. Imports run downward only; see ARCHITECTURE.md.
 
+pub mod builder;
 pub mod commands;
 pub mod containment;
 pub mod disk;
 pub mod durable;
+pub mod environment;
 pub mod fetch;
 pub mod layout;
 pub mod logs;
 pub mod process;
 pub mod run_dir;
+pub mod script;
 pub mod shim;
 pub mod supervisor;
+pub mod underlay;
 pub mod unpack;

@@ -206,6 +206,15 @@ pub fn uptime() -> io::Result<Duration> {
     seconds.map(Duration::from_secs_f64).ok_or_else(|| io::Error::other("/proc/uptime is not a number of seconds"))
 }
 
+/// The memory this machine has.
+pub fn total_memory_bytes() -> io::Result<u64> {
+    let text = std::fs::read_to_string("/proc/meminfo")?;
+    let kibibytes = text.strip_prefix("MemTotal:").and_then(|rest| rest.split_ascii_whitespace().next()?.parse().ok());
+    kibibytes
+        .map(|count: u64| count * 1024)
+        .ok_or_else(|| io::Error::other("/proc/meminfo does not begin with a total"))
+}
+
 /// Starts `program shim --dir DIR` detached: in its own session and not as a child of the caller, so that neither the
 /// caller's death nor a signal to its process group reaches it. `lock` becomes its standard input and so stays locked
 /// until the shim lets go of it. What it answers can be read from the returned pipe.

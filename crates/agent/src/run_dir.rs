@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
 use std::io;
 use std::os::unix::fs::OpenOptionsExt;
+use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
@@ -174,6 +175,13 @@ impl LogSpec {
     /// A log at `path` of at most 50 MiB in five files.
     pub fn at(path: PathBuf) -> Self {
         Self { path, max_bytes: 10 * 1024 * 1024, files: 5 }
+    }
+}
+
+impl From<std::process::ExitStatus> for ExitStatus {
+    fn from(status: std::process::ExitStatus) -> Self {
+        // A process that was waited for has one or the other.
+        status.code().map_or_else(|| Self::Signal(status.signal().unwrap_or_default()), Self::Code)
     }
 }
 

@@ -1,0 +1,269 @@
+//! Builds a package with the build tool its manifest names: in a bash of its own, out of the way of everything else,
+//! within limits of time, memory and output, and gone without a trace of processes when it is cancelled. A build begins
+//! with empty `build` and `install` directories, so one that was interrupted is simply done again.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::fs::{self, File};
+use std::io::{self, PipeReader, Read, Write};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use task_proto::manifest::BuildTool;
+use task_proto::report::FailureCode;
+use tokio_util::sync::CancellationToken;
+
+use crate::containment::{Containment, ContainmentError, RUN_DIR_VARIABLE};
+use crate::durable;
+use crate::layout::VersionDir;
+use crate::process::{self, BuildPriority};
+use crate::run_dir::ExitStatus;
+use crate::script;
+
+/// How long the processes of a build may take to be gone.
+const KILL_TIMEOUT: Duration = Duration::from_secs(10);
+/// The end of the output that goes into a failure's text.
+const TAIL_BYTES: usize = 2048;
+
+/// What to build, and with what.
+#[derive(Debug, Clone)]
+pub struct BuildOrder {
+    /// The build tool.
+    pub tool: BuildTool,
+    /// Where `src` is and `build` and `install` go.
+    pub version: VersionDir,
+    /// The setup files to source first.
+    pub underlays: Vec<PathBuf>,
+    /// The whole environment.
+    pub environment: BTreeMap<String, String>,
+    /// Where the output goes; what an earlier build wrote there is replaced.
+    pub log: PathBuf,
+    /// What it may use.
+    pub limits: BuildLimits,
+}
+
+/// What a build may use.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct BuildLimits {
+    /// The time it may take.
+    pub timeout: Duration,
+    /// The address space each of its processes may have; `None` does not limit it.
+    pub memory_bytes: Option<u64>,
+    /// The output that is kept.
+    pub log_bytes: u64,
+}
+
+/// Why there is no build.
+#[derive(Debug, thiserror::Error)]
+pub enum BuildError {
+    /// The caller no longer wanted it.
+    #[error("the build was cancelled")]
+    Cancelled,
+    /// It took too long.
+    #[error("the build did not end within {} s; its last output:\n{tail}", timeout.as_secs())]
+    TimedOut {
+        /// The time it had.
+        timeout: Duration,
+        /// The end of its output.
+        tail: String,
+    },
+    /// The build tool failed, or is not there.
+    #[error("the build {status}; its last output:\n{tail}")]
+    Failed {
+        /// How it ended.
+        status: ExitStatus,
+        /// The end of its output.
+        tail: String,
+    },
+    /// The build tool was content, but the package is not there.
+    #[error("the build tool succeeded without installing {missing}; its last output:\n{tail}")]
+    NotInstalled {
+        /// What should be there.
+        missing: String,
+        /// The end of its output.
+        tail: String,
+    },
+    /// Processes of the build could not be ended.
+    #[error(transparent)]
+    Containment(#[from] ContainmentError),
+    /// The disk or the system refused something.
+    #[error("cannot use {}", path.display())]
+    Io {
+        /// On what.
+        path: PathBuf,
+        /// What it said.
+        source: io::Error,
+    },
+}
+
+impl BuildError {
+    /// The code that a report gives; `None` for a build that was cancelled, which is no failure.
+    pub fn code(&self) -> Option<FailureCode> {
+        match self {
+            Self::Cancelled => None,
+            Self::TimedOut { .. } => Some(FailureCode::DEADLINE_EXCEEDED),
+            Self::Failed { .. } | Self::NotInstalled { .. } => Some(FailureCode::BUILD_FAILED),
+            Self::Containment(_) | Self::Io { .. } => Some(FailureCode::IO_ERROR),
+        }
+    }
+}
+
+impl BuildLimits {
+    /// Half an hour, and three quarters of this machine's memory, so that a build alone can't drive a robot into the
+    /// out-of-memory killer.
+    pub fn of_this_machine() -> Self {
+        let memory_bytes = process::total_memory_bytes().ok().map(|total| total / 4 * 3);
+        Self { timeout: Duration::from_secs(30 * 60), memory_bytes, log_bytes: 8 * 1024 * 1024 }
+    }
+}
+
+/// Ends a build whose future was dropped: whatever the reason, none goes on unwatched.
+struct KillOnDrop(Containment);
+
+impl Drop for KillOnDrop {
+    fn drop(&mut self) {
+        // The next build of the same directory looks again.
+        let _ = self.0.kill();
+    }
+}
+
+/// Builds `order`; at once done when there is nothing to build. When it returns, no process of the build is left and
+/// what was installed is on the disk.
+pub async fn build(order: &BuildOrder, cancel: &CancellationToken) -> Result<(), BuildError> {
+    let Some(text) = script::build_script(order.tool, &order.version, &order.underlays) else { return Ok(()) };
+    let root = order.version.root();
+    let guard = KillOnDrop(Containment::new(root, None));
+    // An agent that was killed leaves its build running.
+    guard.0.end(KILL_TIMEOUT).await?;
+    prepare(order, &text)?;
+    let (status, output) = run(order, &guard.0, cancel).await?;
+    let tail = String::from_utf8_lossy(&output).trim().to_owned();
+    match status {
+        Some(ExitStatus::Code(0)) => {}
+        Some(status) => return Err(BuildError::Failed { status, tail }),
+        None if cancel.is_cancelled() => return Err(BuildError::Cancelled),
+        None => return Err(BuildError::TimedOut { timeout: order.limits.timeout, tail }),
+    }
+    if let Some(missing) = missing_package(&order.version) {
+        return Err(BuildError::NotInstalled { missing, tail });
+    }
+    let synced = root.to_owned();
+    let syncing = tokio::task::spawn_blocking(move || durable::sync_file_system(&synced));
+    syncing.await.unwrap_or_else(|error| Err(error.into())).map_err(failed(root))
+}
+
+fn prepare(order: &BuildOrder, script: &str) -> Result<(), BuildError> {
+    let root = order.version.root();
+    for stale in [order.version.build(), order.version.install(), root.join("log")] {
+        durable::remove_dir_all(&stale).map_err(failed(&stale))?;
+    }
+    let path = script_path(order);
+    durable::write(&path, script.as_bytes(), 0o700).map_err(failed(&path))
+}
+
+fn script_path(order: &BuildOrder) -> PathBuf {
+    order.version.root().join("build.sh")
+}
+
+/// How the build ended, or `None` when it was ended here, and the end of its output.
+async fn run(
+    order: &BuildOrder,
+    containment: &Containment,
+    cancel: &CancellationToken,
+) -> Result<(Option<ExitStatus>, Vec<u8>), BuildError> {
+    let (root, script) = (order.version.root(), script_path(order));
+    let mut environment = order.environment.clone();
+    environment.insert(RUN_DIR_VARIABLE.to_owned(), root.display().to_string());
+    let log = File::create(&order.log).map_err(failed(&order.log))?;
+    let (reader, writer) = io::pipe().map_err(failed(&script))?;
+    let priority = BuildPriority { nice: 10, memory_bytes: order.limits.memory_bytes };
+    let mut child = process::spawn_build(&script, root, &environment, priority, writer).map_err(failed(&script))?;
+    let log_bytes = order.limits.log_bytes;
+    let copying = tokio::task::spawn_blocking(move || copy_output(reader, log, log_bytes));
+    let status = tokio::select! {
+        status = child.wait() => Some(status.map_err(failed(&script))?),
+        () = cancel.cancelled() => None,
+        () = tokio::time::sleep(order.limits.timeout) => None,
+    };
+    // The output ends when the last process that could write any has.
+    containment.end(KILL_TIMEOUT).await?;
+    let tail = copying.await.map_err(|error| failed(&order.log)(error.into()))?;
+    Ok((status.map(ExitStatus::from), tail))
+}
+
+/// Copies the first `limit` bytes of `output` into `log`, reads on to its end, and returns its last bytes.
+fn copy_output(mut output: PipeReader, mut log: File, limit: u64) -> Vec<u8> {
+    let (mut room, mut tail) = (limit, VecDeque::with_capacity(TAIL_BYTES));
+    let mut buffer = vec![0; 16 * 1024];
+    loop {
+        let count = match output.read(&mut buffer) {
+            Ok(0) => return tail.into(),
+            Ok(count) => count,
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
+            Err(_) => return tail.into(),
+        };
+        let kept = count.min(usize::try_from(room).unwrap_or(usize::MAX));
+        // A full disk fails the build by itself; the log is not what it fails for.
+        room = if log.write_all(&buffer[..kept]).is_ok() { room - kept as u64 } else { 0 };
+        tail.extend(&buffer[count.saturating_sub(TAIL_BYTES)..count]);
+        tail.drain(..tail.len().saturating_sub(TAIL_BYTES));
+    }
+}
+
+/// The package that should have been installed and was not. Build tools skip what they don't recognise and succeed.
+fn missing_package(version: &VersionDir) -> Option<String> {
+    let installed = version.install();
+    if let Some(name) = package_name(&version.src().join("package.xml")) {
+        let there = installed.join(&name).is_dir() || installed.join("share").join(&name).is_dir();
+        return (!there).then(|| format!("install/{name}"));
+    }
+    let holds_package = |entry: fs::DirEntry| entry.path().is_dir();
+    let any = fs::read_dir(&installed).is_ok_and(|entries| entries.flatten().any(holds_package));
+    (!any).then(|| "anything: there is no package.xml in the package, or none the build tool accepts".to_owned())
+}
+
+/// The name in a `package.xml`. It was checked when the package was pushed, so looking for the element is enough.
+fn package_name(path: &Path) -> Option<String> {
+    let text = fs::read_to_string(path).ok()?;
+    let (_, rest) = text.split_once("<name>")?;
+    let (name, _) = rest.split_once("</name>")?;
+    let name = name.trim();
+    let is_plain = !name.is_empty() && name.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"_-".contains(&byte));
+    is_plain.then(|| name.to_owned())
+}
+
+fn failed(path: &Path) -> impl Fn(io::Error) -> BuildError {
+    let path = path.to_owned();
+    move |source| BuildError::Io { path: path.clone(), source }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_log_is_limited_and_the_tail_is_the_end() {
+        let temp = tempfile::tempdir().unwrap();
+        let path = temp.path().join("build.log");
+        let (reader, mut writer) = io::pipe().unwrap();
+        let writing = std::thread::spawn(move || {
+            for line in 0..10_000 {
+                writeln!(writer, "line {line}").unwrap();
+            }
+        });
+        let tail = copy_output(reader, File::create(&path).unwrap(), 100);
+        writing.join().unwrap();
+        assert_eq!(fs::metadata(&path).unwrap().len(), 100);
+        assert_eq!(tail.len(), TAIL_BYTES);
+        assert!(tail.ends_with(b"line 9998\nline 9999\n"));
+    }
+
+    #[test]
+    fn a_package_name_is_read_and_an_odd_one_is_not_followed() {
+        let temp = tempfile::tempdir().unwrap();
+        let path = temp.path().join("package.xml");
+        fs::write(&path, "<package format=\"3\">\n  <name> talker </name></package>").unwrap();
+        assert_eq!(package_name(&path).as_deref(), Some("talker"));
+        fs::write(&path, "<name>../../etc</name>").unwrap();
+        assert_eq!(package_name(&path), None);
+    }
+}

@@ -12,6 +12,18 @@ use crate::{Digest, TaskName, Version};
 pub const MAX_TEXT_BYTES: usize = 4096;
 /// The most elements any list or table in a manifest may have.
 pub const MAX_LIST_LEN: usize = 256;
+/// The largest uncompressed content that is packed, in bytes, and that a robot unpacks by default.
+pub const MAX_CONTENT_TAR_BYTES: u64 = 16 << 30;
+/// The most files, directories and links, likewise.
+pub const MAX_CONTENT_ENTRIES: u64 = 100_000;
+/// The most components of a path, likewise.
+pub const MAX_CONTENT_DEPTH: usize = 48;
+/// The longest path, likewise.
+pub const MAX_CONTENT_PATH_BYTES: usize = 1024;
+/// Uncompressed bytes for one compressed byte, beyond [`CONTENT_RATIO_FREE_BYTES`], likewise.
+pub const MAX_CONTENT_RATIO: u64 = 200;
+/// Content up to this size may compress as well as it likes.
+pub const CONTENT_RATIO_FREE_BYTES: u64 = 64 << 20;
 
 /// What a package is and how it is built, run and watched.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

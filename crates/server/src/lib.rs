@@ -7,6 +7,7 @@ pub mod changes;
 pub mod clock;
 pub mod config;
 pub mod http;
+pub mod package;
 pub mod presence;
 pub mod report_writer;
 pub mod store;

@@ -1,0 +1,68 @@
+//! From a directory to a package: what the directory says of itself, whether that can run, and the bytes that travel.
+//! It reads the directory and writes one temporary file; it knows no network and no server.
+
+use std::path::PathBuf;
+
+use task_proto::desired::PackageRef;
+use task_proto::manifest::TaskManifest;
+use tempfile::NamedTempFile;
+
+mod archive;
+mod pack;
+mod package_xml;
+mod rules;
+mod source;
+mod task_toml;
+mod tree;
+
+pub use pack::pack;
+
+/// A package, ready to travel.
+#[derive(Debug)]
+pub struct Packed {
+    /// What pins it.
+    pub package: PackageRef,
+    /// What it is and how it runs.
+    pub manifest: TaskManifest,
+    /// The manifest as the OCI config blob.
+    pub config_bytes: Vec<u8>,
+    /// The OCI manifest.
+    pub manifest_bytes: Vec<u8>,
+    /// The content blob, deleted when this is dropped.
+    pub content: NamedTempFile,
+}
+
+/// One thing that keeps a directory from being a package: the file, the key or path in it, and why.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{file}: {reason}")]
+pub struct Problem {
+    /// The file, relative to the package's directory.
+    pub file: String,
+    /// What is wrong with it, beginning with the key where there is one.
+    pub reason: String,
+}
+
+/// Why a directory could not be packed.
+#[derive(Debug, thiserror::Error)]
+pub enum PackageError {
+    /// It is not a package that could run; everything that is wrong with it.
+    #[error("{} can't be packed:\n{}", dir.display(), list(problems))]
+    Invalid {
+        /// The directory.
+        dir: PathBuf,
+        /// At least one.
+        problems: Vec<Problem>,
+    },
+    /// A file could not be read or written.
+    #[error("{what}")]
+    Io {
+        /// What was being done, with the path.
+        what: String,
+        /// Why it failed.
+        source: std::io::Error,
+    },
+}
+
+fn list(problems: &[Problem]) -> String {
+    problems.iter().map(|problem| format!("  {problem}")).collect::<Vec<_>>().join("\n")
+}

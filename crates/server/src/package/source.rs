@@ -1,0 +1,174 @@
+//! What a package's directory says of itself: `task.toml`, with what it leaves out taken from `package.xml`, merged into
+//! a task manifest, and the files that belong to it. It collects everything that is wrong before it gives up.
+
+use std::fs::{self, File};
+use std::io::{self, Read as _};
+use std::path::Path;
+
+use task_proto::Digest;
+use task_proto::manifest::{Build, BuildTool, ContentFacts, TaskManifest};
+
+use super::package_xml::{self, BuildType, PackageXml};
+use super::task_toml::{self, TaskToml};
+use super::tree::Tree;
+use super::{PackageError, Problem, rules};
+
+/// The largest text file that is read.
+const MAX_TEXT_BYTES: u64 = 1024 * 1024;
+
+/// A directory that can become a package.
+#[derive(Debug)]
+pub(super) struct Source {
+    /// The manifest; its content facts are zeros until the content is packed.
+    pub(super) manifest: TaskManifest,
+    /// The files.
+    pub(super) tree: Tree,
+}
+
+/// Reads and checks `dir`.
+pub(super) fn read(dir: &Path) -> Result<Source, PackageError> {
+    let invalid = |problems| PackageError::Invalid { dir: dir.to_owned(), problems };
+    let metadata = fs::metadata(dir)
+        .map_err(|source| PackageError::Io { what: format!("can't read {}", dir.display()), source })?;
+    if !metadata.is_dir() {
+        return Err(invalid(vec![Problem { file: ".".to_owned(), reason: "is not a directory".to_owned() }]));
+    }
+    let mut problems = Vec::new();
+    let toml = read_text(dir, task_toml::FILE, &mut problems)?;
+    let xml = read_text(dir, package_xml::FILE, &mut problems)?;
+    if toml.is_none() && problems.is_empty() {
+        let reason = match xml {
+            Some(_) => "is absent; package.xml does not say how the package is run: give [run] with launch or exec",
+            None => "is absent, and so is package.xml; a package needs at least task.toml with name, version and [run]",
+        };
+        problems.push(Problem { file: task_toml::FILE.to_owned(), reason: reason.to_owned() });
+        return Err(invalid(problems));
+    }
+    let before = problems.len();
+    let toml = toml.map(|text| task_toml::parse(&text, &mut problems)).unwrap_or_default();
+    // What the file gives wrongly must not be called absent as well.
+    let toml_is_whole = problems.len() == before;
+    let xml = xml.and_then(|text| match package_xml::parse(&text) {
+        Ok(xml) => Some(xml),
+        Err(reason) => {
+            problems.push(Problem { file: package_xml::FILE.to_owned(), reason });
+            None
+        }
+    });
+    let tool = build_tool(&toml, xml.as_ref(), &mut problems);
+    let tree = Tree::walk(dir, tool != BuildTool::None, &mut problems)?;
+    let manifest = merge(toml, toml_is_whole, xml.as_ref(), tool, &mut problems);
+    match manifest {
+        Some(manifest) if toml_is_whole => {
+            rules::check(&manifest, &tree, &mut problems)?;
+            if problems.is_empty() { Ok(Source { manifest, tree }) } else { Err(invalid(problems)) }
+        }
+        _ => Err(invalid(problems)),
+    }
+}
+
+/// The text file `name` in `dir`; `None` if it is not there or can't be used, which is then a problem.
+pub(super) fn read_text(dir: &Path, name: &str, problems: &mut Vec<Problem>) -> Result<Option<String>, PackageError> {
+    let path = dir.join(name);
+    let mut refuse = |reason: String| problems.push(Problem { file: name.to_owned(), reason });
+    // Only a regular file is opened: a FIFO would wait for ever.
+    match fs::symlink_metadata(&path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+        Ok(metadata) if metadata.is_file() && metadata.len() <= MAX_TEXT_BYTES => {}
+        Ok(metadata) if metadata.is_file() => {
+            refuse(format!("is larger than {MAX_TEXT_BYTES} bytes"));
+            return Ok(None);
+        }
+        Ok(_) => {
+            refuse("is not a regular file".to_owned());
+            return Ok(None);
+        }
+        Err(source) => return Err(PackageError::Io { what: format!("can't read {}", path.display()), source }),
+    }
+    let mut bytes = Vec::new();
+    File::open(&path)
+        .and_then(|file| file.take(MAX_TEXT_BYTES).read_to_end(&mut bytes))
+        .map_err(|source| PackageError::Io { what: format!("can't read {}", path.display()), source })?;
+    match String::from_utf8(bytes) {
+        Ok(text) => Ok(Some(text)),
+        Err(_) => {
+            refuse("is not UTF-8".to_owned());
+            Ok(None)
+        }
+    }
+}
+
+/// `build.tool`, or what `package.xml` implies.
+fn build_tool(toml: &TaskToml, xml: Option<&PackageXml>, problems: &mut Vec<Problem>) -> BuildTool {
+    let (None, Some(xml)) = (toml.build_tool, xml) else { return toml.build_tool.unwrap_or(BuildTool::None) };
+    let reason = match &xml.build_type {
+        BuildType::One(name) => match name.as_str() {
+            "ament_python" | "ament_cmake" | "cmake" => return BuildTool::Colcon,
+            "catkin" => return BuildTool::Catkin,
+            other => format!("export.build_type: {other:?} is none of ament_python, ament_cmake, cmake and catkin"),
+        },
+        BuildType::Absent => "export.build_type: is absent".to_owned(),
+        BuildType::Several(names) => format!("export.build_type: there are several ({})", names.join(", ")),
+    };
+    let reason = format!("{reason}; say build.tool in task.toml: \"colcon\", \"catkin\" or \"none\"");
+    problems.push(Problem { file: package_xml::FILE.to_owned(), reason });
+    BuildTool::None
+}
+
+/// The manifest, if there is a name and a version. `task.toml` wins.
+fn merge(
+    toml: TaskToml,
+    toml_is_whole: bool,
+    xml: Option<&PackageXml>,
+    tool: BuildTool,
+    problems: &mut Vec<Problem>,
+) -> Option<TaskManifest> {
+    let mut missing = |key: &'static str, text: Option<&String>, reason: Option<String>| {
+        let reason = match (text.filter(|text| !text.is_empty()), reason) {
+            (Some(_), Some(reason)) => format!("<{key}>: {reason}; give another {key} in task.toml"),
+            _ if toml_is_whole => {
+                let hint = if xml.is_some() { "; package.xml does not give it either" } else { "" };
+                problems.push(Problem { file: task_toml::FILE.to_owned(), reason: format!("{key}: is absent{hint}") });
+                return;
+            }
+            _ => return,
+        };
+        problems.push(Problem { file: package_xml::FILE.to_owned(), reason });
+    };
+    let name = toml.name.or_else(|| {
+        let text = xml.map(|xml| &xml.name);
+        let parsed = text.map(|text| text.parse());
+        if !matches!(parsed, Some(Ok(_))) {
+            missing(
+                "name",
+                text,
+                parsed.clone().and_then(Result::err).map(|error: task_proto::id::InvalidId| error.to_string()),
+            );
+        }
+        parsed.and_then(Result::ok)
+    });
+    let version = toml.version.or_else(|| {
+        let text = xml.map(|xml| &xml.version);
+        let parsed = text.map(|text| text.parse());
+        if !matches!(parsed, Some(Ok(_))) {
+            missing(
+                "version",
+                text,
+                parsed.clone().and_then(Result::err).map(|error: task_proto::id::InvalidId| error.to_string()),
+            );
+        }
+        parsed.and_then(Result::ok)
+    });
+    Some(TaskManifest {
+        name: name?,
+        version: version?,
+        build: Build { tool },
+        run: toml.run,
+        ready: toml.ready,
+        parameters: toml.parameters,
+        outputs: toml.outputs,
+        requires: toml.requires,
+        exec_depends: xml.map(|xml| xml.exec_depends.clone()).unwrap_or_default(),
+        content: ContentFacts { tar_digest: Digest::of(b""), tar_size: 0, entries: 0 },
+    })
+}

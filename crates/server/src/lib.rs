@@ -5,6 +5,7 @@ pub mod blobs;
 pub mod broker;
 pub mod changes;
 pub mod clock;
+pub mod commands;
 pub mod config;
 pub mod http;
 pub mod package;

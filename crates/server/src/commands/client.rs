@@ -1,0 +1,311 @@
+//! The server's API as the commands see it: one call, one method. It retries what may pass (a lost connection, a 5xx),
+//! always with the same idempotency key, and turns every refusal into an error with the server's own words.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use reqwest::header::RETRY_AFTER;
+use reqwest::{Method, RequestBuilder, Response, StatusCode};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use task_proto::api::{BASE, ErrorBody, IDEMPOTENCY_KEY};
+use task_proto::token::{InvalidToken, Token};
+
+use super::{CommandError, Connection, Outcome};
+
+/// How often a request is tried.
+const TRIES: u32 = 6;
+/// The longest pause between two tries.
+const MAX_PAUSE: Duration = Duration::from_secs(4);
+/// How long one answer may take, uploads excepted.
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(60);
+/// The largest answer that is read: the list of a large fleet.
+const MAX_ANSWER_BYTES: usize = 256 * 1024 * 1024;
+
+/// Why the server did not do what it was asked.
+#[derive(Debug, thiserror::Error)]
+pub enum ClientError {
+    /// It answered with an error.
+    #[error("{message} ({code})")]
+    Refused {
+        /// The HTTP status.
+        status: StatusCode,
+        /// The stable code.
+        code: String,
+        /// The server's words.
+        message: String,
+    },
+    /// It could not be reached, or went away.
+    #[error("can't reach the server at {url}")]
+    Unreachable {
+        /// Where it should be.
+        url: String,
+        /// Why.
+        source: reqwest::Error,
+    },
+    /// Something answered that is not taskd.
+    #[error("what answers at {url} is not taskd (status {status})")]
+    NotTheServer {
+        /// Where.
+        url: String,
+        /// The HTTP status.
+        status: StatusCode,
+    },
+    /// No token was given.
+    #[error(
+        "no operator token: give --token or --token-file, set TASKD_TOKEN, or point --data at the server's data directory"
+    )]
+    NoToken,
+    /// The token file can't be read.
+    #[error("can't read the token file {}", path.display())]
+    TokenFile {
+        /// Which.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// The token is none.
+    #[error("{origin}")]
+    Token {
+        /// Where it came from.
+        origin: String,
+        /// Why.
+        source: InvalidToken,
+    },
+    /// The URL is none.
+    #[error("--server: {url:?} is not an http:// URL")]
+    Url {
+        /// What was given.
+        url: String,
+    },
+}
+
+impl ClientError {
+    /// The exit code's meaning.
+    pub fn outcome(&self) -> Outcome {
+        match self {
+            Self::Refused { status: StatusCode::UNAUTHORIZED | StatusCode::FORBIDDEN, .. } => Outcome::NotAllowed,
+            Self::Refused { status: StatusCode::BAD_REQUEST | StatusCode::UNPROCESSABLE_ENTITY, .. }
+            | Self::NoToken
+            | Self::TokenFile { .. }
+            | Self::Token { .. }
+            | Self::Url { .. } => Outcome::Usage,
+            Self::Refused { code, .. } if code == "no_robots_match" => Outcome::Usage,
+            Self::Refused { .. } | Self::Unreachable { .. } | Self::NotTheServer { .. } => Outcome::Failed,
+        }
+    }
+}
+
+/// A server and the token to ask it with.
+pub(crate) struct Client {
+    http: reqwest::Client,
+    base: String,
+    token: Token,
+}
+
+impl Client {
+    /// Finds server and token; nothing is sent yet.
+    pub(crate) fn connect(connection: &Connection) -> Result<Self, CommandError> {
+        let data =
+            connection.data.clone().or_else(|| crate::config::default_data_directory(|name| std::env::var_os(name)));
+        let base = match &connection.server {
+            Some(url) => url.trim_end_matches('/').to_owned(),
+            None => local_server(data.as_deref()).unwrap_or_else(|| "http://127.0.0.1:8080".to_owned()),
+        };
+        let is_http = reqwest::Url::parse(&base)
+            .is_ok_and(|url| matches!(url.scheme(), "http" | "https") && url.has_host() && url.query().is_none());
+        if !is_http {
+            return Err(ClientError::Url { url: base }.into());
+        }
+        let token = find_token(connection, data.as_deref())?;
+        // A second install is refused because the first is in place, which is all that matters.
+        let _ = rustls::crypto::ring::default_provider().install_default();
+        let http = reqwest::Client::builder()
+            .connect_timeout(Duration::from_secs(10))
+            .redirect(reqwest::redirect::Policy::none())
+            .user_agent(concat!("taskd/", env!("CARGO_PKG_VERSION")))
+            .build()
+            .map_err(|source| ClientError::Unreachable { url: base.clone(), source })?;
+        Ok(Self { http, base, token })
+    }
+
+    /// Reads from the API.
+    pub(crate) async fn get<T: DeserializeOwned>(
+        &self,
+        path: &str,
+        query: &[(&str, String)],
+    ) -> Result<T, ClientError> {
+        self.answer(|| self.request(Method::GET, &format!("{BASE}{path}")).query(query)).await
+    }
+
+    /// Deletes; the answer's body does not matter.
+    pub(crate) async fn delete(&self, path: &str) -> Result<(), ClientError> {
+        let path = format!("{BASE}{path}");
+        self.send(|| self.request(Method::DELETE, &path)).await.map(drop)
+    }
+
+    /// Orders something. However often it is tried, it is done once: `key` says that it is the same order.
+    pub(crate) async fn order<B: Serialize, T: DeserializeOwned>(
+        &self,
+        path: &str,
+        body: &B,
+        key: &str,
+    ) -> Result<T, ClientError> {
+        self.answer(|| self.request(Method::POST, &format!("{BASE}{path}")).header(IDEMPOTENCY_KEY, key).json(body))
+            .await
+    }
+
+    /// A request with the token, to a path below the server's URL or to a whole URL of the same server.
+    pub(crate) fn request(&self, method: Method, path: &str) -> RequestBuilder {
+        let url = if path.starts_with('/') { format!("{}{path}", self.base) } else { path.to_owned() };
+        self.http.request(method, url).bearer_auth(self.token.reveal()).timeout(ANSWER_TIMEOUT)
+    }
+
+    async fn answer<T: DeserializeOwned>(&self, request: impl Fn() -> RequestBuilder) -> Result<T, ClientError> {
+        let mut response = self.send(request).await?;
+        let status = response.status();
+        let mut body = Vec::new();
+        while let Some(chunk) = response.chunk().await.map_err(|source| self.unreachable(source))? {
+            if body.len() + chunk.len() > MAX_ANSWER_BYTES {
+                return Err(self.not_the_server(status));
+            }
+            body.extend_from_slice(&chunk);
+        }
+        serde_json::from_slice(&body).map_err(|_| self.not_the_server(status))
+    }
+
+    /// Sends until it is answered for good: success, or a refusal that trying again does not change.
+    pub(crate) async fn send(&self, request: impl Fn() -> RequestBuilder) -> Result<Response, ClientError> {
+        let mut tried = 0;
+        loop {
+            tried += 1;
+            let (error, wait) = match request().send().await {
+                Ok(response) if response.status().is_success() => return Ok(response),
+                Ok(response) => {
+                    let (status, wait) = (response.status(), retry_after(&response));
+                    let error = self.refusal(response).await;
+                    if !(status.is_server_error() || status == StatusCode::TOO_MANY_REQUESTS) {
+                        return Err(error);
+                    }
+                    (error, wait)
+                }
+                Err(source) if source.is_builder() => return Err(self.unreachable(source)),
+                Err(source) => (self.unreachable(source), None),
+            };
+            if tried >= TRIES {
+                return Err(error);
+            }
+            tokio::time::sleep(wait.unwrap_or_else(|| pause(tried, rand::random()))).await;
+        }
+    }
+
+    /// What an answer that is no success says.
+    pub(crate) async fn refusal(&self, response: Response) -> ClientError {
+        const MAX_ERROR_BYTES: usize = 64 * 1024;
+        let status = response.status();
+        let mut response = response;
+        let mut body = Vec::new();
+        while let Ok(Some(chunk)) = response.chunk().await {
+            body.extend_from_slice(&chunk);
+            if body.len() > MAX_ERROR_BYTES {
+                break;
+            }
+        }
+        if let Ok(ErrorBody { error }) = serde_json::from_slice(&body) {
+            return ClientError::Refused { status, code: error.code, message: error.message };
+        }
+        match serde_json::from_slice::<RegistryErrors>(&body).ok().and_then(|errors| errors.errors.into_iter().next()) {
+            Some(error) => ClientError::Refused { status, code: error.code.to_lowercase(), message: error.message },
+            None => self.not_the_server(status),
+        }
+    }
+
+    pub(crate) fn unreachable(&self, source: reqwest::Error) -> ClientError {
+        // The URL is in our own text; in reqwest's it would only be said twice.
+        ClientError::Unreachable { url: self.base.clone(), source: source.without_url() }
+    }
+
+    pub(crate) fn not_the_server(&self, status: StatusCode) -> ClientError {
+        ClientError::NotTheServer { url: self.base.clone(), status }
+    }
+}
+
+/// The error body of the OCI distribution API.
+#[derive(serde::Deserialize)]
+struct RegistryErrors {
+    errors: Vec<RegistryError>,
+}
+
+#[derive(serde::Deserialize)]
+struct RegistryError {
+    code: String,
+    #[serde(default)]
+    message: String,
+}
+
+/// Full jitter: anything up to a bound that doubles with each try. `random` is any number.
+fn pause(tried: u32, random: u32) -> Duration {
+    let bound = Duration::from_millis(200).saturating_mul(1 << tried.min(10)).min(MAX_PAUSE);
+    bound.mul_f64(f64::from(random) / f64::from(u32::MAX))
+}
+
+fn retry_after(response: &Response) -> Option<Duration> {
+    let seconds: u64 = response.headers().get(RETRY_AFTER)?.to_str().ok()?.parse().ok()?;
+    Some(Duration::from_secs(seconds).min(MAX_PAUSE))
+}
+
+/// The addresses that `taskd serve` writes into its data directory.
+#[derive(serde::Deserialize)]
+struct Addresses {
+    http: String,
+}
+
+fn local_server(data: Option<&Path>) -> Option<String> {
+    let text = std::fs::read(data?.join("addresses.json")).ok()?;
+    let Addresses { http } = serde_json::from_slice(&text).ok()?;
+    Some(if http.contains("://") { http.trim_end_matches('/').to_owned() } else { format!("http://{http}") })
+}
+
+fn find_token(connection: &Connection, data: Option<&Path>) -> Result<Token, ClientError> {
+    let (text, origin) = match (&connection.token_file, &connection.token, data) {
+        (Some(path), _, _) => (read_token(path)?, path.display().to_string()),
+        (None, Some(token), _) => (token.clone(), "--token or TASKD_TOKEN".to_owned()),
+        (None, None, Some(data)) => {
+            let path = data.join("operator.token");
+            if connection.data.is_none() && !path.exists() {
+                return Err(ClientError::NoToken);
+            }
+            (read_token(&path)?, path.display().to_string())
+        }
+        (None, None, None) => return Err(ClientError::NoToken),
+    };
+    text.parse().map_err(|source| ClientError::Token { origin, source })
+}
+
+fn read_token(path: &Path) -> Result<String, ClientError> {
+    std::fs::read_to_string(path).map_err(|source| ClientError::TokenFile { path: path.to_owned(), source })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pauses_grow_to_a_bound() {
+        assert_eq!(pause(1, u32::MAX), Duration::from_millis(400));
+        assert_eq!(pause(30, u32::MAX), MAX_PAUSE);
+        assert_eq!(pause(3, 0), Duration::ZERO);
+    }
+
+    #[test]
+    fn exit_codes_follow_the_status() {
+        let refused = |status, code: &str| {
+            ClientError::Refused { status, code: code.to_owned(), message: String::new() }.outcome()
+        };
+        assert_eq!(refused(StatusCode::UNAUTHORIZED, "unauthorized"), Outcome::NotAllowed);
+        assert_eq!(refused(StatusCode::FORBIDDEN, "forbidden"), Outcome::NotAllowed);
+        assert_eq!(refused(StatusCode::CONFLICT, "no_robots_match"), Outcome::Usage);
+        assert_eq!(refused(StatusCode::NOT_FOUND, "not_found"), Outcome::Failed);
+        assert_eq!(refused(StatusCode::BAD_REQUEST, "invalid_request"), Outcome::Usage);
+    }
+}

@@ -1,0 +1,245 @@
+//! The operator's commands: what they are called, what they take, and which exit code they end with. Each command talks
+//! to the server over its public API only; none of them opens the server's database or files (the token file excepted).
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use clap::{Args, Subcommand};
+
+use crate::package::PackageError;
+use client::{Client, ClientError};
+use output::{Format, Output};
+
+mod client;
+mod confirm;
+mod deploy;
+mod enroll_token;
+mod output;
+mod progress;
+mod push;
+mod robot;
+mod task;
+mod upload;
+mod wait;
+
+/// The operator's commands; `main` adds `serve` to them.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Look at robots, or remove one
+    Robot {
+        /// Where the server is and who asks.
+        #[command(flatten)]
+        connection: Connection,
+        /// What to do.
+        #[command(subcommand)]
+        action: robot::Action,
+    },
+    /// Make the tokens that robots enrol with
+    EnrollToken {
+        /// Where the server is and who asks.
+        #[command(flatten)]
+        connection: Connection,
+        /// What to do.
+        #[command(subcommand)]
+        action: enroll_token::Action,
+    },
+    /// Pack a directory, upload it and, with --to, deploy it
+    Push {
+        /// Where the server is and who asks.
+        #[command(flatten)]
+        connection: Connection,
+        /// What to push.
+        #[command(flatten)]
+        push: push::Push,
+    },
+    /// Pack a directory and print its digests; talks to no server
+    Pack(push::Pack),
+    /// Look at deployments, cancel or resume one
+    Deploy {
+        /// Where the server is and who asks.
+        #[command(flatten)]
+        connection: Connection,
+        /// What to do.
+        #[command(subcommand)]
+        action: deploy::Action,
+    },
+    /// Start a task on robots that have it
+    Start {
+        /// Where the server is and who asks.
+        #[command(flatten)]
+        connection: Connection,
+        /// Which task, where.
+        #[command(flatten)]
+        order: task::TaskOrder,
+    },
+    /// Stop a task; it stays installed
+    Stop {
+        /// Where the server is and who asks.
+        #[command(flatten)]
+        connection: Connection,
+        /// Which task, where.
+        #[command(flatten)]
+        order: task::TaskOrder,
+    },
+    /// Stop a task and remove it from robots
+    Remove {
+        /// Where the server is and who asks.
+        #[command(flatten)]
+        connection: Connection,
+        /// Which task, where.
+        #[command(flatten)]
+        order: task::TaskOrder,
+    },
+}
+
+/// Where the server is and who asks.
+#[derive(Debug, Args)]
+pub struct Connection {
+    /// The server's URL [default: the server of --data, else http://127.0.0.1:8080]
+    #[arg(long, env = "TASKD_SERVER", value_name = "URL", global = true)]
+    pub server: Option<String>,
+    /// The operator's token [default: operator.token in --data]
+    #[arg(long, env = "TASKD_TOKEN", value_name = "TOKEN", hide_env_values = true, global = true)]
+    pub token: Option<String>,
+    /// A file that holds the operator's token
+    #[arg(long, value_name = "FILE", global = true)]
+    pub token_file: Option<PathBuf>,
+    /// The data directory of a server on this machine
+    #[arg(long, env = "TASKD_DATA", value_name = "DIR", global = true)]
+    pub data: Option<PathBuf>,
+    /// How to print the result
+    #[arg(short, long, value_enum, default_value_t = Format::Table, value_name = "FORMAT", global = true)]
+    pub output: Format,
+}
+
+/// How a command ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Outcome {
+    /// Everything that was asked for.
+    Succeeded,
+    /// It did not work, or no robot succeeded.
+    Failed,
+    /// The command line or the package is wrong, or no robot is meant.
+    Usage,
+    /// Some robots succeeded, others failed.
+    SomeFailed,
+    /// The server does not let this token do that.
+    NotAllowed,
+    /// It was not done in time.
+    TimedOut,
+}
+
+impl From<Outcome> for ExitCode {
+    fn from(outcome: Outcome) -> Self {
+        Self::from(match outcome {
+            Outcome::Succeeded => 0,
+            Outcome::Failed => 1,
+            Outcome::Usage => 2,
+            Outcome::SomeFailed => 3,
+            Outcome::NotAllowed => 4,
+            Outcome::TimedOut => 5,
+        })
+    }
+}
+
+/// Why a command could not do its work.
+#[derive(Debug, thiserror::Error)]
+pub enum CommandError {
+    /// The server refused, or could not be asked.
+    #[error(transparent)]
+    Client(#[from] ClientError),
+    /// The directory is not a package that could run.
+    #[error(transparent)]
+    Package(#[from] PackageError),
+    /// The command line asks for something that makes no sense.
+    #[error("{0}")]
+    Usage(String),
+    /// A local file or stream.
+    #[error("{what}")]
+    Io {
+        /// What was being done.
+        what: String,
+        /// Why it failed.
+        source: std::io::Error,
+    },
+}
+
+impl CommandError {
+    fn outcome(&self) -> Outcome {
+        match self {
+            Self::Client(error) => error.outcome(),
+            Self::Package(PackageError::Io { .. }) | Self::Io { .. } => Outcome::Failed,
+            Self::Package(_) | Self::Usage(_) => Outcome::Usage,
+        }
+    }
+}
+
+/// Runs one command to its end. Results are on stdout, everything else has been said on stderr.
+pub async fn run(command: Command) -> ExitCode {
+    let outcome = match dispatch(command).await {
+        Ok(outcome) => outcome,
+        Err(error) => {
+            output::complain(&error);
+            error.outcome()
+        }
+    };
+    outcome.into()
+}
+
+async fn dispatch(command: Command) -> Result<Outcome, CommandError> {
+    match command {
+        Command::Pack(pack) => push::pack(pack).await,
+        Command::Robot { connection, action } => robot::run(&connection.open()?, action).await,
+        Command::EnrollToken { connection, action } => enroll_token::run(&connection.open()?, action).await,
+        Command::Push { connection, push } => push::run(&connection.open()?, push).await,
+        Command::Deploy { connection, action } => deploy::run(&connection.open()?, action).await,
+        Command::Start { connection, order } => task::run(&connection.open()?, task::Verb::Start, order).await,
+        Command::Stop { connection, order } => task::run(&connection.open()?, task::Verb::Stop, order).await,
+        Command::Remove { connection, order } => task::run(&connection.open()?, task::Verb::Remove, order).await,
+    }
+}
+
+/// What every command that asks the server has at hand.
+pub(crate) struct Session {
+    client: Client,
+    output: Output,
+}
+
+impl Connection {
+    fn open(&self) -> Result<Session, CommandError> {
+        Ok(Session { client: Client::connect(self)?, output: Output::new(self.output) })
+    }
+}
+
+/// Reads `90s`, `2m`, `1h` or `7d`; at most ten years.
+fn duration(text: &str) -> Result<Duration, String> {
+    const MAX_S: u64 = 10 * 365 * 24 * 60 * 60;
+    let unit_s = match text.chars().last() {
+        Some('s') => 1,
+        Some('m') => 60,
+        Some('h') => 60 * 60,
+        Some('d') => 24 * 60 * 60,
+        _ => return Err("expected a number and one of s, m, h, d, like 90s or 2m".to_owned()),
+    };
+    let number: u64 =
+        text[..text.len() - 1].parse().map_err(|_| "expected a whole number before the unit".to_owned())?;
+    match number.checked_mul(unit_s) {
+        Some(seconds) if (1..=MAX_S).contains(&seconds) => Ok(Duration::from_secs(seconds)),
+        _ => Err("must be between 1s and ten years".to_owned()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn durations_have_a_number_and_a_unit() {
+        assert_eq!(duration("2m"), Ok(Duration::from_secs(120)));
+        assert_eq!(duration("7d"), Ok(Duration::from_secs(604_800)));
+        for bad in ["", "m", "2", "2w", "0s", "-1s", "99999999d", "1.5h", "2 m", "2é"] {
+            assert!(duration(bad).is_err(), "{bad}");
+        }
+    }
+}

@@ -1,0 +1,148 @@
+//! What people and programs read: results on stdout as table or JSON, everything else on stderr. A reader that goes away
+//! (a closed pipe) is no error: what it no longer wants is dropped.
+
+use std::io::{self, IsTerminal as _, Write as _};
+
+use comfy_table::{ContentArrangement, Table};
+use serde::Serialize;
+
+use super::CommandError;
+
+/// How results are printed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Format {
+    /// For people.
+    Table,
+    /// For programs: one JSON document.
+    Json,
+}
+
+/// The command's way to its reader.
+pub(crate) struct Output {
+    format: Format,
+}
+
+impl Output {
+    pub(crate) fn new(format: Format) -> Self {
+        Self { format }
+    }
+
+    /// Prints `value`: as JSON, or as the table that `rows` makes of it.
+    pub(crate) fn result<T: Serialize>(
+        &self,
+        value: &T,
+        header: &[&str],
+        rows: impl FnOnce(&T) -> Vec<Vec<String>>,
+    ) -> Result<(), CommandError> {
+        let text = match self.format {
+            Format::Json => json(value)?,
+            Format::Table => table(header, rows(value)),
+        };
+        print(&text)
+    }
+
+    /// Prints `value`: as JSON, or as the text that `describe` makes of it.
+    pub(crate) fn described<T: Serialize>(
+        &self,
+        value: &T,
+        describe: impl FnOnce(&T) -> String,
+    ) -> Result<(), CommandError> {
+        let text = match self.format {
+            Format::Json => json(value)?,
+            Format::Table => describe(value),
+        };
+        print(&text)
+    }
+}
+
+fn json<T: Serialize>(value: &T) -> Result<String, CommandError> {
+    serde_json::to_string_pretty(value)
+        .map_err(|error| CommandError::Io { what: "can't print the result".to_owned(), source: error.into() })
+}
+
+fn print(text: &str) -> Result<(), CommandError> {
+    let mut stdout = io::stdout().lock();
+    match writeln!(stdout, "{}", text.trim_end()).and_then(|()| stdout.flush()) {
+        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => {
+            Err(CommandError::Io { what: "can't write to stdout".to_owned(), source: error })
+        }
+        _ => Ok(()),
+    }
+}
+
+/// A table without lines, its columns two spaces apart.
+pub(crate) fn table(header: &[&str], rows: Vec<Vec<String>>) -> String {
+    let mut table = Table::new();
+    table.load_style(comfy_table::presets::NOTHING).set_content_arrangement(ContentArrangement::Disabled);
+    table.set_header(header.iter().map(|title| title.to_uppercase()));
+    for row in rows {
+        table.add_row(row.into_iter().map(|cell| printable(&cell)));
+    }
+    table.lines().map(|line| line.trim_end().to_owned()).collect::<Vec<_>>().join("\n")
+}
+
+/// `text` on one line and without control characters: a robot or a package may have put them there.
+pub(crate) fn printable(text: &str) -> String {
+    text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect()
+}
+
+/// Says `text` on stderr. Nobody may be listening, which is no reason to fail.
+pub(crate) fn say(text: &str) {
+    let _ = writeln!(io::stderr().lock(), "{text}");
+}
+
+/// Says what went wrong and why, the whole chain.
+pub(crate) fn complain(error: &CommandError) {
+    let mut text = format!("taskd: {error}");
+    let mut source = std::error::Error::source(error);
+    while let Some(cause) = source {
+        text.push_str(&format!(": {cause}"));
+        source = cause.source();
+    }
+    say(&text);
+}
+
+/// Whether a person sees stderr, so that progress may move.
+pub(crate) fn stderr_is_terminal() -> bool {
+    io::stderr().is_terminal()
+}
+
+/// Milliseconds since the Unix epoch as `2026-01-31 08:05:09Z`.
+pub(crate) fn time(ms: u64) -> String {
+    let seconds = ms / 1000;
+    let (days, second) = (seconds / 86_400, seconds % 86_400);
+    // Civil date from days, with years that begin in March so that leap days come last (Hinnant's algorithm).
+    let shifted = days + 719_468;
+    let era = shifted / 146_097;
+    let day_of_era = shifted % 146_097;
+    let year_of_era = (day_of_era - day_of_era / 1460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;
+    let day_of_year = day_of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
+    let month_from_march = (5 * day_of_year + 2) / 153;
+    let day = day_of_year - (153 * month_from_march + 2) / 5 + 1;
+    let month = if month_from_march < 10 { month_from_march + 3 } else { month_from_march - 9 };
+    let year = era * 400 + year_of_era + u64::from(month <= 2);
+    format!("{year:04}-{month:02}-{day:02} {:02}:{:02}:{:02}Z", second / 3600, second / 60 % 60, second % 60)
+}
+
+/// Bytes as people read them.
+pub(crate) fn bytes(count: u64) -> String {
+    indicatif::HumanBytes(count).to_string()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_are_civil_dates() {
+        assert_eq!(time(0), "1970-01-01 00:00:00Z");
+        assert_eq!(time(951_782_400_000), "2000-02-29 00:00:00Z");
+        assert_eq!(time(1_704_067_199_999), "2023-12-31 23:59:59Z");
+    }
+
+    #[test]
+    fn a_table_has_a_header_and_no_lines() {
+        let text = table(&["id", "name"], vec![vec!["r1".to_owned(), "a\u{1b}[31mb\nc".to_owned()]]);
+        assert_eq!(text, " ID  NAME\n r1  a [31mb c");
+    }
+}

@@ -1,0 +1,118 @@
+//! Progress on stderr: a bar per robot for a few robots, one bar for many, plain lines where nobody sees bars move.
+
+use std::collections::HashMap;
+
+use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
+use task_proto::RobotId;
+use task_proto::api::{AssignmentView, DeploymentView};
+use task_proto::report::Phase;
+
+use super::output::{printable, say, stderr_is_terminal};
+
+/// Up to this many robots each gets its own bar.
+const MAX_BARS: usize = 20;
+
+/// A bar for an upload of `size` bytes.
+pub(super) fn upload_bar(size: u64) -> ProgressBar {
+    if !stderr_is_terminal() {
+        return ProgressBar::hidden();
+    }
+    let style = ProgressStyle::with_template("uploading {bar:30} {bytes}/{total_bytes} {binary_bytes_per_sec}");
+    let bar = ProgressBar::new(size);
+    if let Ok(style) = style {
+        bar.set_style(style);
+    }
+    bar
+}
+
+/// Follows one deployment.
+pub(super) struct DeploymentProgress {
+    bars: MultiProgress,
+    moving: bool,
+    robots: HashMap<RobotId, ProgressBar>,
+    summary: Option<ProgressBar>,
+    said: HashMap<RobotId, Phase>,
+    said_summary: String,
+}
+
+impl DeploymentProgress {
+    pub(super) fn new() -> Self {
+        Self {
+            bars: MultiProgress::new(),
+            moving: stderr_is_terminal(),
+            robots: HashMap::new(),
+            summary: None,
+            said: HashMap::new(),
+            said_summary: String::new(),
+        }
+    }
+
+    /// Shows where the deployment stands now.
+    pub(super) fn show(&mut self, view: &DeploymentView) {
+        let assignments = view.assignments.as_deref().unwrap_or_default();
+        if assignments.len() > MAX_BARS {
+            self.show_summary(view, assignments);
+        } else {
+            for assignment in assignments {
+                self.show_robot(assignment);
+            }
+        }
+    }
+
+    fn show_robot(&mut self, assignment: &AssignmentView) {
+        if !self.moving {
+            if self.said.insert(assignment.robot.clone(), assignment.phase) != Some(assignment.phase) {
+                say(&line(assignment));
+            }
+            return;
+        }
+        let bars = &self.bars;
+        let bar = self.robots.entry(assignment.robot.clone()).or_insert_with(|| styled(bars));
+        match assignment.progress {
+            Some(progress) => {
+                bar.set_length(progress.total);
+                bar.set_position(progress.done);
+            }
+            None => bar.set_length(0),
+        }
+        bar.set_message(line(assignment));
+    }
+
+    fn show_summary(&mut self, view: &DeploymentView, assignments: &[AssignmentView]) {
+        let counts: Vec<_> = view.counts.iter().map(|count| format!("{} {}", count.count, count.phase)).collect();
+        let text = counts.join(", ");
+        if !self.moving {
+            if self.said_summary != text {
+                say(&text);
+                self.said_summary = text;
+            }
+            return;
+        }
+        let bars = &self.bars;
+        let bar = self.summary.get_or_insert_with(|| styled(bars));
+        bar.set_length(assignments.len() as u64);
+        bar.set_position(assignments.iter().filter(|assignment| assignment.phase.is_settled(view.kind)).count() as u64);
+        bar.set_message(text);
+    }
+
+    /// Takes the bars away, so that the result stands alone.
+    pub(super) fn finish(self) {
+        for bar in self.robots.into_values().chain(self.summary) {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+fn styled(bars: &MultiProgress) -> ProgressBar {
+    let bar = bars.add(ProgressBar::new(0));
+    if let Ok(style) = ProgressStyle::with_template("{bar:20} {msg}") {
+        bar.set_style(style);
+    }
+    bar
+}
+
+fn line(assignment: &AssignmentView) -> String {
+    let offline = if assignment.online { "" } else { " (offline)" };
+    let reason = assignment.failure.as_ref().map_or_else(String::new, |failure| format!(": {failure}"));
+    printable(&format!("{} {}{offline}{reason}", assignment.name, assignment.phase))
+}

@@ -1,0 +1,168 @@
+//! `taskd push` and `taskd pack`: from a directory to a package, to the server and, with `--to`, to robots.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::{Args, ValueEnum};
+use task_proto::api::{CreateDeployment, DeploymentView, MatchedRobot, MatchedRobots};
+use task_proto::desired::Delivery;
+use task_proto::selector::Selector;
+
+use super::confirm::confirm;
+use super::output::{bytes, say};
+use super::{CommandError, Outcome, Session, deploy, duration, robot, task, upload, wait};
+use crate::package::{self, Packed};
+
+/// What to push, where to and how.
+#[derive(Debug, Args)]
+pub struct Push {
+    /// The package's directory, with task.toml, package.xml or both
+    dir: PathBuf,
+    /// Deploy it to these robots: *, names, label=value; without it the package is only uploaded
+    #[arg(long, value_name = "SELECTOR")]
+    to: Option<Selector>,
+    /// Wait until it runs (a job: has succeeded) everywhere
+    #[arg(long, requires = "to")]
+    wait: bool,
+    /// How long to wait
+    #[arg(long, value_name = "TIME", value_parser = duration, default_value = "10m", requires = "to")]
+    timeout: Duration,
+    /// So many robots at a time [default: all at once]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..), requires = "to")]
+    batch: Option<u64>,
+    /// Pause when more robots than this have failed [default: never]
+    #[arg(long, value_name = "N", requires = "to")]
+    max_failures: Option<u64>,
+    /// How the bytes travel
+    #[arg(long, value_enum, default_value_t = DeliveryName::PushPull, requires = "to")]
+    delivery: DeliveryName,
+    /// When what is not done by then expires [default: the server's setting]
+    #[arg(long, value_name = "TIME", value_parser = duration, requires = "to")]
+    expires: Option<Duration>,
+    /// Only check the package and list the robots that are meant
+    #[arg(long)]
+    dry_run: bool,
+    /// Don't ask, however many robots are meant
+    #[arg(short, long)]
+    yes: bool,
+    /// Makes a repeated command the same order
+    #[arg(long, value_name = "KEY", requires = "to")]
+    idempotency_key: Option<String>,
+}
+
+/// How the bytes travel, by the name it has everywhere.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum DeliveryName {
+    /// The server announces, the robot pulls
+    PushPull,
+    /// The robot asks on its own timer
+    Poll,
+}
+
+/// What to pack.
+#[derive(Debug, Args)]
+pub struct Pack {
+    /// The package's directory
+    dir: PathBuf,
+    /// Write the content archive (tar+zstd) to this file
+    #[arg(short, long, value_name = "FILE")]
+    out: Option<PathBuf>,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) async fn run(session: &Session, push: Push) -> Result<Outcome, CommandError> {
+    let matched = match &push.to {
+        Some(selector) => Some(matched(session, selector).await?),
+        None => None,
+    };
+    let packed = packed(push.dir.clone()).await?;
+    if push.dry_run {
+        task::print_matched(session, &matched.unwrap_or_default())?;
+        return Ok(Outcome::Succeeded);
+    }
+    if let (Some(selector), Some(matched)) = (&push.to, &matched) {
+        confirm(&format!("push {} to {selector}", packed.package.name), matched.robots.len(), push.yes)?;
+    }
+    upload::upload(&session.client, &packed).await?;
+    let Some(selector) = push.to else {
+        session.output.described(&packed.package, |_| describe(&packed))?;
+        return Ok(Outcome::Succeeded);
+    };
+    let order = CreateDeployment {
+        package: packed.package.name.clone(),
+        manifest: packed.package.manifest.digest,
+        selector,
+        delivery: match push.delivery {
+            DeliveryName::PushPull => Delivery::PushPull,
+            DeliveryName::Poll => Delivery::Poll,
+        },
+        batch: push.batch,
+        max_failures: push.max_failures,
+        expires_in_s: push.expires.map(|expires| expires.as_secs()),
+        dry_run: false,
+    };
+    let key = push.idempotency_key.unwrap_or_else(random_key);
+    let ordered: DeploymentView = session.client.order("/deployments", &order, &key).await?;
+    let robots: u64 = ordered.counts.iter().map(|count| count.count).sum();
+    say(&format!("deployment {}: {} {} to {robots} robots", ordered.id, order.package, ordered.package.version));
+    for superseded in &ordered.supersedes {
+        say(&format!("it supersedes {superseded}"));
+    }
+    if !push.wait {
+        session.output.described(&ordered, deploy::describe)?;
+        return Ok(Outcome::Succeeded);
+    }
+    wait::until_settled(session, &ordered.id, push.timeout).await
+}
+
+/// The robots meant; none at all is a mistake in the command, noticed before anything travels.
+async fn matched(session: &Session, selector: &Selector) -> Result<MatchedRobots, CommandError> {
+    let robots = robot::matching(session, selector).await?.robots;
+    if robots.is_empty() {
+        return Err(CommandError::Usage(format!("--to {selector}: no robot matches")));
+    }
+    let matched =
+        |robot: task_proto::api::RobotView| MatchedRobot { id: robot.id, name: robot.name, online: robot.online };
+    Ok(MatchedRobots { robots: robots.into_iter().map(matched).collect() })
+}
+
+async fn packed(dir: PathBuf) -> Result<Packed, CommandError> {
+    let packing = tokio::task::spawn_blocking(move || package::pack(&dir));
+    let packed = packing.await.map_err(|error| CommandError::Io {
+        what: "the packer ended unexpectedly".to_owned(),
+        source: error.into(),
+    })??;
+    Ok(packed)
+}
+
+pub(super) async fn pack(pack: Pack) -> Result<Outcome, CommandError> {
+    let packed = packed(pack.dir).await?;
+    if let Some(path) = &pack.out {
+        std::fs::copy(packed.content.path(), path)
+            .map_err(|source| CommandError::Io { what: format!("can't write {}", path.display()), source })?;
+    }
+    let format = if pack.json { super::output::Format::Json } else { super::output::Format::Table };
+    super::output::Output::new(format).described(&packed.package, |_| describe(&packed))?;
+    Ok(Outcome::Succeeded)
+}
+
+fn describe(packed: &Packed) -> String {
+    let (package, facts) = (&packed.package, &packed.manifest.content);
+    format!(
+        "package     {} {}\nmanifest    {}\ncontent     {} ({}, {} unpacked, {} entries)\n",
+        package.name,
+        package.version,
+        package.manifest.digest,
+        package.content.digest,
+        bytes(package.content.size),
+        bytes(facts.tar_size),
+        facts.entries
+    )
+}
+
+/// A key for an order that the operator gave none.
+pub(super) fn random_key() -> String {
+    format!("{:032x}", rand::random::<u128>())
+}

@@ -1,0 +1,131 @@
+//! `taskd robot`: shows robots and removes them.
+
+use clap::Subcommand;
+use task_proto::RobotName;
+use task_proto::api::{RobotList, RobotTask, RobotView};
+use task_proto::selector::Selector;
+
+use super::output::{printable, say, table, time};
+use super::{CommandError, Outcome, Session};
+
+/// What to do with robots.
+#[derive(Debug, Subcommand)]
+pub enum Action {
+    /// List robots
+    List {
+        /// Which robots: *, names, label=value; commas separate alternatives, & joins conditions
+        #[arg(default_value = "*")]
+        selector: Selector,
+    },
+    /// Show everything about one robot
+    Info {
+        /// Its name or id
+        robot: RobotName,
+    },
+    /// Remove a robot; its token ends, its tasks run on but nothing new starts
+    Rm {
+        /// Its name or id
+        robot: RobotName,
+    },
+}
+
+pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, CommandError> {
+    match action {
+        Action::List { selector } => {
+            let list = matching(session, &selector).await?;
+            session.output.result(&list, &HEADER, |list| list.robots.iter().map(row).collect())?;
+        }
+        Action::Info { robot } => {
+            let robot = one(session, &robot).await?;
+            session.output.described(&robot, describe)?;
+        }
+        Action::Rm { robot } => {
+            let robot = one(session, &robot).await?;
+            session.client.delete(&format!("/robots/{}", robot.id)).await?;
+            say(&format!("removed {} ({})", robot.name, robot.id));
+        }
+    }
+    Ok(Outcome::Succeeded)
+}
+
+/// The robots that `selector` means now.
+pub(super) async fn matching(session: &Session, selector: &Selector) -> Result<RobotList, CommandError> {
+    Ok(session.client.get("/robots", &[("selector", selector.to_string())]).await?)
+}
+
+async fn one(session: &Session, name: &RobotName) -> Result<RobotView, CommandError> {
+    let selector = name.as_str().parse().map_err(|error| CommandError::Usage(format!("{error}")))?;
+    let mut robots = matching(session, &selector).await?.robots;
+    match robots.len() {
+        0 => Err(CommandError::Usage(format!("no robot has the name or id {name}"))),
+        1 => Ok(robots.remove(0)),
+        _ => Err(CommandError::Usage(format!("{name} is the name of one robot and the id of another"))),
+    }
+}
+
+const HEADER: [&str; 7] = ["id", "name", "mac", "address", "state", "last seen", "tasks"];
+
+fn row(robot: &RobotView) -> Vec<String> {
+    let tasks: Vec<_> = robot.tasks.iter().map(|task| format!("{}:{}", task.task, task.phase)).collect();
+    vec![
+        robot.id.to_string(),
+        robot.name.to_string(),
+        robot.mac.to_string(),
+        robot.address.clone().unwrap_or_else(|| "-".to_owned()),
+        state(robot),
+        robot.last_seen_ms.map_or_else(|| "never".to_owned(), time),
+        if tasks.is_empty() { "-".to_owned() } else { tasks.join(" ") },
+    ]
+}
+
+/// Online or offline, and the conditions an operator must know about.
+fn state(robot: &RobotView) -> String {
+    let mut state = vec![if robot.online { "online" } else { "offline" }];
+    state.extend(robot.conditions.iter().map(|condition| condition.code.as_str()));
+    state.join(" ")
+}
+
+fn describe(robot: &RobotView) -> String {
+    let labels: Vec<_> = robot.labels.iter().map(|(key, value)| format!("{key}={value}")).collect();
+    let mut facts = vec![
+        ("id", robot.id.to_string()),
+        ("name", robot.name.to_string()),
+        ("mac", robot.mac.to_string()),
+        ("state", if robot.online { "online" } else { "offline" }.to_owned()),
+        ("address", robot.address.clone().unwrap_or_else(|| "-".to_owned())),
+        ("last seen", robot.last_seen_ms.map_or_else(|| "never".to_owned(), time)),
+        ("enrolled", time(robot.enrolled_at_ms)),
+        ("labels", if labels.is_empty() { "-".to_owned() } else { labels.join(" ") }),
+        ("generation", format!("{} ordered, {} observed", robot.generation, robot.observed_generation)),
+    ];
+    if let Some(host) = &robot.host {
+        facts.push(("host", format!("{} {} agent {}", host.hostname, host.arch, host.agent_version)));
+        facts.push(("ros", if host.ros_distros.is_empty() { "-".to_owned() } else { host.ros_distros.join(" ") }));
+        facts.push(("disk free", super::output::bytes(host.disk_free_bytes)));
+    }
+    facts.extend(robot.conditions.iter().map(|c| ("condition", format!("{}: {}", c.code, c.text))));
+    let mut text: String = facts.iter().map(|(key, value)| format!("{key:<12}{}\n", printable(value))).collect();
+    if !robot.tasks.is_empty() {
+        text.push('\n');
+        let header = ["task", "version", "wanted", "run", "phase", "restarts", "deployment", "failure"];
+        text.push_str(&table(&header, robot.tasks.iter().map(task_row).collect()));
+    }
+    text
+}
+
+fn task_row(task: &RobotTask) -> Vec<String> {
+    let wanted = match task.wanted {
+        task_proto::desired::Wanted::Running => "running",
+        task_proto::desired::Wanted::Stopped => "stopped",
+    };
+    vec![
+        task.task.to_string(),
+        task.version.to_string(),
+        wanted.to_owned(),
+        task.run.to_string(),
+        task.phase.to_string(),
+        task.restarts.to_string(),
+        task.deployment.to_string(),
+        task.failure.as_ref().map_or_else(|| "-".to_owned(), ToString::to_string),
+    ]
+}

@@ -1,0 +1,86 @@
+//! `taskd start|stop|remove`: orders on tasks that robots already have.
+
+use clap::Args;
+use task_proto::TaskName;
+use task_proto::api::{MatchedRobots, OrderTask};
+use task_proto::selector::Selector;
+
+use super::confirm::confirm;
+use super::output::say;
+use super::{CommandError, Outcome, Session};
+
+/// Which task on which robots.
+#[derive(Debug, Args)]
+pub struct TaskOrder {
+    /// The task's name
+    task: TaskName,
+    /// Which robots: *, names, label=value; those without the task are left out
+    #[arg(long, value_name = "SELECTOR")]
+    on: Selector,
+    /// Only list the robots that are meant
+    #[arg(long)]
+    dry_run: bool,
+    /// Don't ask, however many robots are meant
+    #[arg(short, long)]
+    yes: bool,
+    /// Makes a repeated command the same order
+    #[arg(long, value_name = "KEY")]
+    idempotency_key: Option<String>,
+}
+
+/// What is ordered.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Verb {
+    Start,
+    Stop,
+    Remove,
+}
+
+impl Verb {
+    fn as_str(self) -> &'static str {
+        match self {
+            Self::Start => "start",
+            Self::Stop => "stop",
+            Self::Remove => "remove",
+        }
+    }
+}
+
+pub(super) async fn run(session: &Session, verb: Verb, order: TaskOrder) -> Result<Outcome, CommandError> {
+    let TaskOrder { task, on, dry_run, yes, idempotency_key } = order;
+    let path = format!("/tasks/{task}/{}", verb.as_str());
+    let key = idempotency_key.unwrap_or_else(super::push::random_key);
+    let ask = OrderTask { selector: on.clone(), dry_run: true };
+    // A dry run is no order, so it gets a key of its own.
+    let matched: MatchedRobots = session.client.order(&path, &ask, &super::push::random_key()).await?;
+    if matched.robots.is_empty() {
+        return Err(CommandError::Usage(format!("no robot that {on} selects has the task {task}")));
+    }
+    if dry_run {
+        print_matched(session, &matched)?;
+        return Ok(Outcome::Succeeded);
+    }
+    confirm(&format!("{} {task} on {on}", verb.as_str()), matched.robots.len(), yes)?;
+    let ordered: MatchedRobots = session.client.order(&path, &OrderTask { selector: on, dry_run: false }, &key).await?;
+    print_matched(session, &ordered)?;
+    let offline = ordered.robots.iter().filter(|robot| !robot.online).count();
+    say(&format!("ordered: {} {task} on {} robots", verb.as_str(), ordered.robots.len()));
+    if offline > 0 {
+        say(&format!("{offline} of them are offline and follow when they are back"));
+    }
+    Ok(Outcome::Succeeded)
+}
+
+/// Lists the robots an order means.
+pub(super) fn print_matched(session: &Session, matched: &MatchedRobots) -> Result<(), CommandError> {
+    session.output.result(matched, &["id", "name", "state"], |matched| {
+        let row = |robot: &task_proto::api::MatchedRobot| {
+            vec![
+                robot.id.to_string(),
+                robot.name.to_string(),
+                if robot.online { "online" } else { "offline" }.to_owned(),
+            ]
+        };
+        matched.robots.iter().map(row).collect()
+    })
+}

@@ -1,0 +1,150 @@
+//! Brings a package's blobs and manifest to the server's OCI store. What is there already is not sent again, and a blob
+//! streams from its file.
+
+use std::path::Path;
+
+use futures_util::TryStreamExt as _;
+use reqwest::header::{CONTENT_LENGTH, CONTENT_TYPE, LOCATION};
+use reqwest::{Body, Method, Response, StatusCode};
+use task_proto::desired::BlobRef;
+use task_proto::oci::MANIFEST_TYPE;
+use tokio_util::io::ReaderStream;
+
+use super::CommandError;
+use super::client::{Client, ClientError};
+use super::output::{bytes, say};
+use super::progress;
+use crate::package::Packed;
+
+/// How often a blob's upload is begun.
+const UPLOAD_TRIES: u32 = 4;
+/// An upload slower than this is given up.
+const MIN_BYTES_PER_SECOND: u64 = 16 * 1024;
+/// How much is read from the file at once.
+const CHUNK_BYTES: usize = 256 * 1024;
+
+/// A blob's bytes, in memory or in a file.
+enum Source<'a> {
+    Bytes(&'a [u8]),
+    File(&'a Path),
+}
+
+/// Uploads what the server lacks, and says how much that was.
+pub(super) async fn upload(client: &Client, packed: &Packed) -> Result<(), CommandError> {
+    let name = packed.package.name.as_str();
+    let mut sent = 0;
+    for (blob, source) in [
+        (packed.package.config, Source::Bytes(&packed.config_bytes)),
+        (packed.package.content, Source::File(packed.content.path())),
+    ] {
+        if !exists(client, &format!("/v2/{name}/blobs/{}", blob.digest)).await? {
+            upload_blob(client, name, blob, &source).await?;
+            sent += 1;
+        }
+    }
+    put_manifest(client, packed).await?;
+    let package = &packed.package;
+    match sent {
+        0 => say(&format!("{} {}: the server has it already, no blob transferred", package.name, package.version)),
+        _ => say(&format!(
+            "{} {}: {sent} blobs transferred ({})",
+            package.name,
+            package.version,
+            bytes(package.content.size)
+        )),
+    }
+    Ok(())
+}
+
+async fn exists(client: &Client, path: &str) -> Result<bool, ClientError> {
+    match client.send(|| client.request(Method::HEAD, path)).await {
+        Ok(_) => Ok(true),
+        Err(error) if status_of(&error) == Some(StatusCode::NOT_FOUND) => Ok(false),
+        Err(error) => Err(error),
+    }
+}
+
+/// The status of an answer without a readable body, as a HEAD has.
+fn status_of(error: &ClientError) -> Option<StatusCode> {
+    match error {
+        ClientError::Refused { status, .. } | ClientError::NotTheServer { status, .. } => Some(*status),
+        _ => None,
+    }
+}
+
+async fn upload_blob(client: &Client, name: &str, blob: BlobRef, source: &Source<'_>) -> Result<(), CommandError> {
+    let mut tried = 0;
+    loop {
+        tried += 1;
+        // Each try is an upload of its own: the server collects what a broken one left.
+        let session = client.send(|| client.request(Method::POST, &format!("/v2/{name}/blobs/uploads/"))).await?;
+        let target = target(client, &session, blob)?;
+        let request = client
+            .request(Method::PUT, &target)
+            .timeout(std::time::Duration::from_secs(60 + blob.size / MIN_BYTES_PER_SECOND))
+            .header(CONTENT_TYPE, "application/octet-stream")
+            .header(CONTENT_LENGTH, blob.size)
+            .body(body(source, blob.size).await?);
+        let error = match request.send().await {
+            Ok(response) if response.status().is_success() => return Ok(()),
+            Ok(response) => {
+                let status = response.status();
+                let error = client.refusal(response).await;
+                if !status.is_server_error() {
+                    return Err(error.into());
+                }
+                error
+            }
+            Err(source) => client.unreachable(source),
+        };
+        if tried >= UPLOAD_TRIES {
+            return Err(error.into());
+        }
+    }
+}
+
+/// Where the server wants the bytes: its `Location`, relative or absolute, with the digest added.
+fn target(client: &Client, session: &Response, blob: BlobRef) -> Result<String, ClientError> {
+    let location = session.headers().get(LOCATION).and_then(|value| value.to_str().ok());
+    let location = location
+        .and_then(|location| session.url().join(location).ok())
+        // The token goes nowhere but to the server it is for.
+        .filter(|url| url.origin() == session.url().origin());
+    let mut url = location.ok_or_else(|| client.not_the_server(session.status()))?;
+    url.query_pairs_mut().append_pair("digest", &blob.digest.to_string());
+    Ok(url.into())
+}
+
+async fn body(source: &Source<'_>, size: u64) -> Result<Body, CommandError> {
+    match source {
+        Source::Bytes(bytes) => Ok(Body::from(bytes.to_vec())),
+        Source::File(path) => {
+            let file = tokio::fs::File::open(path)
+                .await
+                .map_err(|source| CommandError::Io { what: "can't read the packed content".to_owned(), source })?;
+            let bar = progress::upload_bar(size);
+            let chunks = ReaderStream::with_capacity(file, CHUNK_BYTES);
+            Ok(Body::wrap_stream(chunks.inspect_ok(move |chunk| bar.inc(chunk.len() as u64))))
+        }
+    }
+}
+
+/// Puts the manifest under the version as its tag, unless the tag is there and means it.
+async fn put_manifest(client: &Client, packed: &Packed) -> Result<(), CommandError> {
+    let path = format!("/v2/{}/manifests/{}", packed.package.name, packed.package.version);
+    match client.send(|| client.request(Method::HEAD, &path)).await {
+        Ok(response) => {
+            let known = response.headers().get("docker-content-digest").and_then(|value| value.to_str().ok());
+            if known == Some(&packed.package.manifest.digest.to_string()) {
+                return Ok(());
+            }
+            say(&format!("version {} is on the server with other content; its tag moves", packed.package.version));
+        }
+        Err(error) if status_of(&error) == Some(StatusCode::NOT_FOUND) => {}
+        Err(error) => return Err(error.into()),
+    }
+    let put =
+        || client.request(Method::PUT, &path).header(CONTENT_TYPE, MANIFEST_TYPE).body(packed.manifest_bytes.clone());
+    client.send(put).await?;
+    Ok(())
+}

@@ -1,0 +1,134 @@
+//! `--wait`: follows a deployment until every robot has settled or the time is over, and judges how it went. It asks the
+//! server again and again, so a server that restarts meanwhile costs time and nothing else.
+
+use std::time::Duration;
+
+use task_proto::DeploymentId;
+use task_proto::api::{AssignmentView, DeploymentState, DeploymentView};
+use tokio::time::{Instant, sleep, timeout_at};
+
+use super::client::ClientError;
+use super::output::{printable, say};
+use super::progress::DeploymentProgress;
+use super::{CommandError, Outcome, Session, deploy};
+
+/// The first pause between two looks; it doubles while nothing changes.
+const MIN_PAUSE: Duration = Duration::from_millis(100);
+/// The longest pause.
+const MAX_PAUSE: Duration = Duration::from_secs(1);
+
+/// Waits, then prints the deployment and the reasons of every robot that did not make it.
+pub(super) async fn until_settled(
+    session: &Session,
+    id: &DeploymentId,
+    timeout: Duration,
+) -> Result<Outcome, CommandError> {
+    let deadline = Instant::now() + timeout;
+    let mut progress = DeploymentProgress::new();
+    let mut pause = MIN_PAUSE;
+    let mut latest: Option<DeploymentView> = None;
+    while Instant::now() < deadline {
+        match timeout_at(deadline, look(session, id)).await {
+            Err(_) => break,
+            Ok(Err(error)) if !may_pass(&error) => return Err(error.into()),
+            Ok(Err(_)) => pause = MAX_PAUSE,
+            Ok(Ok(view)) => {
+                progress.show(&view);
+                pause = if latest.as_ref() == Some(&view) { (pause * 2).min(MAX_PAUSE) } else { MIN_PAUSE };
+                let over = is_over(&view);
+                latest = Some(view);
+                if over {
+                    break;
+                }
+            }
+        }
+        sleep(pause.min(deadline.saturating_duration_since(Instant::now()))).await;
+    }
+    progress.finish();
+    let Some(view) = latest else {
+        say("timed out: the server did not say how the deployment stands");
+        return Ok(Outcome::TimedOut);
+    };
+    session.output.described(&view, deploy::describe)?;
+    let verdict = judge(&view);
+    say(&verdict.text);
+    Ok(verdict.outcome)
+}
+
+async fn look(session: &Session, id: &DeploymentId) -> Result<DeploymentView, ClientError> {
+    session.client.get(&format!("/deployments/{id}"), &[]).await
+}
+
+/// Whether the server may answer if it is asked again: it is restarting, or something stands before it that is not it.
+fn may_pass(error: &ClientError) -> bool {
+    match error {
+        ClientError::Refused { status, .. } | ClientError::NotTheServer { status, .. } => status.is_server_error(),
+        ClientError::Unreachable { .. } => true,
+        _ => false,
+    }
+}
+
+/// Whether nothing more will happen by itself.
+fn is_over(view: &DeploymentView) -> bool {
+    let mut assignments = view.assignments.iter().flatten();
+    match view.state {
+        DeploymentState::Cancelled => true,
+        // What is not released stays so until somebody resumes it.
+        DeploymentState::Paused => assignments.all(|a| !a.released || a.phase.is_settled(view.kind)),
+        DeploymentState::Active | DeploymentState::Settled => assignments.all(|a| a.phase.is_settled(view.kind)),
+    }
+}
+
+struct Verdict {
+    outcome: Outcome,
+    text: String,
+}
+
+/// How it went: counts, and a line for each robot that did not make it.
+fn judge(view: &DeploymentView) -> Verdict {
+    let assignments = view.assignments.as_deref().unwrap_or_default();
+    let (settled, open): (Vec<_>, Vec<_>) = assignments.iter().partition(|a| a.phase.is_settled(view.kind));
+    let (succeeded, failed): (Vec<_>, Vec<_>) = settled.into_iter().partition(|a| a.phase.is_success(view.kind));
+    let (waiting, open): (Vec<_>, Vec<_>) =
+        open.into_iter().partition(|a| view.state == DeploymentState::Paused && !a.released);
+    let (open, offline): (Vec<_>, Vec<_>) = open.into_iter().partition(|a| a.online);
+    let mut lines = vec![format!("{} of {} succeeded", succeeded.len(), assignments.len())];
+    lines.extend(failed.iter().map(|a| format!("{}: {}", a.name, reason(a))));
+    lines.extend(open.iter().map(|a| format!("{}: not done in time, still {}", a.name, a.phase)));
+    if !offline.is_empty() {
+        lines.push(format!("offline, and following when back: {}", names(&offline)));
+    }
+    if !waiting.is_empty() {
+        lines.push(format!(
+            "paused after {} failures, not begun: {}; go on with `taskd deploy resume {}`",
+            failed.len(),
+            names(&waiting),
+            view.id
+        ));
+    }
+    let outcome = match (succeeded.len(), failed.len() + waiting.len(), open.len() + offline.len()) {
+        (_, _, 1..) if view.state != DeploymentState::Cancelled => Outcome::TimedOut,
+        (1.., 0, 0) => Outcome::Succeeded,
+        (1.., _, _) => Outcome::SomeFailed,
+        (0, _, _) => Outcome::Failed,
+    };
+    let text = lines.iter().map(|line| printable(line)).collect::<Vec<_>>().join("\n");
+    Verdict { outcome, text }
+}
+
+fn reason(assignment: &AssignmentView) -> String {
+    match (&assignment.failure, &assignment.superseded_by) {
+        (Some(failure), _) => format!("{} ({failure})", assignment.phase),
+        (None, Some(newer)) => format!("{} by {newer}", assignment.phase),
+        (None, None) => assignment.phase.to_string(),
+    }
+}
+
+fn names(assignments: &[&AssignmentView]) -> String {
+    const MAX_NAMES: usize = 20;
+    let mut names: Vec<_> = assignments.iter().take(MAX_NAMES).map(|a| a.name.to_string()).collect();
+    if assignments.len() > MAX_NAMES {
+        names.push(format!("and {} more", assignments.len() - MAX_NAMES));
+    }
+    names.join(", ")
+}

@@ -1,0 +1,4 @@
+//! Tests of the agent through its public modules, against real files, processes and sockets on loopback.
+
+mod archive;
+mod unpack;

@@ -37,8 +37,6 @@ const MAX_MANIFEST_BYTES: u64 = 1 << 20;
 const QUEUED_CHUNKS: usize = 16;
 /// How often one pull connects anew after a cut before it is given back to the caller's slower retries.
 const MAX_RECONNECTS: u32 = 5;
-/// The longest wait before the first such connection; it grows with each, and the actual one is random below it.
-const RECONNECT_WAIT: Duration = Duration::from_secs(2);
 
 /// Limits of a pull.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -49,11 +47,18 @@ pub struct FetchSettings {
     pub reserve_bytes: u64,
     /// How long the server may take for each further 16 KiB, and for its first answer.
     pub stall_timeout: Duration,
+    /// The longest wait before the first new connection after a cut; it grows with each further one.
+    pub reconnect_wait: Duration,
 }
 
 impl Default for FetchSettings {
     fn default() -> Self {
-        Self { limits: Limits::default(), reserve_bytes: 256 << 20, stall_timeout: Duration::from_secs(30) }
+        Self {
+            limits: Limits::default(),
+            reserve_bytes: 256 << 20,
+            stall_timeout: Duration::from_secs(30),
+            reconnect_wait: Duration::from_secs(2),
+        }
     }
 }
 
@@ -315,7 +320,8 @@ impl Fetcher {
         for reconnects in 1..=MAX_RECONNECTS {
             tracing::info!(package = %package.name, position, %cut, "connecting anew");
             // A server that restarts cuts a whole fleet off at once.
-            tokio::time::sleep(RECONNECT_WAIT.mul_f64(f64::from(reconnects) * rand::random::<f64>())).await;
+            let longest = self.settings.reconnect_wait * reconnects;
+            tokio::time::sleep(longest.mul_f64(rand::random())).await;
             let ended = match self.download(package, package.content, position).await {
                 Ok(mut download) => {
                     let ended = download.pass_on(&sender).await;

@@ -1,6 +1,7 @@
 //! The robot's half: everything `task-agent` does. Imports run downward only; see ARCHITECTURE.md.
 
 pub mod builder;
+pub mod clock;
 pub mod commands;
 pub mod containment;
 pub mod disk;
@@ -8,7 +9,10 @@ pub mod durable;
 pub mod environment;
 pub mod fetch;
 pub mod layout;
+pub mod ledger;
 pub mod logs;
+pub mod observed;
+pub mod plan;
 pub mod process;
 pub mod run_dir;
 pub mod script;

@@ -1,0 +1,25 @@
+//! The only place that reads the time. Waits and elapsed times use milliseconds since boot, suspend included, because a
+//! robot's wall clock may jump; the wall clock is only asked whether a signed state has expired.
+
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use crate::process;
+
+/// Milliseconds since the kernel booted; comparable between processes of one boot.
+pub fn boot_ms() -> u64 {
+    // Without /proc no process could be supervised either, and the agent has said so at its start.
+    process::uptime().map_or(0, millis)
+}
+
+/// Milliseconds since the Unix epoch, or what the robot takes for it.
+#[expect(clippy::disallowed_methods, reason = "this is the clock")]
+pub fn wall_ms() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, millis)
+}
+
+/// Milliseconds since the Unix epoch before which this program did not exist: a wall clock that shows less is wrong.
+pub const PROGRAM_EXISTS_SINCE_MS: u64 = 1_767_225_600_000;
+
+fn millis(duration: Duration) -> u64 {
+    u64::try_from(duration.as_millis()).unwrap_or(u64::MAX)
+}

@@ -1,0 +1,364 @@
+//! The ledger: what the agent accepted, what it was doing and what it started. Written before each step, so that after
+//! kill -9 or a power cut the next agent goes on where this one was. Ledger types are neither wire types nor what is
+//! observed; times are [`crate::clock`]'s milliseconds since boot and mean something only in the boot they name.
+//! It decides nothing: that is the plan's work.
+
+use std::collections::BTreeMap;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use task_proto::desired::{DesiredTask, PackageRef, Wanted};
+use task_proto::envelope::Envelope;
+use task_proto::manifest::{OnBoot, Restart, TaskKind, TaskManifest};
+use task_proto::report::{Failure, Phase};
+use task_proto::{DeploymentId, Digest, Generation, TaskName};
+
+use crate::durable;
+
+/// The version of the file's format that this agent reads and writes.
+pub const FORMAT: u32 = 1;
+/// The largest file that is read as a ledger.
+const MAX_BYTES: u64 = 64 * 1024 * 1024;
+/// The most finished runs remembered of one task.
+const MAX_FINISHED: usize = 32;
+
+/// Everything the agent must not forget.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Ledger {
+    /// See [`FORMAT`].
+    pub format: u32,
+    /// How many times the agent has been started.
+    pub start: u64,
+    /// The boot in which the times below were taken.
+    pub boot_id: String,
+    /// The last desired state that was accepted.
+    pub accepted: Option<Accepted>,
+    /// The server does not know this robot's token: it was removed there.
+    pub removed: bool,
+    /// The tasks on this robot.
+    pub tasks: BTreeMap<TaskName, TaskRecord>,
+}
+
+/// A desired state that was verified and accepted. It is kept as it was signed and verified again at each start.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Accepted {
+    /// Its generation.
+    pub generation: Generation,
+    /// The signed bytes.
+    pub envelope: Envelope,
+}
+
+/// One task.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TaskRecord {
+    /// What the desired state last asked for.
+    pub order: DesiredTask,
+    /// How far the ordered version has come before its start.
+    pub preparation: Preparation,
+    /// The run that is kept alive, of the ordered version or, until that is staged, of the one before.
+    pub active: Option<ActiveRun>,
+    /// The version that was active before.
+    pub previous: Option<PackageRef>,
+    /// Runs that have ended for good, the oldest first. An order that comes back is not done twice.
+    pub finished: Vec<FinishedRun>,
+    /// The phase as it was last reported.
+    pub phase: Phase,
+    /// Since when.
+    pub phase_since_ms: u64,
+}
+
+/// How far a version has come on its way to be started.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Preparation {
+    /// `assigned` to `staged`, `deferred`, or one of the ends `failed` and `unmet`.
+    pub phase: Phase,
+    /// Tries of that phase.
+    pub attempts: u32,
+    /// Not before this time.
+    pub retry_at_ms: u64,
+    /// Why it failed, is unmet or waits.
+    pub failure: Option<Failure>,
+    /// Known once the manifest is there.
+    pub kind: Option<TaskKind>,
+}
+
+/// A run of one version, alive or meant to be.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ActiveRun {
+    /// The order that asked for it.
+    pub deployment: DeploymentId,
+    /// Which of the order's runs.
+    pub run: u64,
+    /// What runs.
+    pub package: PackageRef,
+    /// How it is to be run.
+    pub rules: RunRules,
+    /// The process that was started last and is not known to have ended.
+    pub process: Option<ProcessRecord>,
+    /// Starts of a process in this run.
+    pub starts: u32,
+    /// Those of them that the restart policy made.
+    pub restarts: u32,
+    /// Those of them since it last ran calmly.
+    pub restarts_in_a_row: u32,
+    /// No start before this time.
+    pub retry_at_ms: u64,
+    /// When the first process of this boot was started.
+    pub first_start_ms: u64,
+    /// Whether a process of this run was ever ready.
+    pub ever_ready: bool,
+    /// Set once the run is over for good.
+    pub end: Option<End>,
+}
+
+/// A process that was, or was about to be, started.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ProcessRecord {
+    /// Its run directory's name; one directory is one start.
+    pub dir: String,
+    /// The boot it was started in.
+    pub boot_id: String,
+    /// When.
+    pub started_ms: u64,
+    /// Its id, once it is known.
+    pub pid: Option<u32>,
+    /// Whether it counted as running.
+    pub ready: bool,
+}
+
+/// What of a task manifest matters while the task runs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RunRules {
+    /// Service or job.
+    pub kind: TaskKind,
+    /// What a reboot does.
+    pub on_boot: OnBoot,
+    /// When a process that ended is started again.
+    pub restart: Restart,
+    /// Whether an interrupted job may be started again.
+    pub idempotent: bool,
+    /// Seconds between the signals of a stop.
+    pub stop_timeout_s: u32,
+    /// Seconds a process must live to be ready.
+    pub hold_s: u32,
+    /// Seconds in which a run must have been ready once.
+    pub ready_timeout_s: u32,
+}
+
+/// A run that is over.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FinishedRun {
+    /// The order.
+    pub deployment: DeploymentId,
+    /// Its run.
+    pub run: u64,
+    /// What came of it.
+    pub end: End,
+}
+
+/// What came of a run.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct End {
+    /// A final phase.
+    pub phase: Phase,
+    /// Why, where it is no success.
+    pub failure: Option<Failure>,
+}
+
+/// The ledger could not be written or read.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot use the ledger {path}")]
+pub struct LedgerError {
+    path: PathBuf,
+    source: io::Error,
+}
+
+/// What was found where the ledger should be.
+#[derive(Debug)]
+pub enum Found {
+    /// A ledger.
+    Ledger(Box<Ledger>),
+    /// No file: a first start.
+    Nothing,
+    /// A file that is no ledger of this format; it was moved to this path and lost nothing.
+    Unreadable(PathBuf),
+}
+
+impl Ledger {
+    /// The ledger of a robot that was never started, or whose ledger was lost. A start counter above all earlier ones
+    /// makes the server take this agent's reports for newer than those before the loss.
+    pub fn new(start: u64) -> Self {
+        Self { format: FORMAT, start, boot_id: String::new(), accepted: None, removed: false, tasks: BTreeMap::new() }
+    }
+
+    /// Reads the ledger at `path`; one that can't be understood is moved aside, not deleted.
+    pub fn read(path: &Path) -> Result<Found, LedgerError> {
+        let failed = |source| LedgerError { path: path.to_owned(), source };
+        let bytes = match read_limited(path) {
+            Ok(bytes) => bytes,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Found::Nothing),
+            Err(error) => return Err(failed(error)),
+        };
+        match serde_json::from_slice::<Self>(&bytes) {
+            Ok(ledger) if ledger.format == FORMAT => Ok(Found::Ledger(Box::new(ledger))),
+            _ => {
+                let aside = free_name_beside(path);
+                durable::rename(path, &aside).map_err(failed)?;
+                Ok(Found::Unreadable(aside))
+            }
+        }
+    }
+
+    /// Reads the ledger without changing anything, for `status`.
+    pub fn peek(path: &Path) -> Result<Option<Self>, LedgerError> {
+        let failed = |source| LedgerError { path: path.to_owned(), source };
+        match read_limited(path) {
+            Ok(bytes) => serde_json::from_slice(&bytes).map(Some).map_err(|error| failed(error.into())),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+            Err(error) => Err(failed(error)),
+        }
+    }
+
+    /// Writes the ledger so that it survives a power cut.
+    pub fn write(&self, path: &Path) -> Result<(), LedgerError> {
+        let failed = |source| LedgerError { path: path.to_owned(), source };
+        let bytes = serde_json::to_vec(self).map_err(|error| failed(error.into()))?;
+        durable::write(path, &bytes, 0o600).map_err(failed)
+    }
+
+    /// Takes the times of another boot out of the records: in this one they mean nothing.
+    pub fn enter_boot(&mut self, boot_id: &str, now_ms: u64) {
+        if self.boot_id == boot_id {
+            return;
+        }
+        self.boot_id = boot_id.to_owned();
+        for record in self.tasks.values_mut() {
+            record.phase_since_ms = now_ms;
+            record.preparation.retry_at_ms = 0;
+            if let Some(active) = &mut record.active {
+                active.retry_at_ms = 0;
+                active.first_start_ms = now_ms;
+            }
+        }
+    }
+}
+
+fn read_limited(path: &Path) -> io::Result<Vec<u8>> {
+    use std::io::Read as _;
+    let mut bytes = Vec::new();
+    std::fs::File::open(path)?.take(MAX_BYTES).read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
+
+/// The first of `ledger.json.broken-1`, `-2`, … that does not exist; the ninth is used again.
+fn free_name_beside(path: &Path) -> PathBuf {
+    let name = |n: u32| PathBuf::from(format!("{}.broken-{n}", path.display()));
+    (1..9).map(name).find(|candidate| !candidate.exists()).unwrap_or_else(|| name(9))
+}
+
+impl TaskRecord {
+    /// The record of an order that has just come in.
+    pub fn new(order: DesiredTask, now_ms: u64) -> Self {
+        let mut record = Self {
+            order,
+            preparation: Preparation::default(),
+            active: None,
+            previous: None,
+            finished: Vec::new(),
+            phase: Phase::Assigned,
+            phase_since_ms: now_ms,
+        };
+        record.settle_phase(now_ms);
+        record
+    }
+
+    /// How the ordered run ended, if it has: now, or before the order came back.
+    pub fn end_of_order(&self) -> Option<&End> {
+        if let Some(active) = self.active.as_ref().filter(|active| active.is_for(&self.order)) {
+            return active.end.as_ref();
+        }
+        let same = |run: &&FinishedRun| run.deployment == self.order.deployment && run.run == self.order.run;
+        self.finished.iter().rev().find(same).map(|run| &run.end)
+    }
+
+    /// Where the order stands.
+    pub fn standing(&self) -> (Phase, Option<&Failure>) {
+        let active = self.active.as_ref().filter(|active| active.is_for(&self.order));
+        if self.order.wanted == Wanted::Stopped && self.active.as_ref().is_none_or(|active| active.process.is_none()) {
+            return (Phase::Stopped, None);
+        }
+        if let Some(end) = self.end_of_order() {
+            return (end.phase, end.failure.as_ref());
+        }
+        match active {
+            Some(active) if active.process.as_ref().is_some_and(|process| process.ready) => (Phase::Running, None),
+            Some(_) => (Phase::Starting, None),
+            None => (self.preparation.phase, self.preparation.failure.as_ref()),
+        }
+    }
+
+    /// Brings the stored phase up to date after any change.
+    pub fn settle_phase(&mut self, now_ms: u64) {
+        let phase = self.standing().0;
+        if phase != self.phase {
+            self.phase = phase;
+            self.phase_since_ms = now_ms;
+        }
+    }
+
+    /// Makes place for the ordered run: remembers how the active one ended, and its version.
+    pub fn retire_active(&mut self) {
+        let Some(active) = self.active.take() else { return };
+        if let Some(end) = active.end {
+            self.finished.retain(|run| run.deployment != active.deployment || run.run != active.run);
+            self.finished.push(FinishedRun { deployment: active.deployment, run: active.run, end });
+            let surplus = self.finished.len().saturating_sub(MAX_FINISHED);
+            self.finished.drain(..surplus);
+        }
+        if active.package != self.order.package {
+            self.previous = Some(active.package);
+        }
+    }
+
+    /// The versions that must stay on disk: ordered, active and the one before.
+    pub fn kept_versions(&self) -> Vec<Digest> {
+        let active = self.active.as_ref().map(|active| &active.package);
+        let mut kept: Vec<Digest> =
+            [Some(&self.order.package), active, self.previous.as_ref()].into_iter().flatten().map(digest_of).collect();
+        kept.sort();
+        kept.dedup();
+        kept
+    }
+}
+
+fn digest_of(package: &PackageRef) -> Digest {
+    package.manifest.digest
+}
+
+impl ActiveRun {
+    /// Whether this is the run that `order` asks for.
+    pub fn is_for(&self, order: &DesiredTask) -> bool {
+        self.deployment == order.deployment && self.run == order.run && self.package == order.package
+    }
+}
+
+impl Default for Preparation {
+    fn default() -> Self {
+        Self { phase: Phase::Assigned, attempts: 0, retry_at_ms: 0, failure: None, kind: None }
+    }
+}
+
+impl From<&TaskManifest> for RunRules {
+    fn from(manifest: &TaskManifest) -> Self {
+        Self {
+            kind: manifest.run.kind,
+            on_boot: manifest.run.on_boot,
+            restart: manifest.run.restart,
+            idempotent: manifest.run.idempotent,
+            stop_timeout_s: manifest.run.stop_timeout_s,
+            hold_s: manifest.ready.hold_s,
+            ready_timeout_s: manifest.ready.timeout_s,
+        }
+    }
+}

@@ -1,0 +1,297 @@
+//! The plan: what to do next about one task. Pure: desired state, ledger record and observation in, next step out; time
+//! and randomness are arguments. It never touches disk, network or processes.
+//!
+//! Two things go on side by side. A version that was ordered is prepared while the one before it keeps running:
+//!
+//! ```text
+//! assigned ─► fetching ─► unpacking ─► building ─► staged ──► (handed to the active run)
+//!     │           └──────────┴────────────┴──► failed           ▲ deferred: a person holds the robot
+//!     └► unmet    a retry waits in its phase
+//! ```
+//!
+//! and one run of one version is kept alive:
+//!
+//! ```text
+//! starting ─► running ─► succeeded | failed | stopped
+//!     ▲           │
+//!     └───────────┘ restart policy, reboot: after a backoff
+//! ```
+//!
+//! A staged version takes over: the old process is stopped, `current` is swapped, the new one is started. Each half has
+//! at most one step under way ([`Lane`]); a process is only ever started by the second, so there are never two of a task.
+
+use task_proto::desired::{DesiredTask, PackageRef, Wanted};
+use task_proto::report::{Failure, FailureCode, Phase};
+use task_proto::{Digest, TaskName};
+
+use crate::ledger::{ActiveRun, ProcessRecord, RunRules, TaskRecord};
+use crate::observed::{Prepared, ProcessState, RobotFacts};
+
+#[cfg(test)]
+mod tests;
+mod transition;
+
+pub use transition::{StepFailure, adopted, backoff_ms, begun, finished};
+
+/// All that the next step depends on.
+#[derive(Debug, Clone, Copy)]
+pub struct Situation<'a> {
+    /// What the accepted desired state says of this task; `None`: it should be absent.
+    pub desired: Option<&'a DesiredTask>,
+    /// What the ledger says.
+    pub record: &'a TaskRecord,
+    /// What is on the disk of the ordered version.
+    pub prepared: &'a Prepared,
+    /// What became of the active run's process.
+    pub process: &'a ProcessState,
+    /// Whether a step of [`Lane::Prepare`] is under way.
+    pub preparing: bool,
+    /// Whether a step that deletes versions is under way.
+    pub deleting: bool,
+    /// What packages may require.
+    pub robot: &'a RobotFacts,
+    /// Whether new work may be begun: the desired state is in force and the server knows the robot.
+    pub may_begin: bool,
+    /// A person at the robot said `hold`.
+    pub held: bool,
+    /// The kernel's boot id.
+    pub boot_id: &'a str,
+    /// Milliseconds since boot.
+    pub now_ms: u64,
+    /// Evenly from 0 to 1: spreads the retries.
+    pub jitter: f64,
+}
+
+/// What to do next.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Next {
+    /// Nothing before this time, or before something changes.
+    Rest {
+        /// Milliseconds since boot.
+        until_ms: Option<u64>,
+    },
+    /// Write this record, then ask again.
+    Record(Box<TaskRecord>),
+    /// Write [`begun`], do this, write [`finished`], then ask again.
+    Act(Step),
+}
+
+/// One thing to be done about a task.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Step {
+    /// Pull the manifest.
+    PullManifest(PackageRef),
+    /// Pull and unpack the content.
+    PullContent(PackageRef),
+    /// Build it.
+    Build(PackageRef),
+    /// Make this run the active one and start a process of it.
+    Start(ActiveRun),
+    /// Stop the active run's process.
+    Stop {
+        /// Which.
+        process: ProcessRecord,
+        /// Seconds between the signals.
+        stop_timeout_s: u32,
+    },
+    /// Delete the versions that are not in `kept`.
+    Prune {
+        /// The versions that stay.
+        kept: Vec<Digest>,
+    },
+    /// Delete the task with all that belongs to it, its record too.
+    Remove,
+}
+
+/// Which half of the plan a step belongs to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Lane {
+    /// Brings the ordered version to `staged`. May take long, may be interrupted at any point.
+    Prepare,
+    /// Starts, stops, removes.
+    Run,
+}
+
+impl Step {
+    /// The lane it runs in.
+    pub fn lane(&self) -> Lane {
+        match self {
+            Self::PullManifest(_) | Self::PullContent(_) | Self::Build(_) => Lane::Prepare,
+            Self::Start(_) | Self::Stop { .. } | Self::Prune { .. } | Self::Remove => Lane::Run,
+        }
+    }
+
+    /// Whether it deletes versions, so that none may be prepared meanwhile.
+    pub fn deletes(&self) -> bool {
+        matches!(self, Self::Prune { .. } | Self::Remove)
+    }
+
+    /// Whether this step, already under way, still serves what is desired. If not it is interrupted; steps of
+    /// [`Lane::Run`] are short and are finished.
+    pub fn is_wanted(&self, desired: Option<&DesiredTask>) -> bool {
+        match self {
+            Self::PullManifest(package) | Self::PullContent(package) | Self::Build(package) => {
+                desired.is_some_and(|task| task.wanted == Wanted::Running && task.package == *package)
+            }
+            Self::Start(_) | Self::Stop { .. } | Self::Prune { .. } | Self::Remove => true,
+        }
+    }
+}
+
+/// A run that went on this long without ending is calm: its restarts are forgiven.
+pub const CALM_MS: u64 = 10 * 60 * 1000;
+/// A run that is restarted more often than this without a calm stretch has failed. At the longest backoff that is over an
+/// hour: enough for a sensor to be plugged in again.
+pub const MAX_RESTARTS_IN_A_ROW: u32 = 100;
+
+/// The next step about the active run: start, restart, stop, replace, remove.
+pub fn supervise(s: &Situation<'_>) -> Next {
+    if let Some(order) = s.desired
+        && *order != s.record.order
+    {
+        return record(adopted(s.record, order, s.now_ms));
+    }
+    let Some(active) = &s.record.active else { return without_process(s, None) };
+    let Some(process) = &active.process else { return without_process(s, Some(active)) };
+    match s.process {
+        ProcessState::Alive { .. } => with_process(s, active, process),
+        ProcessState::Ended(exit) => record(transition::ended(s, exit)),
+        ProcessState::NeverStarted | ProcessState::None => record(transition::never_started(s)),
+    }
+}
+
+/// The next step towards the ordered version being staged.
+pub fn prepare(s: &Situation<'_>) -> Next {
+    const NOTHING: Next = Next::Rest { until_ms: None };
+    let order = &s.record.order;
+    let preparation = &s.record.preparation;
+    if s.desired != Some(order)
+        || order.wanted == Wanted::Stopped
+        || s.record.end_of_order().is_some()
+        || s.record.active.as_ref().is_some_and(|active| active.is_for(order))
+        || preparation.phase.is_final()
+        || !s.may_begin
+        || s.deleting
+    {
+        return NOTHING;
+    }
+    if s.now_ms < preparation.retry_at_ms {
+        return Next::Rest { until_ms: Some(preparation.retry_at_ms) };
+    }
+    let Some(manifest) = &s.prepared.manifest else { return Next::Act(Step::PullManifest(order.package.clone())) };
+    let lacks = s.robot.lacks(&manifest.requires);
+    if !lacks.is_empty() {
+        let text =
+            format!("this robot lacks what {} {} requires: {}", order.task, order.package.version, lacks.join(", "));
+        let failure = Failure::new(FailureCode::REQUIREMENTS_UNMET, text);
+        return record(transition::prepared_to(s, Phase::Unmet, Some(failure)));
+    }
+    if !s.prepared.content {
+        return Next::Act(Step::PullContent(order.package.clone()));
+    }
+    if !s.prepared.built {
+        return Next::Act(Step::Build(order.package.clone()));
+    }
+    let (phase, failure) = if s.held {
+        let text = "a person at the robot said hold: it is staged and starts after release";
+        (Phase::Deferred, Some(Failure::new(FailureCode::HELD, text)))
+    } else {
+        (Phase::Staged, None)
+    };
+    if preparation.phase == phase { NOTHING } else { record(transition::prepared_to(s, phase, failure)) }
+}
+
+/// Whether the ordered version may take over now.
+fn takes_over(s: &Situation<'_>) -> bool {
+    s.desired == Some(&s.record.order)
+        && s.record.order.wanted == Wanted::Running
+        && s.record.preparation.phase == Phase::Staged
+        && s.prepared.content
+        && s.prepared.built
+        && s.record.end_of_order().is_none()
+        && !s.held
+        && s.may_begin
+}
+
+fn with_process(s: &Situation<'_>, active: &ActiveRun, process: &ProcessRecord) -> Next {
+    let replaced = !active.is_for(&s.record.order) && takes_over(s);
+    let wanted = s.desired.is_some_and(|task| task.wanted == Wanted::Running);
+    if !wanted || replaced {
+        if s.now_ms < active.retry_at_ms {
+            return Next::Rest { until_ms: Some(active.retry_at_ms) };
+        }
+        return Next::Act(Step::Stop { process: process.clone(), stop_timeout_s: active.rules.stop_timeout_s });
+    }
+    // Readiness is, for now, having lived long enough; what the ROS graph says comes in here.
+    let ready_at_ms = process.started_ms + u64::from(active.rules.hold_s) * 1000;
+    if !process.ready {
+        return if s.now_ms >= ready_at_ms {
+            record(transition::ready(s))
+        } else {
+            Next::Rest { until_ms: Some(ready_at_ms) }
+        };
+    }
+    if active.restarts_in_a_row > 0 {
+        let calm_at_ms = process.started_ms + CALM_MS;
+        return if s.now_ms >= calm_at_ms { record(transition::calm(s.record)) } else { tidy(s, Some(calm_at_ms)) };
+    }
+    tidy(s, None)
+}
+
+fn without_process(s: &Situation<'_>, active: Option<&ActiveRun>) -> Next {
+    let order = &s.record.order;
+    if s.desired.is_none() {
+        let retry_at_ms = s.record.preparation.retry_at_ms;
+        return match s.preparing {
+            true => Next::Rest { until_ms: None },
+            false if s.now_ms < retry_at_ms => Next::Rest { until_ms: Some(retry_at_ms) },
+            false => Next::Act(Step::Remove),
+        };
+    }
+    if order.wanted == Wanted::Stopped {
+        return tidy(s, None);
+    }
+    if takes_over(s)
+        && active.is_none_or(|active| !active.is_for(order))
+        && let Some(manifest) = &s.prepared.manifest
+    {
+        return Next::Act(Step::Start(ActiveRun::of(order, RunRules::from(manifest), s.now_ms)));
+    }
+    match active {
+        Some(active) if active.end.is_none() && s.held => tidy(s, None),
+        Some(active) if active.end.is_none() && s.now_ms < active.retry_at_ms => {
+            Next::Rest { until_ms: Some(active.retry_at_ms) }
+        }
+        Some(active) if active.end.is_none() => Next::Act(Step::Start(active.clone())),
+        _ => tidy(s, None),
+    }
+}
+
+/// Deletes versions that nothing needs any more, once nothing else is to be done.
+fn tidy(s: &Situation<'_>, until_ms: Option<u64>) -> Next {
+    let kept = s.record.kept_versions();
+    let surplus = s.prepared.versions.iter().any(|version| !kept.contains(version));
+    if surplus && !s.preparing { Next::Act(Step::Prune { kept }) } else { Next::Rest { until_ms } }
+}
+
+fn record(record: TaskRecord) -> Next {
+    Next::Record(Box::new(record))
+}
+
+/// The name of a run's directory: one for each start, never used twice.
+pub fn run_dir_name(run: &ActiveRun, start: u64) -> String {
+    format!("{}.{}.{start}.{}", run.deployment, run.run, run.starts)
+}
+
+/// The line that names a step in the log.
+pub fn describe(task: &TaskName, step: &Step) -> String {
+    match step {
+        Step::PullManifest(package) => format!("pull the manifest of {task} {}", package.version),
+        Step::PullContent(package) => format!("pull {task} {}", package.version),
+        Step::Build(package) => format!("build {task} {}", package.version),
+        Step::Start(run) => format!("start {task} {} (run {})", run.package.version, run.run),
+        Step::Stop { .. } => format!("stop {task}"),
+        Step::Prune { .. } => format!("delete old versions of {task}"),
+        Step::Remove => format!("remove {task}"),
+    }
+}

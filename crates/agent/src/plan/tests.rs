@@ -1,0 +1,472 @@
+//! Properties of the plan, shown in a small simulated world: whatever happens in whatever order, no job runs twice, no
+//! task has two processes, what is not wanted is interrupted, and once it is quiet everything converges.
+
+use proptest::prelude::*;
+use task_proto::desired::{BlobRef, Delivery};
+use task_proto::manifest::{
+    Build, ContentFacts, OnBoot, Outputs, Ready, Requires, Restart, Run, TaskKind, TaskManifest,
+};
+use task_proto::report::{Failure, FailureCode, Phase};
+use task_proto::{DeploymentId, Digest};
+
+use super::*;
+use crate::observed::Exit;
+use crate::run_dir::ExitStatus;
+
+/// One robot with one task.
+struct World {
+    desired: Option<DesiredTask>,
+    record: Option<TaskRecord>,
+    /// The processes that live, by their directory.
+    alive: Vec<String>,
+    /// How those ended that do not.
+    ended: Vec<(String, Option<ExitStatus>)>,
+    /// Versions whose manifest, content and build are there.
+    disk: Vec<(PackageRef, u8)>,
+    /// The steps under way, with whether their effect has happened.
+    steps: Vec<(Step, bool)>,
+    /// (deployment, run) of every process of a job that was ever started.
+    job_starts: Vec<(DeploymentId, u64)>,
+    boot: u32,
+    start: u64,
+    now_ms: u64,
+    held: bool,
+    may_begin: bool,
+    manifest: Run,
+}
+
+/// What can happen.
+#[derive(Debug, Clone)]
+enum Happening {
+    Order {
+        deployment: u8,
+        run: u64,
+        stop: bool,
+    },
+    Withdraw,
+    /// The effect of a step happens, well or badly; the agent does not know it yet.
+    Effect {
+        well: bool,
+    },
+    /// The agent learns of the ends of steps.
+    Learn,
+    ProcessEnds {
+        code: i32,
+    },
+    ProcessVanishes,
+    AgentDies,
+    Reboot,
+    Hold(bool),
+    MayBegin(bool),
+    Wait {
+        ms: u64,
+    },
+}
+
+fn happening() -> impl Strategy<Value = Happening> {
+    use Happening::*;
+    prop_oneof![
+        4 => (0..3u8, 1..3u64, any::<bool>())
+            .prop_map(|(deployment, run, stop)| Order { deployment, run, stop: stop && run == 2 }),
+        1 => Just(Withdraw),
+        8 => prop::bool::weighted(0.8).prop_map(|well| Effect { well }),
+        8 => Just(Learn),
+        2 => (0..2i32).prop_map(|code| ProcessEnds { code }),
+        1 => Just(ProcessVanishes),
+        2 => Just(AgentDies),
+        1 => Just(Reboot),
+        1 => any::<bool>().prop_map(Hold),
+        1 => any::<bool>().prop_map(MayBegin),
+        3 => (0..90_000u64).prop_map(|ms| Wait { ms }),
+    ]
+}
+
+fn package(number: u8) -> PackageRef {
+    let blob = |kind: u8| BlobRef { digest: Digest::of(&[number, kind]), size: 1 };
+    PackageRef {
+        name: "talker".parse().expect("valid"),
+        version: format!("1.{number}").parse().expect("valid"),
+        manifest: blob(0),
+        config: blob(1),
+        content: blob(2),
+    }
+}
+
+fn order(deployment: u8, package_number: u8, run: u64, wanted: Wanted) -> DesiredTask {
+    DesiredTask {
+        task: "talker".parse().expect("valid"),
+        deployment: format!("d{deployment:016x}").parse().expect("valid"),
+        package: package(package_number),
+        wanted,
+        run,
+        delivery: Delivery::PushPull,
+    }
+}
+
+impl World {
+    fn new(manifest: Run) -> Self {
+        Self {
+            desired: None,
+            record: None,
+            alive: Vec::new(),
+            ended: Vec::new(),
+            disk: Vec::new(),
+            steps: Vec::new(),
+            job_starts: Vec::new(),
+            boot: 1,
+            start: 1,
+            now_ms: 1000,
+            held: false,
+            may_begin: true,
+            manifest,
+        }
+    }
+
+    fn happen(&mut self, happening: Happening) {
+        match happening {
+            Happening::Order { deployment, run, stop } => {
+                let wanted = if stop { Wanted::Stopped } else { Wanted::Running };
+                // A deployment is of one package.
+                self.desired = Some(order(deployment, deployment % 2, run, wanted));
+            }
+            Happening::Withdraw => self.desired = None,
+            Happening::Effect { well } => self.effect(well),
+            Happening::Learn => self.learn(),
+            Happening::ProcessEnds { code } => self.end_process(Some(ExitStatus::Code(code))),
+            Happening::ProcessVanishes => self.end_process(None),
+            Happening::AgentDies => {
+                self.steps.clear();
+                self.start += 1;
+            }
+            Happening::Reboot => {
+                self.end_process(None);
+                self.steps.clear();
+                self.start += 1;
+                self.boot += 1;
+                let mut ledger = crate::ledger::Ledger::new(1);
+                ledger.tasks.extend(self.record.take().map(|record| (record.order.task.clone(), record)));
+                self.now_ms = 1000;
+                ledger.enter_boot(&self.boot.to_string(), self.now_ms);
+                self.record = ledger.tasks.into_values().next();
+            }
+            Happening::Hold(held) => self.held = held,
+            Happening::MayBegin(may_begin) => self.may_begin = may_begin,
+            Happening::Wait { ms } => self.now_ms += ms,
+        }
+        self.plan();
+    }
+
+    fn end_process(&mut self, status: Option<ExitStatus>) {
+        for dir in self.alive.drain(..) {
+            self.ended.push((dir, status));
+        }
+    }
+
+    /// The driver's loop: plans both lanes until they rest.
+    fn plan(&mut self) {
+        let desired = self.desired.clone();
+        // An interrupted step has no further effect; the driver waits for that before it begins another.
+        self.steps.retain(|(step, _)| step.is_wanted(desired.as_ref()));
+        if self.record.is_none() {
+            self.record = desired.map(|order| TaskRecord::new(order, self.now_ms));
+        }
+        for round in 0.. {
+            assert!(round < 20, "the plan does not come to rest: {:?}", self.record);
+            let before = (self.record.clone(), self.steps.len());
+            for lane in [Lane::Run, Lane::Prepare] {
+                if self.record.is_none() || self.steps.iter().any(|(step, _)| step.lane() == lane) {
+                    continue;
+                }
+                match self.with_situation(|s| if lane == Lane::Run { supervise(s) } else { prepare(s) }) {
+                    Next::Rest { .. } => {}
+                    Next::Record(record) => self.record = Some(*record),
+                    Next::Act(step) => self.begin(step),
+                }
+            }
+            if before == (self.record.clone(), self.steps.len()) {
+                return;
+            }
+        }
+    }
+
+    fn begin(&mut self, step: Step) {
+        let record = self.record.as_ref().expect("a step is of a record");
+        self.record = Some(begun(record, &step, &self.boot.to_string(), self.start, self.now_ms));
+        // What a start will do is fixed by the record written before it.
+        let step = match step {
+            Step::Start(_) => Step::Start(self.record.clone().and_then(|record| record.active).expect("begun")),
+            other => other,
+        };
+        self.steps.push((step, false));
+    }
+
+    fn with_situation<T>(&self, ask: impl Fn(&Situation<'_>) -> T) -> T {
+        let record = self.record.as_ref().expect("there is a record");
+        let level =
+            self.disk.iter().find(|(on_disk, _)| *on_disk == record.order.package).map_or(0, |(_, level)| *level);
+        let prepared = Prepared {
+            manifest: (level > 0).then(|| manifest(&self.manifest)),
+            content: level > 1,
+            built: level > 2,
+            versions: self.disk.iter().map(|(package, _)| package.manifest.digest).collect(),
+        };
+        let process = match record.active.as_ref().and_then(|active| active.process.as_ref()) {
+            None => ProcessState::None,
+            Some(process) if self.alive.contains(&process.dir) => ProcessState::Alive { pid: 7 },
+            Some(process) => match self.ended.iter().find(|(dir, _)| *dir == process.dir) {
+                Some((_, status)) => ProcessState::Ended(Exit { status: *status, last_lines: String::new() }),
+                None => ProcessState::NeverStarted,
+            },
+        };
+        ask(&Situation {
+            desired: self.desired.as_ref(),
+            record,
+            prepared: &prepared,
+            process: &process,
+            preparing: self.steps.iter().any(|(step, _)| step.lane() == Lane::Prepare),
+            deleting: self.steps.iter().any(|(step, _)| step.deletes()),
+            robot: &RobotFacts::default(),
+            may_begin: self.may_begin,
+            held: self.held,
+            boot_id: &self.boot.to_string(),
+            now_ms: self.now_ms,
+            jitter: 0.5,
+        })
+    }
+
+    fn effect(&mut self, well: bool) {
+        let Some((step, done)) = self.steps.iter_mut().find(|(_, done)| !done) else { return };
+        *done = true;
+        let step = step.clone();
+        if !well {
+            self.steps.retain(|(other, _)| *other != step);
+            let failure = Failure::new(FailureCode::IO_ERROR, "it went badly");
+            let error = StepFailure { failure, retry_after_ms: Some(0) };
+            self.record = Some(self.with_situation(|s| finished(s, &step, Err(error.clone()))));
+            return;
+        }
+        match &step {
+            Step::PullManifest(package) => self.raise(package, 1),
+            Step::PullContent(package) => self.raise(package, 2),
+            Step::Build(package) => self.raise(package, 3),
+            Step::Start(run) => {
+                assert!(self.alive.is_empty(), "a second process of the task");
+                let dir = run.process.as_ref().expect("begun").dir.clone();
+                assert!(self.ended.iter().all(|(other, _)| *other != dir), "a run directory is used twice");
+                self.alive.push(dir);
+                if self.manifest.kind == TaskKind::Job {
+                    let job = (run.deployment.clone(), run.run);
+                    assert!(self.manifest.idempotent || !self.job_starts.contains(&job), "a job is started twice");
+                    self.job_starts.push(job);
+                }
+            }
+            Step::Stop { process, .. } => {
+                self.alive.retain(|dir| *dir != process.dir);
+                self.ended.push((process.dir.clone(), Some(ExitStatus::Signal(2))));
+            }
+            Step::Prune { kept } => {
+                let active = self.record.as_ref().and_then(|record| record.active.as_ref());
+                assert!(active.is_none_or(|active| kept.contains(&active.package.manifest.digest)), "prunes what runs");
+                self.disk.retain(|(package, _)| kept.contains(&package.manifest.digest));
+            }
+            Step::Remove => {
+                assert!(self.alive.is_empty(), "removes a task that runs");
+                self.disk.clear();
+                // With the task its history goes: the same order afterwards is a new one.
+                self.job_starts.clear();
+            }
+        }
+    }
+
+    fn raise(&mut self, package: &PackageRef, level: u8) {
+        self.disk.retain(|(on_disk, _)| on_disk != package);
+        self.disk.push((package.clone(), level));
+    }
+
+    fn learn(&mut self) {
+        let (done, under_way) = std::mem::take(&mut self.steps).into_iter().partition(|(_, done)| *done);
+        self.steps = under_way;
+        for (step, _) in done {
+            if step == Step::Remove {
+                self.record = None;
+            } else {
+                self.record = Some(self.with_situation(|s| finished(s, &step, Ok(Some(7)))));
+            }
+        }
+    }
+
+    /// Lets everything go well until nothing is left to do.
+    fn settle(&mut self) {
+        self.happen(Happening::Hold(false));
+        self.happen(Happening::MayBegin(true));
+        for _ in 0..60 {
+            self.happen(Happening::Effect { well: true });
+            self.happen(Happening::Learn);
+            self.happen(Happening::Wait { ms: 400_000 });
+        }
+        assert!(self.steps.is_empty(), "still under way: {:?}", self.steps);
+    }
+}
+
+fn manifest(run: &Run) -> TaskManifest {
+    TaskManifest {
+        name: "talker".parse().expect("valid"),
+        version: "1.0".parse().expect("valid"),
+        build: Build::default(),
+        run: run.clone(),
+        ready: Ready::default(),
+        parameters: Default::default(),
+        outputs: Outputs::default(),
+        requires: Requires::default(),
+        exec_depends: Vec::new(),
+        content: ContentFacts { tar_digest: Digest::of(b""), tar_size: 0, entries: 0 },
+    }
+}
+
+fn run_rules() -> impl Strategy<Value = Run> {
+    let kind = prop_oneof![Just(TaskKind::Service), Just(TaskKind::Job)];
+    let on_boot = prop_oneof![Just(OnBoot::Start), Just(OnBoot::Hold)];
+    let restart = prop_oneof![Just(Restart::Always), Just(Restart::OnFailure), Just(Restart::Never)];
+    (kind, on_boot, restart, any::<bool>()).prop_map(|(kind, on_boot, restart, idempotent)| Run {
+        kind,
+        on_boot,
+        restart,
+        idempotent,
+        ..Run::default()
+    })
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 512, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn whatever_happens_it_is_safe_and_converges(
+        rules in run_rules(),
+        happenings in prop::collection::vec(happening(), 1..80),
+    ) {
+        let mut world = World::new(rules);
+        for happening in happenings {
+            world.happen(happening);
+            prop_assert!(world.alive.len() <= 1);
+        }
+        world.settle();
+        match (&world.desired, &world.record) {
+            (None, record) => {
+                prop_assert!(record.is_none() && world.alive.is_empty() && world.disk.is_empty());
+            }
+            (Some(order), Some(record)) => {
+                prop_assert_eq!(&record.order, order);
+                let phase = record.standing().0;
+                prop_assert_eq!(phase, record.phase);
+                match order.wanted {
+                    Wanted::Stopped => prop_assert!(world.alive.is_empty() && phase == Phase::Stopped),
+                    Wanted::Running => {
+                        let active = record.active.as_ref().filter(|active| active.is_for(order));
+                        let runs = active.is_some_and(|active| active.process.is_some()) && world.alive.len() == 1;
+                        prop_assert!(runs == (phase == Phase::Running), "{phase} {active:?} {:?}", world.alive);
+                        prop_assert!(runs || phase.is_final(), "stuck in {phase}: {record:?}");
+                    }
+                }
+                prop_assert!(world.disk.len() <= 3);
+            }
+            (Some(_), None) => prop_assert!(false, "an order without a record"),
+        }
+    }
+
+    #[test]
+    fn backoff_stays_in_its_bounds(attempt in 0..u32::MAX, jitter in 0.0..1.0f64) {
+        prop_assert!(backoff_ms(attempt, 60_000, jitter) <= 60_000);
+        prop_assert!(backoff_ms(attempt, 60_000, 1.0) >= backoff_ms(attempt, 60_000, jitter));
+    }
+}
+
+fn running(run: Run) -> World {
+    let mut world = World::new(run);
+    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+    while world.alive.is_empty() {
+        world.happen(Happening::Effect { well: true });
+        world.happen(Happening::Learn);
+    }
+    world.happen(Happening::Wait { ms: 2000 });
+    assert_eq!(world.record.as_ref().expect("a record").phase, Phase::Running);
+    world
+}
+
+fn phase(world: &World) -> Phase {
+    world.record.as_ref().expect("a record").phase
+}
+
+#[test]
+fn the_old_version_runs_until_the_new_one_is_staged_and_after_a_cancel() {
+    let mut world = running(Run::default());
+    let old = world.alive.clone();
+    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
+    assert!(matches!(world.steps[..], [(Step::PullManifest(_), false)]));
+    assert_eq!((phase(&world), &world.alive), (Phase::Fetching, &old));
+    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+    assert_eq!((phase(&world), &world.alive), (Phase::Running, &old));
+    assert!(world.steps.is_empty(), "the cancelled step is interrupted: {:?}", world.steps);
+}
+
+#[test]
+fn the_old_version_comes_back_after_a_reboot_while_the_new_one_is_pulled() {
+    let mut world = running(Run::default());
+    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
+    world.happen(Happening::Reboot);
+    let mut lanes: Vec<Lane> = world.steps.iter().map(|(step, _)| step.lane()).collect();
+    lanes.sort();
+    assert_eq!(lanes, [Lane::Prepare, Lane::Run]);
+    assert_eq!(phase(&world), Phase::Fetching);
+}
+
+#[test]
+fn hold_starts_nothing_and_stops_nothing() {
+    let mut world = running(Run::default());
+    let old = world.alive.clone();
+    world.happen(Happening::Hold(true));
+    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
+    for _ in 0..4 {
+        world.happen(Happening::Effect { well: true });
+        world.happen(Happening::Learn);
+    }
+    assert_eq!((phase(&world), &world.alive), (Phase::Deferred, &old));
+    world.happen(Happening::Hold(false));
+    assert!(matches!(world.steps[..], [(Step::Stop { .. }, false)]));
+}
+
+#[test]
+fn a_job_that_the_robot_lost_is_interrupted_unless_it_is_idempotent() {
+    for (idempotent, expected) in [(false, Phase::Failed), (true, Phase::Starting)] {
+        let mut world = running(Run { kind: TaskKind::Job, idempotent, ..Run::default() });
+        world.happen(Happening::Reboot);
+        assert_eq!(phase(&world), expected);
+    }
+}
+
+#[test]
+fn a_service_that_never_gets_ready_fails_with_its_exit_code() {
+    let mut world = running(Run::default());
+    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
+    for _ in 0..200 {
+        world.happen(Happening::Effect { well: true });
+        world.happen(Happening::Learn);
+        if world.alive.iter().any(|dir| dir.starts_with("d0000000000000001")) {
+            world.happen(Happening::ProcessEnds { code: 3 });
+        }
+        world.happen(Happening::Wait { ms: 500 });
+    }
+    let (phase, failure) = world.record.as_ref().expect("a record").standing();
+    assert_eq!(phase, Phase::Failed);
+    assert!(failure.expect("a failure").text.contains("exited with code 3"));
+}
+
+#[test]
+fn on_boot_hold_leaves_a_service_down_after_a_reboot() {
+    let mut world = running(Run { on_boot: OnBoot::Hold, ..Run::default() });
+    world.happen(Happening::Reboot);
+    world.settle();
+    assert_eq!((phase(&world), world.alive.len()), (Phase::Stopped, 0));
+    world.happen(Happening::Order { deployment: 0, run: 2, stop: false });
+    world.settle();
+    assert_eq!((phase(&world), world.alive.len()), (Phase::Running, 1));
+}

@@ -1,0 +1,272 @@
+//! How a record changes: by an order, by the beginning and end of a step, by what a process did. Pure, like the plan.
+
+use task_proto::desired::DesiredTask;
+use task_proto::manifest::{OnBoot, Restart, TaskKind};
+use task_proto::report::{Failure, FailureCode, Phase};
+
+use super::{MAX_RESTARTS_IN_A_ROW, Situation, Step, run_dir_name};
+use crate::ledger::{ActiveRun, End, Preparation, ProcessRecord, RunRules, TaskRecord};
+use crate::observed::Exit;
+
+/// A step that did not succeed.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct StepFailure {
+    /// Why.
+    pub failure: Failure,
+    /// Whether it may succeed later, and not before how many milliseconds; `None`: it never will.
+    pub retry_after_ms: Option<u64>,
+}
+
+/// The first wait of a backoff.
+const BACKOFF_BASE_MS: u64 = 1000;
+/// The longest wait before a step is tried again.
+const MAX_STEP_BACKOFF_MS: u64 = 5 * 60 * 1000;
+/// The longest wait before a process is started again.
+const MAX_RESTART_BACKOFF_MS: u64 = 60 * 1000;
+
+/// Exponential backoff with full jitter, `jitter` being even from 0 to 1: the wait after the `attempt`th failure.
+pub fn backoff_ms(attempt: u32, max_ms: u64, jitter: f64) -> u64 {
+    let ceiling = BACKOFF_BASE_MS.saturating_mul(1 << attempt.clamp(1, 20)).min(max_ms);
+    // Rounding a positive number below 2^32 loses nothing that matters.
+    (ceiling as f64 * jitter.clamp(0.0, 1.0)) as u64
+}
+
+/// The record under a new order. A run that is alive goes on until the new version takes over.
+pub fn adopted(record: &TaskRecord, order: &DesiredTask, now_ms: u64) -> TaskRecord {
+    let mut record = record.clone();
+    record.order = order.clone();
+    record.preparation = Preparation::default();
+    record.settle_phase(now_ms);
+    record
+}
+
+/// The record that is written before `step` is done. `start` is the agent's start counter.
+pub fn begun(record: &TaskRecord, step: &Step, boot_id: &str, start: u64, now_ms: u64) -> TaskRecord {
+    let mut record = record.clone();
+    let phase = match step {
+        Step::PullManifest(_) | Step::PullContent(_) => Some(Phase::Fetching),
+        Step::Build(_) => Some(Phase::Building),
+        Step::Start(_) | Step::Stop { .. } | Step::Prune { .. } | Step::Remove => None,
+    };
+    if let Some(phase) = phase {
+        let again = record.preparation.phase == phase && record.preparation.failure.is_some();
+        record.preparation.attempts = if again { record.preparation.attempts.saturating_add(1) } else { 1 };
+        record.preparation.phase = phase;
+    }
+    if let Step::Start(run) = step {
+        let same = |active: &ActiveRun| active.deployment == run.deployment && active.run == run.run;
+        if !record.active.as_ref().is_some_and(same) {
+            record.retire_active();
+        }
+        let mut run = run.clone();
+        run.starts = run.starts.saturating_add(1);
+        run.process = Some(ProcessRecord {
+            dir: run_dir_name(&run, start),
+            boot_id: boot_id.to_owned(),
+            started_ms: now_ms,
+            pid: None,
+            ready: false,
+        });
+        record.active = Some(run);
+    }
+    record.settle_phase(now_ms);
+    record
+}
+
+/// The record after `step`, which gave `outcome`: for a start the process id, else nothing.
+pub fn finished(s: &Situation<'_>, step: &Step, outcome: Result<Option<u32>, StepFailure>) -> TaskRecord {
+    let mut record = s.record.clone();
+    match (step, outcome) {
+        (Step::PullManifest(package) | Step::PullContent(package) | Step::Build(package), outcome) => {
+            // The step of an order that was replaced meanwhile says nothing about the new one.
+            if record.order.package == *package {
+                prepared(&mut record.preparation, s, outcome.err());
+            }
+        }
+        (Step::Start(_), Ok(pid)) => {
+            if let Some(process) = record.active.as_mut().and_then(|active| active.process.as_mut()) {
+                process.pid = pid;
+                process.started_ms = s.now_ms;
+            }
+        }
+        (Step::Start(_), Err(error)) => {
+            if let Some(active) = &mut record.active {
+                active.process = None;
+                give_up_or_retry(active, s, error.failure, error.retry_after_ms.is_some());
+            }
+        }
+        (Step::Stop { .. }, Ok(_)) => {
+            if let Some(active) = &mut record.active {
+                active.process = None;
+                if active.rules.kind == TaskKind::Job && active.end.is_none() {
+                    active.end = Some(interrupted("the job was stopped before it had ended"));
+                }
+            }
+        }
+        (Step::Stop { .. }, Err(_)) => {
+            if let Some(active) = &mut record.active {
+                active.retry_at_ms = s.now_ms + backoff_ms(1, MAX_STEP_BACKOFF_MS, s.jitter).max(BACKOFF_BASE_MS);
+            }
+        }
+        (Step::Remove, Err(_)) => {
+            record.preparation.attempts = record.preparation.attempts.saturating_add(1);
+            let wait_ms = backoff_ms(record.preparation.attempts, MAX_STEP_BACKOFF_MS, s.jitter);
+            record.preparation.retry_at_ms = s.now_ms + wait_ms.max(BACKOFF_BASE_MS);
+        }
+        (Step::Remove, Ok(_)) | (Step::Prune { .. }, _) => {}
+    }
+    record.settle_phase(s.now_ms);
+    record
+}
+
+fn prepared(preparation: &mut Preparation, s: &Situation<'_>, error: Option<StepFailure>) {
+    preparation.kind = s.prepared.manifest.as_ref().map(|manifest| manifest.run.kind);
+    preparation.retry_at_ms = 0;
+    match error {
+        None => preparation.failure = None,
+        Some(StepFailure { failure, retry_after_ms: None }) => {
+            preparation.failure = Some(failure);
+            preparation.phase = Phase::Failed;
+        }
+        Some(StepFailure { failure, retry_after_ms: Some(least_ms) }) => {
+            preparation.failure = Some(failure);
+            // Retries go on until the order ends: the server lets it expire.
+            let wait_ms = backoff_ms(preparation.attempts, MAX_STEP_BACKOFF_MS, s.jitter).max(least_ms);
+            preparation.retry_at_ms = s.now_ms + wait_ms;
+        }
+    }
+}
+
+/// The record with the preparation at `phase`.
+pub(super) fn prepared_to(s: &Situation<'_>, phase: Phase, failure: Option<Failure>) -> TaskRecord {
+    let mut record = s.record.clone();
+    record.preparation.kind = s.prepared.manifest.as_ref().map(|manifest| manifest.run.kind);
+    record.preparation.phase = phase;
+    record.preparation.failure = failure;
+    record.preparation.attempts = 0;
+    record.settle_phase(s.now_ms);
+    record
+}
+
+/// The record once the process has lived long enough.
+pub(super) fn ready(s: &Situation<'_>) -> TaskRecord {
+    let mut record = s.record.clone();
+    if let Some(active) = &mut record.active {
+        active.ever_ready = true;
+        if let Some(process) = &mut active.process {
+            process.ready = true;
+        }
+    }
+    record.settle_phase(s.now_ms);
+    record
+}
+
+/// The record once a restarted process has run for long.
+pub(super) fn calm(record: &TaskRecord) -> TaskRecord {
+    let mut record = record.clone();
+    if let Some(active) = &mut record.active {
+        active.restarts_in_a_row = 0;
+    }
+    record
+}
+
+/// The record when it turns out that the process it announces was never started: as if it had not been tried.
+pub(super) fn never_started(s: &Situation<'_>) -> TaskRecord {
+    let mut record = s.record.clone();
+    if let Some(active) = &mut record.active {
+        active.process = None;
+    }
+    record.settle_phase(s.now_ms);
+    record
+}
+
+/// The record after the active run's process has ended without being asked to.
+pub(super) fn ended(s: &Situation<'_>, exit: &Exit) -> TaskRecord {
+    let mut record = s.record.clone();
+    let Some(active) = &mut record.active else { return record };
+    let Some(process) = active.process.take() else { return record };
+    let job_done = active.rules.kind == TaskKind::Job && exit.is_success();
+    if process.boot_id != s.boot_id && !job_done {
+        // Whatever status it left, it ended because the robot went down.
+        after_reboot(active, s.now_ms);
+    } else if active.rules.kind == TaskKind::Job {
+        job_ended(active, exit);
+    } else {
+        service_ended(active, s, exit);
+    }
+    record.settle_phase(s.now_ms);
+    record
+}
+
+fn after_reboot(active: &mut ActiveRun, now_ms: u64) {
+    let job = active.rules.kind == TaskKind::Job;
+    if job && !active.rules.idempotent {
+        active.end = Some(interrupted("the robot was restarted while the job ran"));
+    } else if active.rules.on_boot == OnBoot::Hold {
+        active.end = Some(End { phase: Phase::Stopped, failure: None });
+    } else {
+        active.retry_at_ms = 0;
+        active.first_start_ms = now_ms;
+    }
+}
+
+fn job_ended(active: &mut ActiveRun, exit: &Exit) {
+    active.end = match exit.status {
+        Some(_) if exit.is_success() => Some(End { phase: Phase::Succeeded, failure: None }),
+        Some(_) => Some(exited(exit)),
+        None if active.rules.idempotent => None,
+        None => Some(interrupted("the job's process was gone, without an exit status, when it was looked for")),
+    };
+}
+
+fn service_ended(active: &mut ActiveRun, s: &Situation<'_>, exit: &Exit) {
+    let again = match active.rules.restart {
+        Restart::Never => false,
+        Restart::OnFailure => !exit.is_success(),
+        Restart::Always => true,
+    };
+    let failure = Failure::new(FailureCode::PROCESS_EXITED, exit.text());
+    give_up_or_retry(active, s, failure, again);
+}
+
+/// A service that was never ready gets its readiness time to be so; one that was gets [`MAX_RESTARTS_IN_A_ROW`].
+fn give_up_or_retry(active: &mut ActiveRun, s: &Situation<'_>, failure: Failure, again: bool) {
+    let tried_ms = s.now_ms.saturating_sub(active.first_start_ms);
+    let too_late = !active.ever_ready && tried_ms >= u64::from(active.rules.ready_timeout_s) * 1000;
+    let a_job = active.rules.kind == TaskKind::Job;
+    if !again || a_job || too_late || active.restarts_in_a_row >= MAX_RESTARTS_IN_A_ROW {
+        active.end = Some(End { phase: Phase::Failed, failure: Some(failure) });
+        return;
+    }
+    active.restarts = active.restarts.saturating_add(1);
+    active.restarts_in_a_row += 1;
+    active.retry_at_ms = s.now_ms + backoff_ms(active.restarts_in_a_row, MAX_RESTART_BACKOFF_MS, s.jitter);
+}
+
+fn exited(exit: &Exit) -> End {
+    End { phase: Phase::Failed, failure: Some(Failure::new(FailureCode::PROCESS_EXITED, exit.text())) }
+}
+
+fn interrupted(text: &str) -> End {
+    End { phase: Phase::Failed, failure: Some(Failure::new(FailureCode::INTERRUPTED, text)) }
+}
+
+impl ActiveRun {
+    /// The run that `order` asks for, before its first start.
+    pub fn of(order: &DesiredTask, rules: RunRules, now_ms: u64) -> Self {
+        Self {
+            deployment: order.deployment.clone(),
+            run: order.run,
+            package: order.package.clone(),
+            rules,
+            process: None,
+            starts: 0,
+            restarts: 0,
+            restarts_in_a_row: 0,
+            retry_at_ms: 0,
+            first_start_ms: now_ms,
+            ever_ready: false,
+            end: None,
+        }
+    }
+}

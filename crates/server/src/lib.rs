@@ -6,6 +6,7 @@ pub mod broker;
 pub mod changes;
 pub mod clock;
 pub mod commands;
+pub mod collector;
 pub mod config;
 pub mod http;
 pub mod package;

@@ -22,22 +22,13 @@ pub use body::BlobBody;
 use upload::Uploads;
 pub use upload::{InvalidUploadId, UploadId};
 
-/// How a blob's bytes are read.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Reading {
-    /// From a shared mapping of the file: the fastest.
-    #[default]
-    Mmap,
-    /// By `pread` into fresh memory: a failing disk is an error here, where a mapping would end the process.
-    Pread,
-}
+use crate::config::BlobRead;
 
 /// The blob store's limits and choices.
 #[derive(Debug, Clone, Copy)]
 pub struct BlobSettings {
     /// How blobs are read.
-    pub reading: Reading,
+    pub reading: BlobRead,
     /// The largest blob that is accepted.
     pub max_blob_bytes: u64,
     /// The most uploads that may be unfinished at once.
@@ -48,7 +39,7 @@ pub struct BlobSettings {
 
 impl Default for BlobSettings {
     fn default() -> Self {
-        Self { reading: Reading::Mmap, max_blob_bytes: 16 << 30, max_uploads: 256, max_open_blobs: 64 }
+        Self { reading: BlobRead::Mmap, max_blob_bytes: 16 << 30, max_uploads: 256, max_open_blobs: 64 }
     }
 }
 
@@ -80,14 +71,6 @@ pub enum BlobError {
     TooLarge {
         /// The limit.
         max: u64,
-    },
-    /// A chunk was shorter or longer than announced.
-    #[error("{expected} bytes were announced, {received} came")]
-    WrongLength {
-        /// What was announced.
-        expected: u64,
-        /// What came.
-        received: u64,
     },
     /// The bytes hash to something else.
     #[error("the bytes hash to {actual}, not to {expected}")]
@@ -266,6 +249,17 @@ impl Blobs {
         .await
     }
 
+    /// Whether the blob is here and was last touched before `before_ms`.
+    pub async fn is_untouched_since(&self, digest: Digest, before_ms: u64) -> Result<bool, BlobError> {
+        let path = self.path(digest);
+        on_disk(move || match fs::metadata(&path).and_then(|metadata| modified_ms(&metadata)) {
+            Ok(modified) => Ok(modified < before_ms),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
+            Err(error) => Err(BlobError::disk("look at", &path)(error)),
+        })
+        .await
+    }
+
     /// Deletes a blob. Only the collector may, which knows that nothing refers to it.
     pub async fn delete(&self, digest: Digest, _collection: &Collection) -> Result<(), BlobError> {
         self.take_from_open(digest);
@@ -299,18 +293,18 @@ impl Blobs {
 }
 
 impl Blob {
-    fn open(digest: Digest, path: &Path, reading: Reading) -> io::Result<Self> {
+    fn open(digest: Digest, path: &Path, reading: BlobRead) -> io::Result<Self> {
         let file = File::open(path)?;
         let size = file.metadata()?.len();
         let source = match reading {
             // An empty file can't be mapped.
-            Reading::Mmap if size > 0 => {
+            BlobRead::Mmap if size > 0 => {
                 // SAFETY: nothing modifies or truncates a file after it was renamed into the store; deleting it leaves
                 // the mapping intact.
                 let mapping = unsafe { memmap2::Mmap::map(&file) }?;
                 Source::Mapped(Bytes::from_owner(mapping))
             }
-            Reading::Mmap | Reading::Pread => Source::File(Arc::new(file)),
+            BlobRead::Mmap | BlobRead::Pread => Source::File(Arc::new(file)),
         };
         Ok(Self { digest, size, source })
     }

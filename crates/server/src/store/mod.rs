@@ -20,6 +20,7 @@ use sqlx::any::{Any, AnyPoolOptions};
 use sqlx::{AnyConnection, AnyPool, Transaction};
 
 pub use assignments::TaskOrder;
+pub use packages::{NewManifest, PutManifest, Reference, StoredManifest};
 pub use tokens::TokenHolder;
 
 /// Connections that read at the same time.

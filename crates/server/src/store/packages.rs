@@ -121,21 +121,33 @@ impl Store {
         .transpose()
     }
 
-    /// Removes a manifest with all its tags; false if it was not there.
-    pub async fn delete_manifest(&self, repository: &RepositoryName, digest: &Digest) -> Result<bool, StoreError> {
+    /// Removes a manifest with all its tags and says what it was made of; `None` if it was not there.
+    pub async fn delete_manifest(
+        &self,
+        repository: &RepositoryName,
+        digest: &Digest,
+    ) -> Result<Option<Vec<Digest>>, StoreError> {
         let mut write = self.begin().await?;
+        let parts: Vec<String> =
+            sqlx::query_scalar("DELETE FROM manifest_parts WHERE repository = $1 AND manifest = $2 RETURNING digest")
+                .bind(repository.as_str())
+                .bind(digest.to_string())
+                .fetch_all(write.connection())
+                .await?;
         let mut deleted = 0;
         for sql in [
             "DELETE FROM packages WHERE name = $1 AND manifest = $2",
             "DELETE FROM tags WHERE repository = $1 AND manifest = $2",
-            "DELETE FROM manifest_parts WHERE repository = $1 AND manifest = $2",
             "DELETE FROM manifests WHERE repository = $1 AND digest = $2",
         ] {
             let query = sqlx::query(sql).bind(repository.as_str()).bind(digest.to_string());
             deleted = query.execute(write.connection()).await?.rows_affected();
         }
         write.commit().await?;
-        Ok(deleted > 0)
+        if deleted == 0 {
+            return Ok(None);
+        }
+        parts.iter().map(|part| rows::id("manifest_parts.digest", part)).collect::<Result<_, _>>().map(Some)
     }
 
     /// Removes a tag; false if it was not there.

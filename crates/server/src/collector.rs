@@ -1,0 +1,80 @@
+//! Collects what nobody needs any more: uploads that were given up, blobs that nothing refers to. Blobs of a package that
+//! a robot should have, or may get back, are kept whatever happened to their manifest. A blob is left alone for a grace
+//! time after a pusher last asked for it, so that a push in progress finds what it found before.
+
+use std::time::Duration;
+
+use tokio_util::sync::CancellationToken;
+
+use crate::blobs::{BlobError, Blobs};
+use crate::clock::Clock;
+use crate::store::{Store, StoreError};
+
+/// The most blobs deleted in one go; pushes wait that long.
+const MAX_AT_ONCE: usize = 256;
+/// The shortest and longest time between two collections.
+const INTERVAL: [Duration; 2] = [Duration::from_secs(1), Duration::from_secs(600)];
+
+/// What one collection removed.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Collected {
+    /// Unfinished uploads.
+    pub uploads: usize,
+    /// Blobs.
+    pub blobs: usize,
+}
+
+/// Why a collection did not end. The next one begins anew.
+#[derive(Debug, thiserror::Error)]
+pub enum CollectError {
+    /// The blob store refused.
+    #[error("unneeded blobs can't be deleted")]
+    Blobs(#[from] BlobError),
+    /// The database refused.
+    #[error("the database can't tell which blobs are needed")]
+    Store(#[from] StoreError),
+}
+
+/// Collects now and then, until it is told to stop.
+pub async fn run(store: Store, blobs: Blobs, clock: Clock, grace: Duration, stop: CancellationToken) {
+    let [shortest, longest] = INTERVAL;
+    let mut interval = tokio::time::interval((grace / 4).clamp(shortest, longest));
+    interval.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    loop {
+        // Cancel-safe: the collection itself is not part of the select.
+        tokio::select! {
+            () = stop.cancelled() => return,
+            _ = interval.tick() => {}
+        }
+        match collect(&store, &blobs, clock.now_ms(), grace).await {
+            Ok(Collected { uploads: 0, blobs: 0 }) => {}
+            Ok(Collected { uploads, blobs }) => tracing::info!(uploads, blobs, "collected what nobody needs"),
+            Err(error) => {
+                let cause = std::error::Error::source(&error).map(ToString::to_string);
+                tracing::warn!(%error, cause, "collecting failed");
+            }
+        }
+    }
+}
+
+/// Removes what has not been needed for `grace`.
+pub async fn collect(store: &Store, blobs: &Blobs, now_ms: u64, grace: Duration) -> Result<Collected, CollectError> {
+    let before_ms = now_ms.saturating_sub(u64::try_from(grace.as_millis()).unwrap_or(u64::MAX));
+    let mut collected = Collected { uploads: blobs.drop_idle_uploads(before_ms).await?, blobs: 0 };
+    let old = blobs.untouched_since(before_ms).await?;
+    for candidates in old.chunks(MAX_AT_ONCE) {
+        let collection = blobs.begin_collection().await;
+        let mut untouched = Vec::with_capacity(candidates.len());
+        for &digest in candidates {
+            // A pusher may have asked for it while we waited for the right to collect.
+            if blobs.is_untouched_since(digest, before_ms).await? {
+                untouched.push(digest);
+            }
+        }
+        for digest in store.forget_unneeded(untouched).await? {
+            blobs.delete(digest, &collection).await?;
+            collected.blobs += 1;
+        }
+    }
+    Ok(collected)
+}

@@ -1,0 +1,176 @@
+//! The distribution specification's error bodies: `{"errors":[{"code","message","detail"}]}`, with its codes. What went
+//! wrong inside the server is logged, never told.
+
+use axum::Json;
+use axum::response::{IntoResponse, Response};
+use http::header::{ALLOW, WWW_AUTHENTICATE};
+use http::{HeaderValue, StatusCode};
+use serde_json::{Value, json};
+use task_proto::Digest;
+
+use crate::blobs::BlobError;
+use crate::store::StoreError;
+
+/// An answer that is not the one hoped for.
+#[derive(Debug)]
+pub struct OciError {
+    status: StatusCode,
+    code: &'static str,
+    messages: Vec<(String, Value)>,
+    allow: Option<&'static str>,
+}
+
+impl OciError {
+    fn new(status: StatusCode, code: &'static str, message: impl Into<String>) -> Self {
+        Self { status, code, messages: vec![(message.into(), Value::Null)], allow: None }
+    }
+
+    /// 401: nobody known is asking.
+    pub fn unauthorized() -> Self {
+        let message = "log in with any user name and a token as the password";
+        Self::new(StatusCode::UNAUTHORIZED, "UNAUTHORIZED", message)
+    }
+
+    /// 403: whoever asks may not.
+    pub fn denied(message: &'static str) -> Self {
+        Self::new(StatusCode::FORBIDDEN, "DENIED", message)
+    }
+
+    /// 404: not an endpoint of the specification.
+    pub fn no_endpoint() -> Self {
+        Self::new(StatusCode::NOT_FOUND, "UNSUPPORTED", "this is not an endpoint of the distribution API")
+    }
+
+    /// 405: the endpoint has other methods.
+    pub fn method(allow: &'static str) -> Self {
+        let error = Self::new(StatusCode::METHOD_NOT_ALLOWED, "UNSUPPORTED", "the endpoint does not have this method");
+        Self { allow: Some(allow), ..error }
+    }
+
+    /// 400: not a repository's name.
+    pub fn name_invalid(error: &task_proto::id::InvalidId) -> Self {
+        Self::new(StatusCode::BAD_REQUEST, "NAME_INVALID", error.to_string())
+    }
+
+    /// 404: no such repository.
+    pub fn name_unknown() -> Self {
+        Self::new(StatusCode::NOT_FOUND, "NAME_UNKNOWN", "there is no such repository")
+    }
+
+    /// 400: not a tag.
+    pub fn tag_invalid(error: &task_proto::id::InvalidId) -> Self {
+        Self::new(StatusCode::BAD_REQUEST, "TAG_INVALID", error.to_string())
+    }
+
+    /// 400: not a digest, or not that of the content.
+    pub fn digest_invalid(message: impl Into<String>) -> Self {
+        Self::new(StatusCode::BAD_REQUEST, "DIGEST_INVALID", message)
+    }
+
+    /// 404: no such blob in the repository.
+    pub fn blob_unknown() -> Self {
+        Self::new(StatusCode::NOT_FOUND, "BLOB_UNKNOWN", "the repository has no such blob")
+    }
+
+    /// 400: a chunk's description makes no sense.
+    pub fn upload_invalid(message: impl Into<String>) -> Self {
+        Self::new(StatusCode::BAD_REQUEST, "BLOB_UPLOAD_INVALID", message)
+    }
+
+    /// 404: no such upload.
+    pub fn upload_unknown() -> Self {
+        Self::new(StatusCode::NOT_FOUND, "BLOB_UPLOAD_UNKNOWN", BlobError::UploadUnknown.to_string())
+    }
+
+    /// 400: not the announced number of bytes.
+    pub fn size_invalid(message: impl Into<String>) -> Self {
+        Self::new(StatusCode::BAD_REQUEST, "SIZE_INVALID", message)
+    }
+
+    /// 413: more bytes than are accepted.
+    pub fn too_large(message: impl Into<String>) -> Self {
+        Self::new(StatusCode::PAYLOAD_TOO_LARGE, "SIZE_INVALID", message)
+    }
+
+    /// 416: the content has no such bytes.
+    pub fn range_invalid(message: impl Into<String>) -> Self {
+        Self::new(StatusCode::RANGE_NOT_SATISFIABLE, "RANGE_INVALID", message)
+    }
+
+    /// 404: no such manifest in the repository.
+    pub fn manifest_unknown() -> Self {
+        Self::new(StatusCode::NOT_FOUND, "MANIFEST_UNKNOWN", "the repository has no such manifest")
+    }
+
+    /// 400: a manifest that is not accepted, and why.
+    pub fn manifest_invalid(message: impl Into<String>) -> Self {
+        Self::new(StatusCode::BAD_REQUEST, "MANIFEST_INVALID", message)
+    }
+
+    /// 400: a manifest whose parts are not in the repository.
+    pub fn parts_unknown(parts: &[Digest]) -> Self {
+        let message = "the manifest needs a blob that is not in the repository";
+        let messages = parts.iter().map(|part| (message.to_owned(), json!({ "digest": part }))).collect();
+        Self { status: StatusCode::BAD_REQUEST, code: "MANIFEST_BLOB_UNKNOWN", messages, allow: None }
+    }
+
+    /// 400: the query of a list makes no sense.
+    pub fn query_invalid(message: &'static str) -> Self {
+        Self::new(StatusCode::BAD_REQUEST, "PAGINATION_NUMBER_INVALID", message)
+    }
+
+    fn internal(error: &(dyn std::error::Error + 'static)) -> Self {
+        let mut chain = error.to_string();
+        let mut source = error.source();
+        while let Some(cause) = source {
+            chain = format!("{chain}: {cause}");
+            source = cause.source();
+        }
+        tracing::error!(error = chain, "a registry request failed");
+        Self::new(StatusCode::INTERNAL_SERVER_ERROR, "UNKNOWN", "the server failed; its log says why")
+    }
+}
+
+impl From<StoreError> for OciError {
+    fn from(error: StoreError) -> Self {
+        Self::internal(&error)
+    }
+}
+
+impl From<BlobError> for OciError {
+    fn from(error: BlobError) -> Self {
+        let message = error.to_string();
+        match error {
+            BlobError::UploadUnknown => Self::upload_unknown(),
+            BlobError::UploadBusy => Self::new(StatusCode::CONFLICT, "BLOB_UPLOAD_INVALID", message),
+            BlobError::TooManyUploads { .. } => Self::new(StatusCode::TOO_MANY_REQUESTS, "TOOMANYREQUESTS", message),
+            BlobError::OutOfOrder { .. } => {
+                Self::new(StatusCode::RANGE_NOT_SATISFIABLE, "BLOB_UPLOAD_INVALID", message)
+            }
+            BlobError::TooLarge { .. } => Self::too_large(message),
+            BlobError::WrongDigest { .. } => Self::digest_invalid(message),
+            BlobError::Interrupted(_) => Self::upload_invalid(message),
+            BlobError::DiskFull => Self::new(StatusCode::INSUFFICIENT_STORAGE, "DENIED", message),
+            BlobError::Disk { .. } => Self::internal(&error),
+        }
+    }
+}
+
+impl IntoResponse for OciError {
+    fn into_response(self) -> Response {
+        let errors = self.messages.into_iter().map(|(message, detail)| match detail {
+            Value::Null => json!({ "code": self.code, "message": message }),
+            detail => json!({ "code": self.code, "message": message, "detail": detail }),
+        });
+        let body = json!({ "errors": errors.collect::<Vec<_>>() });
+        let mut response = (self.status, Json(body)).into_response();
+        if self.status == StatusCode::UNAUTHORIZED {
+            let challenge = HeaderValue::from_static("Basic realm=\"taskd\", charset=\"UTF-8\"");
+            response.headers_mut().insert(WWW_AUTHENTICATE, challenge);
+        }
+        if let Some(allow) = self.allow {
+            response.headers_mut().insert(ALLOW, HeaderValue::from_static(allow));
+        }
+        response
+    }
+}

@@ -1,0 +1,82 @@
+//! Finding out what a repository holds: its tags, and the manifests that refer to one.
+
+use axum::Json;
+use axum::response::IntoResponse as _;
+use http::HeaderValue;
+use http::header::{CONTENT_TYPE, LINK};
+use http::request::Parts;
+use serde::Deserialize;
+use serde_json::json;
+use task_proto::RepositoryName;
+use task_proto::oci::INDEX_TYPE;
+
+use super::{Answer, OciError, Registry, query};
+
+/// The most tags in one answer.
+const MAX_TAGS: usize = 1000;
+
+#[derive(Deserialize)]
+struct TagsQuery {
+    n: Option<usize>,
+    last: Option<String>,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct ReferrersQuery {
+    artifact_type: Option<String>,
+}
+
+/// `GET /v2/<name>/tags/list`.
+pub(super) async fn tags(registry: &Registry, repository: &RepositoryName, request: &Parts) -> Answer {
+    let query: TagsQuery = query(&request.uri)?;
+    let mut tags = registry.store.tags(repository).await?.ok_or_else(OciError::name_unknown)?;
+    if let Some(last) = &query.last {
+        tags.retain(|tag| tag.as_str() > last.as_str());
+    }
+    let limit = query.n.unwrap_or(MAX_TAGS).min(MAX_TAGS);
+    let has_more = tags.len() > limit;
+    tags.truncate(limit);
+    let mut response = Json(json!({ "name": repository, "tags": tags })).into_response();
+    if let Some(last) = tags.last().filter(|_| has_more) {
+        let link = format!("</v2/{repository}/tags/list?n={limit}&last={last}>; rel=\"next\"");
+        let link = HeaderValue::try_from(link).map_err(|_| OciError::name_unknown())?;
+        response.headers_mut().insert(LINK, link);
+    }
+    Ok(response)
+}
+
+/// `GET /v2/<name>/referrers/<digest>`: an image index, empty if there is nothing.
+pub(super) async fn referrers(
+    registry: &Registry,
+    repository: &RepositoryName,
+    subject: &str,
+    request: &Parts,
+) -> Answer {
+    if !is_digest(subject) {
+        return Err(OciError::digest_invalid(format!("{subject:?} is not a digest")));
+    }
+    let query: ReferrersQuery = query(&request.uri)?;
+    let mut manifests = registry.store.referrers(repository, subject).await?;
+    let mut response = Json(()).into_response();
+    if let Some(kind) = query.artifact_type.filter(|kind| !kind.is_empty()) {
+        manifests.retain(|manifest| manifest.artifact_type.as_ref() == Some(&kind));
+        response.headers_mut().insert("oci-filters-applied", HeaderValue::from_static("artifactType"));
+    }
+    let index = json!({ "schemaVersion": 2, "mediaType": INDEX_TYPE, "manifests": manifests });
+    *response.body_mut() = index.to_string().into();
+    response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static(INDEX_TYPE));
+    Ok(response)
+}
+
+/// Any digest, of an algorithm known here or not: a subject need not be here.
+fn is_digest(text: &str) -> bool {
+    text.split_once(':').is_some_and(|(algorithm, encoded)| {
+        let is_word = |b: u8| b.is_ascii_lowercase() || b.is_ascii_digit() || matches!(b, b'+' | b'.' | b'_' | b'-');
+        let is_encoded = |b: u8| b.is_ascii_alphanumeric() || matches!(b, b'=' | b'_' | b'-');
+        !algorithm.is_empty()
+            && algorithm.bytes().all(is_word)
+            && encoded.len() >= 32
+            && encoded.bytes().all(is_encoded)
+    })
+}

@@ -1,0 +1,199 @@
+//! Reading, pushing and deleting manifests. One that calls itself a task package must be one: that is checked here, so
+//! that whatever can be ordered can be run.
+
+use std::time::Duration;
+
+use axum::body::Body;
+use bytes::Bytes;
+use http::header::CONTENT_TYPE;
+use http::request::Parts;
+use http::{HeaderValue, StatusCode};
+use task_proto::desired::{BlobRef, PackageRef};
+use task_proto::manifest::TaskManifest;
+use task_proto::oci::{ImageManifest, PACKAGE_TYPE};
+use task_proto::{Digest, RepositoryName, Tag};
+
+use super::blobs::serve;
+use super::parsed::Parsed;
+use super::{Answer, OciError, Registry, empty};
+use crate::store::{NewManifest, PutManifest, Reference, StoredManifest};
+
+/// The largest manifest; the specification asks for at least this.
+const MAX_MANIFEST_BYTES: usize = 4 * 1024 * 1024;
+/// The largest task manifest.
+const MAX_CONFIG_BYTES: u64 = 1024 * 1024;
+/// How long a manifest may take to arrive.
+const PATIENCE: Duration = Duration::from_secs(60);
+/// The most tags one request sets.
+const MAX_TAGS: usize = 64;
+
+/// `GET` and `HEAD /v2/<name>/manifests/<reference>`. What can't be a reference names nothing.
+pub(super) async fn get(
+    registry: &Registry,
+    repository: &RepositoryName,
+    reference: Result<Reference, OciError>,
+    request: &Parts,
+) -> Answer {
+    let Ok(reference) = reference else { return Err(OciError::manifest_unknown()) };
+    let stored = registry.store.manifest(repository, &reference).await?.ok_or_else(OciError::manifest_unknown)?;
+    let blob = registry.blobs.get(stored.digest).await?.ok_or_else(OciError::manifest_unknown)?;
+    let content_type = HeaderValue::try_from(stored.media_type).map_err(|_| OciError::manifest_unknown())?;
+    let cache = match reference {
+        Reference::Digest(_) => "private, max-age=31536000, immutable",
+        Reference::Tag(_) => "private, no-cache",
+    };
+    serve(&blob, request, content_type, HeaderValue::from_static(cache))
+}
+
+/// `PUT`: stores the exact bytes, if all they refer to is in the repository.
+pub(super) async fn put(
+    registry: &Registry,
+    repository: &RepositoryName,
+    reference: Reference,
+    parts: &Parts,
+    body: Body,
+) -> Answer {
+    let bytes = read_body(body).await?;
+    let digest = Digest::of(&bytes);
+    let tags = tags_to_set(parts, &reference)?;
+    if let Reference::Digest(expected) = reference
+        && expected != digest
+    {
+        return Err(OciError::digest_invalid(format!("the manifest hashes to {digest}, not to {expected}")));
+    }
+    let content_type = parts.headers.get(CONTENT_TYPE).and_then(|value| value.to_str().ok());
+    let parsed = Parsed::new(content_type, &bytes)?;
+
+    // From here until the manifest is stored, nothing it is made of may be collected.
+    let _hold = registry.blobs.hold_collection().await;
+    let manifest = BlobRef { digest, size: bytes.len() as u64 };
+    let package = match &parsed.package {
+        Some(image) => Some(check_package(registry, repository, manifest, image).await?),
+        None => None,
+    };
+    let now_ms = registry.clock.now_ms();
+    registry.blobs.put(bytes).await?;
+    registry.blobs.touch(digest, now_ms).await?;
+    let subject = parsed.subject.clone();
+    let new = NewManifest {
+        manifest: StoredManifest { digest, size: manifest.size, media_type: parsed.media_type },
+        artifact_type: parsed.artifact_type,
+        annotations: parsed.annotations,
+        subject: parsed.subject,
+        parts: parsed.parts,
+        tags,
+        package,
+    };
+    match registry.store.put_manifest(repository, &new, now_ms).await? {
+        PutManifest::PartsMissing(missing) => Err(OciError::parts_unknown(&missing)),
+        PutManifest::Stored => created(repository, &digest, subject, parts, &new.tags),
+    }
+}
+
+/// `DELETE`: a tag alone, or a manifest with all its tags.
+pub(super) async fn delete(registry: &Registry, repository: &RepositoryName, reference: Reference) -> Answer {
+    match reference {
+        Reference::Tag(tag) => {
+            if !registry.store.delete_tag(repository, &tag).await? {
+                return Err(OciError::manifest_unknown());
+            }
+        }
+        Reference::Digest(digest) => {
+            let _hold = registry.blobs.hold_collection().await;
+            let parts = registry.store.delete_manifest(repository, &digest).await?;
+            let parts = parts.ok_or_else(OciError::manifest_unknown)?;
+            // An order that looked the package up a moment ago still finds its bytes: they stay for a while.
+            for blob in parts.into_iter().chain([digest]) {
+                registry.blobs.touch(blob, registry.clock.now_ms()).await?;
+            }
+        }
+    }
+    empty(StatusCode::ACCEPTED, [])
+}
+
+async fn read_body(body: Body) -> Result<Bytes, OciError> {
+    let too_large = || OciError::too_large(format!("a manifest may have {MAX_MANIFEST_BYTES} bytes"));
+    match tokio::time::timeout(PATIENCE, axum::body::to_bytes(body, MAX_MANIFEST_BYTES)).await {
+        Ok(Ok(bytes)) => Ok(bytes),
+        Ok(Err(error)) => {
+            let is_limit =
+                std::error::Error::source(&error).is_some_and(|source| source.is::<http_body_util::LengthLimitError>());
+            Err(if is_limit { too_large() } else { OciError::manifest_invalid("the manifest broke off") })
+        }
+        Err(_) => Err(OciError::manifest_invalid("the manifest took too long to arrive")),
+    }
+}
+
+/// The tag of the path, or those in the query of a push by digest.
+fn tags_to_set(parts: &Parts, reference: &Reference) -> Result<Vec<Tag>, OciError> {
+    if let Reference::Tag(tag) = reference {
+        return Ok(vec![tag.clone()]);
+    }
+    let pairs: Vec<(String, String)> = super::query(&parts.uri)?;
+    let tags = pairs.iter().filter(|(key, _)| key == "tag").take(MAX_TAGS);
+    tags.map(|(_, tag)| tag.parse().map_err(|error| OciError::tag_invalid(&error))).collect()
+}
+
+/// Reads the task manifest out of a package's config blob and holds it to its rules.
+async fn check_package(
+    registry: &Registry,
+    repository: &RepositoryName,
+    manifest: BlobRef,
+    image: &ImageManifest,
+) -> Result<(PackageRef, TaskManifest), OciError> {
+    let Some((config, content)) = image.package_blobs() else {
+        let message =
+            format!("a manifest of artifactType {PACKAGE_TYPE} needs its config and one layer of its own types");
+        return Err(OciError::manifest_invalid(message));
+    };
+    for part in [config, content] {
+        let is_here = registry.store.has_blob(Some(repository), &part.digest).await?;
+        let blob = if is_here { registry.blobs.get(part.digest).await? } else { None };
+        let size = blob.ok_or_else(|| OciError::parts_unknown(&[part.digest]))?.size();
+        if size != part.size {
+            let message = format!("the blob {} has {size} bytes, its descriptor says {}", part.digest, part.size);
+            return Err(OciError::manifest_invalid(message));
+        }
+    }
+    if config.size > MAX_CONFIG_BYTES {
+        return Err(OciError::manifest_invalid(format!("the config has more than {MAX_CONFIG_BYTES} bytes")));
+    }
+    let blob = registry.blobs.get(config.digest).await?.ok_or_else(|| OciError::parts_unknown(&[config.digest]))?;
+    let task: TaskManifest = serde_json::from_slice(&blob.read().await?)
+        .map_err(|error| OciError::manifest_invalid(format!("the config is not a task manifest: {error}")))?;
+    let mut problems: Vec<String> = task.problems().iter().map(ToString::to_string).collect();
+    if task.name.as_str() != repository.as_str() {
+        problems.push(format!(
+            "name: {:?} must be the repository's name, {:?}",
+            task.name.as_str(),
+            repository.as_str()
+        ));
+    }
+    if !problems.is_empty() {
+        return Err(OciError::manifest_invalid(problems.join("; ")));
+    }
+    let package = PackageRef { name: task.name.clone(), version: task.version.clone(), manifest, config, content };
+    Ok((package, task))
+}
+
+fn created(
+    repository: &RepositoryName,
+    digest: &Digest,
+    subject: Option<String>,
+    request: &Parts,
+    tags: &[Tag],
+) -> Answer {
+    let location = format!("/v2/{repository}/manifests/{digest}");
+    let headers = [("location", location), ("docker-content-digest", digest.to_string())];
+    let mut response = empty(StatusCode::CREATED, headers)?;
+    if let Some(subject) = subject.and_then(|subject| HeaderValue::try_from(subject).ok()) {
+        response.headers_mut().insert("oci-subject", subject);
+    }
+    if request.uri.query().is_some() {
+        for tag in tags {
+            let tag = HeaderValue::try_from(tag.as_str()).map_err(|_| OciError::manifest_unknown())?;
+            response.headers_mut().append("oci-tag", tag);
+        }
+    }
+    Ok(response)
+}

@@ -1,0 +1,198 @@
+//! The registry: the OCI distribution API v1.1, pull and push, under `/v2/`. Operators may do everything, a robot reads the
+//! blobs of the packages it should have. What a repository holds is the store's, the bytes are the blob store's.
+
+mod blobs;
+mod error;
+mod lists;
+mod manifests;
+mod parsed;
+mod uploads;
+
+use axum::Router;
+use axum::extract::{Path, Request, State};
+use axum::response::{IntoResponse, Response};
+use axum::routing::any;
+use http::{HeaderMap, HeaderValue, Method, StatusCode, Uri};
+use serde::de::DeserializeOwned;
+use task_proto::{Digest, RepositoryName};
+
+pub use error::OciError;
+
+use super::auth::Caller;
+use crate::blobs::Blobs;
+use crate::clock::Clock;
+use crate::store::{Reference, Store};
+
+/// What the registry works on.
+#[derive(Clone)]
+pub struct Registry {
+    /// What repositories hold.
+    pub store: Store,
+    /// The bytes.
+    pub blobs: Blobs,
+    /// When things were pushed.
+    pub clock: Clock,
+}
+
+/// Everything below `/v2/`. The caller is taken from the request's extensions, where the guard put it; without one,
+/// nobody is let in.
+pub fn router(registry: Registry) -> Router {
+    Router::new()
+        .route("/v2", any(version))
+        .route("/v2/", any(version))
+        .route("/v2/{*path}", any(dispatch))
+        .with_state(registry)
+}
+
+type Answer = Result<Response, OciError>;
+
+/// What a path below `/v2/` names.
+#[derive(Debug, PartialEq, Eq)]
+enum Endpoint<'a> {
+    Blob(&'a str),
+    Uploads,
+    Upload(&'a str),
+    Manifest(&'a str),
+    Tags,
+    Referrers(&'a str),
+}
+
+/// Splits a path into the repository's name, which may hold slashes, and the endpoint after it.
+fn endpoint(path: &str) -> Option<(&str, Endpoint<'_>)> {
+    let segments: Vec<&str> = path.split('/').collect();
+    let (name_len, endpoint) = match segments[..] {
+        [ref name @ .., "blobs", "uploads", ""] | [ref name @ .., "blobs", "uploads"] => {
+            (name.len(), Endpoint::Uploads)
+        }
+        [ref name @ .., "blobs", "uploads", id] => (name.len(), Endpoint::Upload(id)),
+        [ref name @ .., "blobs", digest] => (name.len(), Endpoint::Blob(digest)),
+        [ref name @ .., "manifests", reference] => (name.len(), Endpoint::Manifest(reference)),
+        [ref name @ .., "tags", "list"] => (name.len(), Endpoint::Tags),
+        [ref name @ .., "referrers", digest] => (name.len(), Endpoint::Referrers(digest)),
+        _ => return None,
+    };
+    let bytes: usize = segments[..name_len].iter().map(|segment| segment.len() + 1).sum();
+    Some((path[..bytes].strip_suffix('/')?, endpoint))
+}
+
+/// `GET /v2/`: tells that this is a registry, and whether the caller's token is good.
+async fn version(request: Request) -> Answer {
+    match request.extensions().get::<Caller>() {
+        Some(Caller::Operator { .. } | Caller::Robot(_)) => {}
+        _ => return Err(OciError::unauthorized()),
+    }
+    if !matches!(*request.method(), Method::GET | Method::HEAD) {
+        return Err(OciError::method("GET, HEAD"));
+    }
+    let mut headers = HeaderMap::new();
+    headers.insert("docker-distribution-api-version", HeaderValue::from_static("registry/2.0"));
+    Ok((headers, axum::Json(serde_json::json!({}))).into_response())
+}
+
+async fn dispatch(State(registry): State<Registry>, Path(path): Path<String>, request: Request) -> Answer {
+    let (parts, body) = request.into_parts();
+    let caller = parts.extensions.get::<Caller>().cloned();
+    let (name, endpoint) = match &caller {
+        Some(Caller::Operator { .. } | Caller::Robot(_)) => endpoint(&path).ok_or_else(OciError::no_endpoint)?,
+        _ => return Err(OciError::unauthorized()),
+    };
+    let repository: RepositoryName = name.parse().map_err(|error| OciError::name_invalid(&error))?;
+    let method = parts.method.clone();
+    if let Some(robot) = caller.as_ref().and_then(Caller::robot) {
+        return match (&method, endpoint) {
+            (&Method::GET | &Method::HEAD, Endpoint::Blob(digest)) => {
+                blobs::get_for_robot(&registry, robot, parse_digest(digest)?, &parts).await
+            }
+            _ => Err(OciError::denied("a robot may only read blobs")),
+        };
+    }
+    match endpoint {
+        Endpoint::Blob(digest) => {
+            let digest = parse_digest(digest)?;
+            match method {
+                Method::GET => blobs::get(&registry, &repository, digest, &parts).await,
+                Method::HEAD => blobs::head(&registry, &repository, digest, &parts).await,
+                Method::DELETE => blobs::delete(&registry, &repository, digest).await,
+                _ => Err(OciError::method("GET, HEAD, DELETE")),
+            }
+        }
+        Endpoint::Uploads if method == Method::POST => uploads::begin(&registry, &repository, &parts, body).await,
+        Endpoint::Uploads => Err(OciError::method("POST")),
+        Endpoint::Upload(id) => {
+            let id = id.parse().map_err(|_| OciError::upload_unknown())?;
+            match method {
+                Method::GET => uploads::status(&registry, &repository, &id).await,
+                Method::PATCH => uploads::append(&registry, &repository, &id, &parts, body).await,
+                Method::PUT => uploads::finish(&registry, &repository, &id, &parts, body).await,
+                Method::DELETE => uploads::cancel(&registry, &repository, &id).await,
+                _ => Err(OciError::method("GET, PATCH, PUT, DELETE")),
+            }
+        }
+        Endpoint::Manifest(reference) => {
+            let reference = parse_reference(reference);
+            match method {
+                Method::GET | Method::HEAD => manifests::get(&registry, &repository, reference, &parts).await,
+                Method::PUT => manifests::put(&registry, &repository, reference?, &parts, body).await,
+                Method::DELETE => manifests::delete(&registry, &repository, reference?).await,
+                _ => Err(OciError::method("GET, HEAD, PUT, DELETE")),
+            }
+        }
+        Endpoint::Tags | Endpoint::Referrers(_) if method != Method::GET => Err(OciError::method("GET")),
+        Endpoint::Tags => lists::tags(&registry, &repository, &parts).await,
+        Endpoint::Referrers(subject) => lists::referrers(&registry, &repository, subject, &parts).await,
+    }
+}
+
+fn parse_digest(text: &str) -> Result<Digest, OciError> {
+    text.parse().map_err(|error: task_proto::digest::InvalidDigest| OciError::digest_invalid(error.to_string()))
+}
+
+fn parse_reference(text: &str) -> Result<Reference, OciError> {
+    if text.contains(':') {
+        return parse_digest(text).map(Reference::Digest);
+    }
+    text.parse().map(Reference::Tag).map_err(|error| OciError::tag_invalid(&error))
+}
+
+/// The request's query, of which unknown parts are ignored.
+fn query<T: DeserializeOwned>(uri: &Uri) -> Result<T, OciError> {
+    axum::extract::Query::try_from_uri(uri)
+        .map(|axum::extract::Query(query)| query)
+        .map_err(|_| OciError::query_invalid("the query can't be understood"))
+}
+
+/// An answer without a body.
+fn empty<const N: usize>(status: StatusCode, headers: [(&'static str, String); N]) -> Answer {
+    let mut response = status.into_response();
+    for (name, value) in headers {
+        // All values are made of digests, ids, numbers and names, which a header can hold.
+        let value = HeaderValue::try_from(value).map_err(|_| OciError::query_invalid("a name no header can hold"))?;
+        response.headers_mut().insert(name, value);
+    }
+    Ok(response)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_repository_is_what_comes_before_the_endpoint() {
+        let cases = [
+            ("a/blobs/sha256:0", Some(("a", Endpoint::Blob("sha256:0")))),
+            ("a/b/c/manifests/latest", Some(("a/b/c", Endpoint::Manifest("latest")))),
+            ("a/blobs/uploads/", Some(("a", Endpoint::Uploads))),
+            ("a/blobs/uploads", Some(("a", Endpoint::Uploads))),
+            ("a/blobs/uploads/7", Some(("a", Endpoint::Upload("7")))),
+            ("blobs/blobs/blobs/x", Some(("blobs/blobs", Endpoint::Blob("x")))),
+            ("a/tags/list", Some(("a", Endpoint::Tags))),
+            ("a/referrers/sha256:0", Some(("a", Endpoint::Referrers("sha256:0")))),
+            ("tags/list", None),
+            ("_catalog", None),
+            ("a", None),
+        ];
+        for (path, expected) in cases {
+            assert_eq!(endpoint(path), expected, "{path}");
+        }
+    }
+}

@@ -1,0 +1,127 @@
+//! What the registry has to understand of a manifest: its parts, what it refers to, and whether it is a task package.
+//! Whatever else it says is kept and not looked at.
+
+use std::collections::BTreeMap;
+
+use serde::Deserialize;
+use task_proto::Digest;
+use task_proto::oci::{INDEX_TYPE, ImageManifest, MANIFEST_TYPE, PACKAGE_TYPE};
+
+use super::OciError;
+
+const DOCKER_MANIFEST_TYPE: &str = "application/vnd.docker.distribution.manifest.v2+json";
+const DOCKER_LIST_TYPE: &str = "application/vnd.docker.distribution.manifest.list.v2+json";
+/// The most blobs and manifests one manifest is made of: each is looked up.
+const MAX_PARTS: usize = 4096;
+
+/// A manifest of any kind, as far as it is understood.
+#[derive(Debug)]
+pub(super) struct Parsed {
+    /// The content type it is served with.
+    pub(super) media_type: String,
+    /// What a list of referrers says it is.
+    pub(super) artifact_type: Option<String>,
+    /// What a list of referrers says of it.
+    pub(super) annotations: BTreeMap<String, String>,
+    /// The manifest it refers to.
+    pub(super) subject: Option<String>,
+    /// The blobs and manifests that must be in the repository.
+    pub(super) parts: Vec<Digest>,
+    /// The manifest in full, if it is meant to be a task package.
+    pub(super) package: Option<ImageManifest>,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Document {
+    media_type: Option<String>,
+    artifact_type: Option<String>,
+    config: Option<Part>,
+    layers: Option<Vec<Part>>,
+    manifests: Option<Vec<Part>>,
+    subject: Option<Part>,
+    annotations: Option<BTreeMap<String, String>>,
+}
+
+/// A descriptor. Its digest may be of any algorithm; only sha-256 can be here.
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Part {
+    media_type: String,
+    digest: String,
+}
+
+impl Part {
+    /// Layers that, by their type, stay where they were published.
+    fn is_elsewhere(&self) -> bool {
+        self.media_type.starts_with("application/vnd.oci.image.layer.nondistributable.")
+            || self.media_type == "application/vnd.docker.image.rootfs.foreign.diff.tar.gzip"
+    }
+}
+
+impl Parsed {
+    /// Reads a manifest that came with `content_type`.
+    pub(super) fn new(content_type: Option<&str>, bytes: &[u8]) -> Result<Self, OciError> {
+        let invalid = |error: serde_json::Error| OciError::manifest_invalid(format!("not a manifest: {error}"));
+        let document: Document = serde_json::from_slice(bytes).map_err(invalid)?;
+        let media_type = media_type(content_type, document.media_type.as_deref())?;
+        document.check_kind(&media_type)?;
+        let is_package = document.artifact_type.as_deref() == Some(PACKAGE_TYPE);
+        let package = is_package.then(|| serde_json::from_slice(bytes).map_err(invalid)).transpose()?;
+        let config_type = document.config.as_ref().map(|config| config.media_type.clone());
+        Ok(Self {
+            media_type,
+            parts: document.parts()?,
+            artifact_type: document.artifact_type.filter(|kind| !kind.is_empty()).or(config_type),
+            annotations: document.annotations.unwrap_or_default(),
+            subject: document.subject.map(|subject| subject.digest),
+            package,
+        })
+    }
+}
+
+impl Document {
+    /// A kind that is known has its parts; others are taken as they come.
+    fn check_kind(&self, media_type: &str) -> Result<(), OciError> {
+        let missing = match media_type {
+            MANIFEST_TYPE | DOCKER_MANIFEST_TYPE if self.config.is_none() => "config",
+            MANIFEST_TYPE | DOCKER_MANIFEST_TYPE if self.layers.is_none() => "layers",
+            INDEX_TYPE | DOCKER_LIST_TYPE if self.manifests.is_none() => "manifests",
+            _ => return Ok(()),
+        };
+        Err(OciError::manifest_invalid(format!("a manifest of type {media_type} needs {missing:?}")))
+    }
+
+    fn parts(&self) -> Result<Vec<Digest>, OciError> {
+        let lists = [&self.layers, &self.manifests].into_iter().flatten().flatten();
+        let needed = self.config.iter().chain(lists).filter(|part| !part.is_elsewhere());
+        let mut parts = Vec::new();
+        for part in needed {
+            let digest = part.digest.parse().map_err(|_| {
+                OciError::manifest_invalid(format!(
+                    "{:?} is not a sha256 digest; others are not supported",
+                    part.digest
+                ))
+            })?;
+            if parts.len() == MAX_PARTS {
+                return Err(OciError::manifest_invalid(format!("the manifest has more than {MAX_PARTS} parts")));
+            }
+            parts.push(digest);
+        }
+        parts.sort();
+        parts.dedup();
+        Ok(parts)
+    }
+}
+
+/// The manifest's type: what the header and the document say, which must be the same.
+fn media_type(header: Option<&str>, document: Option<&str>) -> Result<String, OciError> {
+    let header = header.and_then(|text| text.split(';').next()).map(str::trim).filter(|text| !text.is_empty());
+    match (header, document.filter(|text| !text.is_empty())) {
+        (Some(header), Some(document)) if header != document => Err(OciError::manifest_invalid(format!(
+            "the Content-Type is {header:?}, the manifest's mediaType {document:?}"
+        ))),
+        (Some(media_type), _) | (None, Some(media_type)) => Ok(media_type.to_owned()),
+        (None, None) => Ok(MANIFEST_TYPE.to_owned()),
+    }
+}

@@ -1,0 +1,181 @@
+//! Pushing blobs: in one request, in a POST and a PUT, in chunks, or by mounting what another repository has.
+
+use axum::body::Body;
+use axum::response::Response;
+use http::header::{CONTENT_LENGTH, CONTENT_RANGE};
+use http::request::Parts;
+use http::{HeaderMap, StatusCode};
+use serde::Deserialize;
+use task_proto::{Digest, RepositoryName};
+
+use super::blobs::decimal;
+use super::{Answer, OciError, Registry, empty, parse_digest, query};
+use crate::blobs::UploadId;
+
+#[derive(Deserialize)]
+#[serde(rename_all = "kebab-case")]
+struct BeginQuery {
+    digest: Option<String>,
+    digest_algorithm: Option<String>,
+    mount: Option<String>,
+    from: Option<String>,
+}
+
+#[derive(Deserialize)]
+struct FinishQuery {
+    digest: Option<String>,
+}
+
+/// `POST /v2/<name>/blobs/uploads/`: begins an upload, or does all of it if `digest` or `mount` is given.
+pub(super) async fn begin(registry: &Registry, repository: &RepositoryName, parts: &Parts, body: Body) -> Answer {
+    let query: BeginQuery = query(&parts.uri)?;
+    if query.digest_algorithm.is_some_and(|algorithm| algorithm != "sha256") {
+        return Err(OciError::digest_invalid("only sha256 is supported"));
+    }
+    if let Some(digest) = &query.mount {
+        let digest = parse_digest(digest)?;
+        if mount(registry, repository, digest, query.from.as_deref()).await? {
+            return created(repository, &digest);
+        }
+    } else if let Some(digest) = &query.digest {
+        let digest = parse_digest(digest)?;
+        check_length(registry, &parts.headers)?;
+        let id = registry.blobs.begin_upload(repository).await?;
+        let appended = registry.blobs.append(repository, &id, Some(0), body.into_data_stream()).await;
+        if let Err(error) = appended {
+            registry.blobs.cancel_upload(repository, &id).await?;
+            return Err(error.into());
+        }
+        return complete(registry, repository, &id, digest).await;
+    }
+    let id = registry.blobs.begin_upload(repository).await?;
+    accepted(StatusCode::ACCEPTED, repository, &id, 0)
+}
+
+/// `GET` of an upload: where it stands.
+pub(super) async fn status(registry: &Registry, repository: &RepositoryName, id: &UploadId) -> Answer {
+    let offset = registry.blobs.upload_offset(repository, id).await?;
+    accepted(StatusCode::NO_CONTENT, repository, id, offset)
+}
+
+/// `PATCH`: one more chunk; without a `Content-Range` it begins where the upload stands.
+pub(super) async fn append(
+    registry: &Registry,
+    repository: &RepositoryName,
+    id: &UploadId,
+    parts: &Parts,
+    body: Body,
+) -> Answer {
+    let offset = take_chunk(registry, repository, id, parts, body).await?;
+    accepted(StatusCode::ACCEPTED, repository, id, offset)
+}
+
+/// `PUT`: perhaps a last chunk, then the digest that everything must have.
+pub(super) async fn finish(
+    registry: &Registry,
+    repository: &RepositoryName,
+    id: &UploadId,
+    parts: &Parts,
+    body: Body,
+) -> Answer {
+    let FinishQuery { digest } = query(&parts.uri)?;
+    let digest = parse_digest(&digest.ok_or_else(|| OciError::digest_invalid("the digest parameter is missing"))?)?;
+    take_chunk(registry, repository, id, parts, body).await?;
+    complete(registry, repository, id, digest).await
+}
+
+/// `DELETE`: gives the upload up.
+pub(super) async fn cancel(registry: &Registry, repository: &RepositoryName, id: &UploadId) -> Answer {
+    registry.blobs.cancel_upload(repository, id).await?;
+    empty(StatusCode::NO_CONTENT, [])
+}
+
+async fn take_chunk(
+    registry: &Registry,
+    repository: &RepositoryName,
+    id: &UploadId,
+    parts: &Parts,
+    body: Body,
+) -> Result<u64, OciError> {
+    let range = content_range(parts)?;
+    check_length(registry, &parts.headers)?;
+    let start = range.as_ref().map(|range| range.start);
+    let offset = registry.blobs.append(repository, id, start, body.into_data_stream()).await?;
+    match range {
+        Some(range) if range.end != offset => Err(OciError::size_invalid(format!(
+            "the Content-Range ends before byte {}, the body before byte {offset}",
+            range.end
+        ))),
+        _ => Ok(offset),
+    }
+}
+
+/// Makes the upload a blob of the repository, in one go as the collector sees it.
+async fn complete(registry: &Registry, repository: &RepositoryName, id: &UploadId, digest: Digest) -> Answer {
+    let _hold = registry.blobs.hold_collection().await;
+    registry.blobs.finish_upload(repository, id, digest).await?;
+    registry.blobs.touch(digest, registry.clock.now_ms()).await?;
+    registry.store.link_blob(repository, &digest).await?;
+    created(repository, &digest)
+}
+
+/// Makes a blob of `from` (of any repository, if absent) one of this repository; false if it is not there.
+async fn mount(
+    registry: &Registry,
+    repository: &RepositoryName,
+    digest: Digest,
+    from: Option<&str>,
+) -> Result<bool, OciError> {
+    let from = from.map(str::parse::<RepositoryName>).transpose().map_err(|error| OciError::name_invalid(&error))?;
+    let _hold = registry.blobs.hold_collection().await;
+    let is_there = registry.store.has_blob(from.as_ref(), &digest).await?
+        && registry.blobs.touch(digest, registry.clock.now_ms()).await?;
+    if is_there {
+        registry.store.link_blob(repository, &digest).await?;
+    }
+    Ok(is_there)
+}
+
+/// Refuses what is announced as too large before any of it is read.
+fn check_length(registry: &Registry, headers: &HeaderMap) -> Result<(), OciError> {
+    let max = registry.blobs.settings().max_blob_bytes;
+    match announced_length(headers) {
+        Some(length) if length > max => Err(crate::blobs::BlobError::TooLarge { max }.into()),
+        _ => Ok(()),
+    }
+}
+
+fn announced_length(headers: &HeaderMap) -> Option<u64> {
+    headers.get(CONTENT_LENGTH).and_then(|value| value.to_str().ok()).and_then(decimal)
+}
+
+/// `Content-Range` as the specification has it: `first-last`, both inclusive.
+fn content_range(parts: &Parts) -> Result<Option<std::ops::Range<u64>>, OciError> {
+    let Some(value) = parts.headers.get(CONTENT_RANGE) else { return Ok(None) };
+    let range = value.to_str().ok().and_then(|text| text.split_once('-')).and_then(|(first, last)| {
+        let (first, last) = (decimal(first)?, decimal(last)?);
+        (first <= last && last < u64::MAX).then_some(first..last + 1)
+    });
+    let range = range.ok_or_else(|| OciError::upload_invalid("the Content-Range is not of the form 0-1023"))?;
+    match announced_length(&parts.headers) {
+        Some(length) if length != range.end - range.start => {
+            Err(OciError::size_invalid("the Content-Length does not fit the Content-Range"))
+        }
+        _ => Ok(Some(range)),
+    }
+}
+
+fn accepted(status: StatusCode, repository: &RepositoryName, id: &UploadId, offset: u64) -> Answer {
+    let headers: [(&str, String); 3] = [
+        ("location", format!("/v2/{repository}/blobs/uploads/{}", id.as_str())),
+        // An upload without a byte can't be told from one with a single byte: the specification has no word for it.
+        ("range", format!("0-{}", offset.saturating_sub(1))),
+        ("docker-upload-uuid", id.as_str().to_owned()),
+    ];
+    empty(status, headers)
+}
+
+fn created(repository: &RepositoryName, digest: &Digest) -> Result<Response, OciError> {
+    let location = format!("/v2/{repository}/blobs/{digest}");
+    empty(StatusCode::CREATED, [("location", location), ("docker-content-digest", digest.to_string())])
+}

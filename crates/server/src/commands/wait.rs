@@ -132,3 +132,93 @@ fn names(assignments: &[&AssignmentView]) -> String {
     }
     names.join(", ")
 }
+
+#[cfg(test)]
+mod tests {
+    use task_proto::report::{Failure, FailureCode, Phase};
+    use task_proto::{Digest, RobotId};
+
+    use super::*;
+
+    fn assignment(name: &str, phase: Phase, online: bool) -> AssignmentView {
+        AssignmentView {
+            robot: RobotId::random(),
+            name: name.parse().unwrap(),
+            online,
+            released: true,
+            phase,
+            progress: None,
+            failure: (phase == Phase::Failed).then(|| Failure::new(FailureCode::BUILD_FAILED, "colcon said no")),
+            attempts: 1,
+            superseded_by: None,
+            updated_at_ms: 0,
+        }
+    }
+
+    fn deployment(state: DeploymentState, assignments: Vec<AssignmentView>) -> DeploymentView {
+        let blob = serde_json::json!({ "digest": Digest::of(b""), "size": 0 });
+        let package = serde_json::json!({
+            "name": "talker", "version": "1", "manifest": blob, "config": blob, "content": blob,
+        });
+        DeploymentView {
+            id: DeploymentId::random(),
+            package: serde_json::from_value(package).unwrap(),
+            kind: task_proto::manifest::TaskKind::Service,
+            selector: "*".parse().unwrap(),
+            delivery: task_proto::desired::Delivery::PushPull,
+            state,
+            batch: None,
+            max_failures: None,
+            created_at_ms: 0,
+            expires_at_ms: 0,
+            counts: Vec::new(),
+            supersedes: Vec::new(),
+            assignments: Some(assignments),
+        }
+    }
+
+    fn outcome(state: DeploymentState, phases: &[Phase]) -> Outcome {
+        judge(&deployment(state, phases.iter().map(|phase| assignment("a", *phase, true)).collect())).outcome
+    }
+
+    #[test]
+    fn the_outcome_is_that_of_all_robots() {
+        use DeploymentState::{Active, Cancelled, Settled};
+        use Phase::{Failed, Fetching, Running, Stopped};
+        assert_eq!(outcome(Settled, &[Running, Running]), Outcome::Succeeded);
+        assert_eq!(outcome(Settled, &[Running, Failed]), Outcome::SomeFailed);
+        assert_eq!(outcome(Settled, &[Failed, Stopped]), Outcome::Failed);
+        assert_eq!(outcome(Active, &[Running, Fetching]), Outcome::TimedOut);
+        assert_eq!(outcome(Cancelled, &[Phase::Cancelled]), Outcome::Failed);
+    }
+
+    #[test]
+    fn reasons_are_given_and_offline_robots_listed_apart() {
+        let view = deployment(
+            DeploymentState::Active,
+            vec![
+                assignment("good", Phase::Running, true),
+                assignment("bad", Phase::Failed, true),
+                assignment("slow", Phase::Building, true),
+                assignment("away", Phase::Assigned, false),
+            ],
+        );
+        assert!(!is_over(&view));
+        assert_eq!(
+            judge(&view).text,
+            "1 of 4 succeeded\nbad: failed (build_failed: colcon said no)\nslow: not done in time, still building\n\
+             offline, and following when back: away"
+        );
+    }
+
+    #[test]
+    fn a_paused_deployment_is_over_when_what_began_has_settled() {
+        let mut waiting = assignment("later", Phase::Assigned, true);
+        waiting.released = false;
+        let view = deployment(DeploymentState::Paused, vec![assignment("bad", Phase::Failed, true), waiting]);
+        assert!(is_over(&view));
+        let verdict = judge(&view);
+        assert_eq!(verdict.outcome, Outcome::Failed);
+        assert!(verdict.text.contains("not begun: later; go on with `taskd deploy resume"), "{}", verdict.text);
+    }
+}

@@ -111,8 +111,12 @@ impl Section<'_> {
     }
 
     fn parameters(&mut self, nodes: &mut BTreeMap<String, BTreeMap<String, serde_json::Value>>) {
-        let mut tables = toml::Table::new();
-        self.take("parameters", &mut tables);
+        self.known.push("parameters");
+        let tables = match self.table.remove("parameters") {
+            None => return,
+            Some(toml::Value::Table(tables)) => tables,
+            Some(other) => return self.problem("parameters", format!("expected a table (it is {})", brief(&other))),
+        };
         for (node, value) in tables {
             let toml::Value::Table(parameters) = value else {
                 self.problem(
@@ -283,6 +287,6 @@ mod tests {
             "[parameters]\nx = 1\n[parameters.\"/n\"]\na = nan\nb = [1, 2.0]\nc = { d = 1 }\ne = 2020-01-01\n",
         );
         assert_eq!(found.len(), 5, "{found:#?}");
-        assert!(found[1].contains("\"/n\" a: must be a finite number"), "{found:#?}");
+        assert!(found[0].contains("\"/n\" a: must be a finite number"), "{found:#?}");
     }
 }

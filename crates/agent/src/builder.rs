@@ -21,8 +21,8 @@ use crate::script;
 
 /// How long the processes of a build may take to be gone.
 const KILL_TIMEOUT: Duration = Duration::from_secs(10);
-/// The end of the output that goes into a failure's text.
-const TAIL_BYTES: usize = 2048;
+/// The end of the output that goes into a failure's text, which a report cuts at 4096 characters.
+const TAIL_BYTES: usize = 3500;
 
 /// What to build, and with what.
 #[derive(Debug, Clone)]

@@ -3,5 +3,8 @@
 #![expect(clippy::unwrap_used, reason = "a helper that cannot go on ends its test")]
 
 mod archive;
+mod build;
 mod fetch;
+mod harness;
+mod supervise;
 mod unpack;

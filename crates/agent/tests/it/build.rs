@@ -1,0 +1,238 @@
+//! Packages are built: by the real colcon where that matters, by stand-ins where it is about limits.
+
+use std::collections::BTreeMap;
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use task_agent::builder::{self, BuildError, BuildLimits, BuildOrder};
+use task_agent::layout::DataDir;
+use task_agent::run_dir::{ExitStatus, LogSpec, RunSpec};
+use task_agent::supervisor::Observed;
+use task_agent::underlay::{SYSTEM_ROOT, Underlays};
+use task_agent::{environment, process, script};
+use task_proto::Digest;
+use task_proto::manifest::{BuildTool, TaskManifest};
+use task_proto::report::FailureCode;
+use tokio_util::sync::CancellationToken;
+
+use crate::harness::{eventually, supervisor, within, write};
+
+/// A version directory with an order to build it.
+struct TestBuild {
+    dir: tempfile::TempDir,
+    order: BuildOrder,
+}
+
+impl TestBuild {
+    fn new(underlays: Vec<PathBuf>) -> Self {
+        let dir = tempfile::tempdir().expect("temp dir");
+        let data = DataDir::new(dir.path()).expect("data dir");
+        let version = data.task(&"talker".parse().expect("name")).version(&Digest::of(b"manifest"));
+        std::fs::create_dir_all(version.src()).expect("src");
+        let order = BuildOrder {
+            tool: BuildTool::Colcon,
+            version,
+            underlays,
+            environment: environment::of_this_robot(&BTreeMap::new()),
+            log: dir.path().join("build.log"),
+            limits: BuildLimits::of_this_machine(),
+        };
+        Self { dir, order }
+    }
+
+    /// A build whose colcon is this script, among the system's other tools.
+    fn with_colcon(script: &str) -> Self {
+        let mut build = Self::new(Vec::new());
+        let bin = build.dir.path().join("bin");
+        write(&bin.join("colcon"), &format!("#!/bin/bash\n{script}\n"));
+        std::fs::set_permissions(bin.join("colcon"), std::fs::Permissions::from_mode(0o755)).expect("executable");
+        build.order.environment.insert("PATH".to_owned(), format!("{}:/usr/bin:/bin", bin.display()));
+        build
+    }
+
+    async fn run(&self) -> Result<(), BuildError> {
+        within("the build", builder::build(&self.order, &CancellationToken::new())).await
+    }
+
+    fn log(&self) -> String {
+        std::fs::read_to_string(&self.order.log).unwrap_or_default()
+    }
+
+    fn src(&self, name: &str) -> PathBuf {
+        self.order.version.src().join(name)
+    }
+
+    /// The processes that were started for this build.
+    fn processes(&self) -> usize {
+        let marker = format!("TASKD_RUN_DIR={}", self.order.version.root().display());
+        let table = process::ProcessEntry::all().expect("process table");
+        table.iter().filter(|entry| !entry.is_zombie && entry.was_started_with(&marker)).count()
+    }
+}
+
+/// The real ROS that the tests run on.
+fn ros() -> PathBuf {
+    let root = std::env::var_os("TASKD_TEST_ROS").map(PathBuf::from);
+    root.expect(
+        "TASKD_TEST_ROS names no virtual environment with ROS 2 and colcon: run ./scripts/test, which makes one",
+    )
+    .join("bin/activate")
+}
+
+fn write_ament_package(build: &TestBuild) {
+    write(
+        &build.src("package.xml"),
+        r#"<?xml version="1.0"?>
+<package format="3">
+  <name>talker</name><version>1.0.0</version><description>says hello</description>
+  <maintainer email="robots@example.com">Robots</maintainer><license>Apache-2.0</license>
+  <exec_depend>rclpy</exec_depend>
+  <export><build_type>ament_python</build_type></export>
+</package>
+"#,
+    );
+    write(
+        &build.src("setup.py"),
+        r#"from setuptools import setup
+setup(name="talker", version="1.0.0", packages=["talker"],
+      data_files=[("share/ament_index/resource_index/packages", ["resource/talker"]), ("share/talker", ["package.xml"])],
+      install_requires=["setuptools"], entry_points={"console_scripts": ["talker = talker.node:main"]})
+"#,
+    );
+    write(
+        &build.src("setup.cfg"),
+        "[develop]\nscript_dir=$base/lib/talker\n[install]\ninstall_scripts=$base/lib/talker\n",
+    );
+    write(&build.src("resource/talker"), "");
+    write(&build.src("talker/__init__.py"), "");
+    write(
+        &build.src("talker/node.py"),
+        r#"import os, sys
+import rclpy
+def main():
+    rclpy.init()
+    node = rclpy.create_node("talker")
+    print("hello from", node.get_fully_qualified_name(), sys.argv[1:], os.environ["ROS_DOMAIN_ID"], flush=True)
+    node.destroy_node()
+    rclpy.shutdown()
+"#,
+    );
+}
+
+#[tokio::test]
+async fn a_real_ros_package_is_built_and_runs_under_its_shim() {
+    let underlays = Underlays::find(&[ros()], Path::new(SYSTEM_ROOT));
+    let mut build = TestBuild::new(underlays.for_task(&["kilted".to_owned()]).expect("kilted is there"));
+    build.order.environment.insert("ROS_DOMAIN_ID".to_owned(), "47".to_owned());
+    write_ament_package(&build);
+    build.run().await.unwrap_or_else(|error| panic!("{error}: {}", build.log()));
+    // An interrupted build is done again.
+    build.run().await.expect("built again");
+
+    let manifest: TaskManifest = serde_json::from_value(serde_json::json!({
+        "name": "talker", "version": "1.0.0", "build": {"tool": "colcon"},
+        "run": {"exec": ["install/talker/lib/talker/talker", "it's", "$HOME"], "kind": "job"},
+        "content": {"tar_digest": Digest::of(b""), "tar_size": 0, "entries": 0},
+    }))
+    .expect("manifest");
+    let version = &build.order.version;
+    std::fs::write(version.run_script(), script::run_script(&manifest, version, &build.order.underlays))
+        .expect("script");
+    let run_dir = build.dir.path().join("run");
+    let spec = RunSpec {
+        assignment: task_proto::DeploymentId::random(),
+        script: version.run_script(),
+        directory: script::run_directory(BuildTool::Colcon, version),
+        environment: build.order.environment.clone(),
+        log: LogSpec::at(build.dir.path().join("task.log")),
+    };
+    supervisor().start(&run_dir, &spec).await.expect("started");
+    let ended = within("the node", supervisor().wait(&run_dir)).await.expect("observed");
+    let log = std::fs::read_to_string(&spec.log.path).unwrap_or_default();
+    assert_eq!(ended, Observed::Exited(ExitStatus::Code(0)), "{log}");
+    assert!(log.contains(r#"hello from /talker ["it's", '$HOME'] 47"#), "{log}");
+}
+
+#[tokio::test]
+async fn a_package_that_does_not_build_fails_with_the_tools_own_words() {
+    let build = TestBuild::new(vec![ros()]);
+    write_ament_package(&build);
+    write(&build.src("setup.py"), "raise RuntimeError('the gearbox is missing')\n");
+    let error = build.run().await.expect_err("failed");
+    assert_eq!(error.code(), Some(FailureCode::BUILD_FAILED));
+    assert!(error.to_string().contains("the gearbox is missing"), "{error}");
+}
+
+#[tokio::test]
+async fn a_package_that_colcon_passes_over_is_no_success() {
+    let build = TestBuild::new(vec![ros()]);
+    write(&build.src("readme.txt"), "no package here");
+    let error = build.run().await.expect_err("failed");
+    assert!(matches!(&error, BuildError::NotInstalled { missing, .. } if missing.contains("package.xml")), "{error}");
+}
+
+#[tokio::test]
+async fn a_missing_tool_and_a_missing_underlay_are_named() {
+    let mut build = TestBuild::new(Vec::new());
+    build.order.environment.insert("PATH".to_owned(), "/nonexistent".to_owned());
+    for (tool, name) in [(BuildTool::Colcon, "colcon"), (BuildTool::Catkin, "catkin_make")] {
+        // The system's own directories come first for catkin, which may really be there.
+        if name == "catkin_make" && Path::new("/usr/bin/catkin_make").exists() {
+            continue;
+        }
+        build.order.tool = tool;
+        let error = build.run().await.expect_err("failed").to_string();
+        assert!(error.contains(&format!("{name} is not installed")), "{error}");
+    }
+    build.order.underlays = vec!["/nonexistent/setup.bash".into()];
+    let error = build.run().await.expect_err("failed").to_string();
+    assert!(error.contains("the underlay /nonexistent/setup.bash is not there"), "{error}");
+}
+
+#[tokio::test]
+async fn a_build_is_nice_and_limited() {
+    let mut build = TestBuild::with_colcon("echo nice $(nice), memory $(ulimit -v); mkdir -p install/talker; exit 0");
+    build.order.limits.memory_bytes = Some(1 << 30);
+    build.run().await.expect("built");
+    assert!(build.log().contains("nice 10, memory 1048576"), "{}", build.log());
+    let big = TestBuild::with_colcon("tail /dev/zero");
+    let mut limited = big.order.clone();
+    limited.limits.memory_bytes = Some(100 << 20);
+    let error = within("the build", builder::build(&limited, &CancellationToken::new())).await.expect_err("failed");
+    assert!(error.to_string().contains("memory exhausted"), "{error}");
+}
+
+const ENDLESS: &str = "trap '' INT TERM; (setsid sleep 1000 &); echo compiling; sleep 1000; sleep 1000";
+
+#[tokio::test]
+async fn a_cancelled_build_ends_with_everything_it_started() {
+    let build = TestBuild::with_colcon(ENDLESS);
+    let cancel = CancellationToken::new();
+    let cancelling = async {
+        eventually("the build's start", || build.log().contains("compiling").then_some(())).await;
+        cancel.cancel();
+    };
+    let building = futures_util::future::join(builder::build(&build.order, &cancel), cancelling);
+    let (built, ()) = within("the cancelled build", building).await;
+    assert!(matches!(built, Err(BuildError::Cancelled)), "{built:?}");
+    assert_eq!(build.processes(), 0);
+}
+
+#[tokio::test]
+async fn a_build_that_is_dropped_or_takes_too_long_leaves_nothing() {
+    let mut build = TestBuild::with_colcon(ENDLESS);
+    {
+        let cancel = CancellationToken::new();
+        let mut building = std::pin::pin!(builder::build(&build.order, &cancel));
+        tokio::select! {
+            built = &mut building => panic!("{built:?}"),
+            () = eventually("the build's start", || build.log().contains("compiling").then_some(())) => {}
+        }
+    }
+    eventually("the end of the dropped build", || (build.processes() == 0).then_some(())).await;
+    build.order.limits.timeout = Duration::from_millis(200);
+    let error = build.run().await.expect_err("failed");
+    assert_eq!(error.code(), Some(FailureCode::DEADLINE_EXCEEDED));
+    assert_eq!(build.processes(), 0);
+}

@@ -1,0 +1,239 @@
+//! Tasks under the real shim: they outlive whoever started them, are found again, and end without a trace.
+
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use nix::sys::signal::{SigHandler, Signal};
+use nix::unistd::Pid;
+use task_agent::process::ProcessIdentity;
+use task_agent::run_dir::{ExitStatus, RunDir, RunSpec, Started};
+use task_agent::supervisor::{Observed, SupervisorError};
+
+use crate::harness::{TestRun, eventually, lives, supervisor, within};
+
+const SHORT_GRACE: Duration = Duration::from_millis(300);
+const LONG_GRACE: Duration = Duration::from_secs(50);
+
+async fn run_to_end(script: &str) -> (TestRun, Observed) {
+    let run = TestRun::of(script);
+    within("the start", run.supervisor.start(&run.run_dir(), &run.spec)).await.expect("started");
+    let ended = within("the end", run.supervisor.wait(&run.run_dir())).await.expect("observed");
+    (run, ended)
+}
+
+#[tokio::test]
+async fn the_exit_code_and_the_signal_are_kept() {
+    assert_eq!(run_to_end("exit 0").await.1, Observed::Exited(ExitStatus::Code(0)));
+    assert_eq!(run_to_end("exit 7").await.1, Observed::Exited(ExitStatus::Code(7)));
+    assert_eq!(run_to_end("kill -SEGV $$").await.1, Observed::Exited(ExitStatus::Signal(11)));
+    let (run, _) = run_to_end("exit 3").await;
+    let text = std::fs::read_to_string(run.run_dir().join("exit.json")).expect("exit file");
+    assert!(text.starts_with(r#"{"code":3,"at_uptime_ms":"#), "{text}");
+    assert_eq!(supervisor().observe(&run.run_dir()).await.expect("observed"), Observed::Exited(ExitStatus::Code(3)));
+}
+
+#[tokio::test]
+async fn a_task_gets_the_environment_it_was_promised_and_nothing_else() {
+    let (run, _) = run_to_end("env; echo descriptors $(ls /proc/self/fd); cat; echo stdin is empty").await;
+    let log = run.log();
+    let names: Vec<_> = log.lines().filter_map(|line| Some(line.split_once('=')?.0)).collect();
+    let expected = [
+        "HOME",
+        "LANG",
+        "LOGNAME",
+        "PATH",
+        "PWD",
+        "PYTHONUNBUFFERED",
+        "SHLVL",
+        "TASKD_ASSIGNMENT",
+        "TASKD_RUN_DIR",
+        "TZ",
+        "USER",
+        "_",
+    ];
+    assert!(names.iter().all(|name| expected.contains(name)), "{names:?}");
+    assert!(log.contains(&format!("TASKD_ASSIGNMENT={}", run.spec.assignment)));
+    // 3 is ls's own, on the directory it lists.
+    assert!(log.contains("descriptors 0 1 2 3\n"), "{log}");
+    assert!(log.contains("stdin is empty"));
+}
+
+#[tokio::test]
+async fn a_start_that_cannot_be_says_why_and_leaves_nothing() {
+    let mut run = TestRun::of("true");
+    run.spec.directory = PathBuf::from("/nonexistent/place");
+    let error = run.supervisor.start(&run.run_dir(), &run.spec).await.expect_err("refused").to_string();
+    assert!(error.contains("/nonexistent/place") && error.contains("No such file"), "{error}");
+    assert_eq!(run.supervisor.observe(&run.run_dir()).await.expect("observed"), Observed::NeverStarted);
+    let never = run.supervisor.stop(&run.path("never"), SHORT_GRACE).await.expect("stopped");
+    assert_eq!(never, Observed::NeverStarted);
+}
+
+#[tokio::test]
+async fn a_run_is_started_once_however_often_it_is_asked_for() {
+    let run = TestRun::of("echo up; sleep 1000");
+    let dir = run.run_dir();
+    let starts = (0..8).map(|_| run.supervisor.start(&dir, &run.spec));
+    let started = within("all starts", futures_util::future::join_all(starts)).await;
+    let pids: Vec<_> = started.into_iter().map(|started| started.expect("started").task.pid).collect();
+    assert!(pids.iter().all(|pid| *pid == pids[0]), "{pids:?}");
+    assert!(lives(pids[0]));
+    within("the stop", run.supervisor.stop(&dir, LONG_GRACE)).await.expect("stopped");
+    let again = run.supervisor.start(&dir, &run.spec).await;
+    assert!(matches!(again, Err(SupervisorError::Used(_))), "{again:?}");
+}
+
+/// Not a test of its own: it is the agent that the next test runs as a process and kills.
+#[tokio::test]
+async fn starter() {
+    let Some(dir) = std::env::var_os("STARTER_DIR").map(PathBuf::from) else { return };
+    let spec: RunSpec = serde_json::from_slice(&std::fs::read(dir.join("order.json")).expect("order")).expect("spec");
+    // What a shell's `&` does to everything it starts.
+    // SAFETY: ignoring a signal installs no handler.
+    unsafe { nix::sys::signal::signal(Signal::SIGINT, SigHandler::SigIgn) }.expect("ignored");
+    supervisor().start(&dir.join("run"), &spec).await.expect("started");
+    std::fs::write(dir.join("started"), "").expect("said so");
+    std::future::pending::<()>().await;
+}
+
+#[expect(clippy::disallowed_methods, reason = "the test needs a process it can kill in the place of the agent")]
+fn spawn_starter(dir: &Path) -> std::process::Child {
+    let mut command = std::process::Command::new(std::env::current_exe().expect("own path"));
+    command.args(["--exact", "supervise::starter"]).env("STARTER_DIR", dir).process_group(0);
+    command.stdout(std::process::Stdio::null()).stderr(std::process::Stdio::null()).spawn().expect("spawned")
+}
+
+#[tokio::test]
+async fn a_task_outlives_the_agent_and_is_adopted() {
+    let run = TestRun::of("trap 'echo asked; exit 4' INT; echo up; while :; do sleep 1000 & wait $!; done");
+    std::fs::write(run.path("order.json"), serde_json::to_vec(&run.spec).expect("json")).expect("order");
+    let mut starter = spawn_starter(&run.path("."));
+    eventually("the start", || run.path("started").exists().then_some(())).await;
+    run.wrote("up").await;
+    let group = Pid::from_raw(i32::try_from(starter.id()).expect("pid"));
+    nix::sys::signal::killpg(group, Signal::SIGKILL).expect("killed");
+    starter.wait().expect("collected");
+
+    let recorded = RunDir::create(&run.run_dir()).expect("dir").started().expect("read").expect("started");
+    let observed = run.supervisor.observe(&run.run_dir()).await.expect("observed");
+    assert!(matches!(observed, Observed::Running { pid, .. } if pid == recorded.task.pid), "{observed:?}");
+    // It was started by a process that ignored SIGINT; a trap on it works only where that was not inherited.
+    let (waited, stopped) = within(
+        "the stop",
+        futures_util::future::join(
+            run.supervisor.wait(&run.run_dir()),
+            run.supervisor.stop(&run.run_dir(), LONG_GRACE),
+        ),
+    )
+    .await;
+    assert_eq!(waited.expect("waited"), Observed::Exited(ExitStatus::Code(4)));
+    assert_eq!(stopped.expect("stopped"), Observed::Exited(ExitStatus::Code(4)));
+    assert_eq!(run.survivors(), Vec::<u32>::new());
+}
+
+/// Ignores what can be ignored, and has children in sessions of their own, one of them without its environment.
+const STUBBORN: &str = r#"
+trap '' INT TERM HUP
+stubborn='trap "" INT TERM HUP; echo $$ >> pids; while :; do sleep 1000; done'
+setsid bash -c "$stubborn" &
+(setsid env -i PATH="$PATH" bash -c "$stubborn" &)
+(setsid bash -c "setsid bash -c '$stubborn' & exit" &)
+echo $$ >> pids
+while :; do sleep 1000; done
+"#;
+
+async fn start_stubborn() -> (TestRun, Started, Vec<u32>) {
+    let run = TestRun::of(STUBBORN);
+    let started = within("the start", run.supervisor.start(&run.run_dir(), &run.spec)).await.expect("started");
+    let pids = eventually("four stubborn processes", || {
+        let text = std::fs::read_to_string(run.path("pids")).ok()?;
+        let pids: Vec<u32> = text.lines().map(|line| line.parse().ok()).collect::<Option<_>>()?;
+        (pids.len() == 4).then_some(pids)
+    })
+    .await;
+    (run, started, pids)
+}
+
+#[tokio::test]
+async fn a_stubborn_task_and_its_daemons_are_ended() {
+    let (run, _, pids) = start_stubborn().await;
+    let stopped = within("the stop", run.supervisor.stop(&run.run_dir(), SHORT_GRACE)).await.expect("stopped");
+    assert_eq!(stopped, Observed::Exited(ExitStatus::Signal(9)));
+    assert_eq!(run.survivors(), Vec::<u32>::new());
+    assert_eq!(pids.into_iter().filter(|pid| lives(*pid)).collect::<Vec<_>>(), Vec::<u32>::new());
+    let again = within("the second stop", run.supervisor.stop(&run.run_dir(), SHORT_GRACE)).await.expect("stopped");
+    assert_eq!(again, stopped);
+}
+
+#[tokio::test]
+async fn a_stop_that_is_dropped_can_be_asked_for_again() {
+    let (run, _, _) = start_stubborn().await;
+    let dropped =
+        tokio::time::timeout(Duration::from_millis(50), run.supervisor.stop(&run.run_dir(), LONG_GRACE)).await;
+    assert!(dropped.is_err());
+    within("the second stop", run.supervisor.stop(&run.run_dir(), SHORT_GRACE)).await.expect("stopped");
+    assert_eq!(run.survivors(), Vec::<u32>::new());
+}
+
+#[tokio::test]
+async fn a_task_that_ends_takes_its_daemons_with_it() {
+    let (run, ended) =
+        run_to_end("setsid sleep 1000 & setsid bash -c 'trap \"\" TERM; sleep 1000' & echo $!; exit 5").await;
+    assert_eq!(ended, Observed::Exited(ExitStatus::Code(5)));
+    assert_eq!(run.survivors(), Vec::<u32>::new());
+}
+
+#[tokio::test]
+async fn without_its_shim_a_task_is_ended_and_gone() {
+    let (run, started, _) = start_stubborn().await;
+    let dir = run.run_dir();
+    let kill = async { started.shim.signal(Signal::SIGKILL).expect("killed") };
+    let (observed, ()) = within("the notice", futures_util::future::join(run.supervisor.wait(&dir), kill)).await;
+    assert_eq!(observed.expect("observed"), Observed::Gone);
+    assert!(!started.task.is_alive());
+    assert_eq!(run.survivors(), Vec::<u32>::new());
+    assert_eq!(run.supervisor.stop(&run.run_dir(), SHORT_GRACE).await.expect("stopped"), Observed::Gone);
+}
+
+#[tokio::test]
+async fn a_pid_that_was_used_again_is_not_mistaken() {
+    let run = TestRun::of("true");
+    let dir = RunDir::create(&run.run_dir()).expect("dir");
+    dir.write_spec(&run.spec).expect("spec");
+    let own = ProcessIdentity::of(std::process::id()).expect("stat").expect("alive");
+    for imposter in [
+        ProcessIdentity { start_ticks: own.start_ticks + 1, ..own.clone() },
+        ProcessIdentity { boot_id: "0f5e1f2a-an-earlier-boot".to_owned(), ..own },
+    ] {
+        dir.write_started(&Started { shim: imposter.clone(), task: imposter }).expect("pid file");
+        // A stop would end this very process if it went by the pid.
+        assert_eq!(run.supervisor.stop(&run.run_dir(), SHORT_GRACE).await.expect("stopped"), Observed::Gone);
+    }
+}
+
+#[tokio::test]
+async fn a_flood_of_output_neither_blocks_the_task_nor_fills_the_disk() {
+    let mut run = TestRun::of("yes 'a line of output' | head -c 20000000; echo the end");
+    run.spec.log.max_bytes = 100_000;
+    run.spec.log.files = 3;
+    within("the start", run.supervisor.start(&run.run_dir(), &run.spec)).await.expect("started");
+    let ended = within("the end", run.supervisor.wait(&run.run_dir())).await.expect("observed");
+    assert_eq!(ended, Observed::Exited(ExitStatus::Code(0)));
+    let sizes: Vec<u64> = ["task.log", "task.log.1", "task.log.2", "task.log.3"]
+        .iter()
+        .filter_map(|name| Some(std::fs::metadata(run.path(name)).ok()?.len()))
+        .collect();
+    assert_eq!(sizes.len(), 3);
+    assert!(sizes.iter().all(|size| *size <= 100_000), "{sizes:?}");
+    assert!(run.log().ends_with("the end\n"));
+}
+
+#[tokio::test]
+async fn a_log_that_cannot_be_written_does_not_stop_the_task() {
+    let mut run = TestRun::of("yes | head -c 1000000; exit 6");
+    run.spec.log.path = PathBuf::from("/nonexistent/task.log");
+    within("the start", run.supervisor.start(&run.run_dir(), &run.spec)).await.expect("started");
+    let ended = within("the end", run.supervisor.wait(&run.run_dir())).await.expect("observed");
+    assert_eq!(ended, Observed::Exited(ExitStatus::Code(6)));
+}

@@ -52,6 +52,15 @@ pub struct BuildLimits {
     pub log_bytes: u64,
 }
 
+/// What a build said: all that was kept is in a file, its end is here.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Output {
+    /// The file.
+    pub log: PathBuf,
+    /// The end of it.
+    pub tail: String,
+}
+
 /// Why there is no build.
 #[derive(Debug, thiserror::Error)]
 pub enum BuildError {
@@ -59,28 +68,28 @@ pub enum BuildError {
     #[error("the build was cancelled")]
     Cancelled,
     /// It took too long.
-    #[error("the build did not end within {} s; its last output:\n{tail}", timeout.as_secs())]
+    #[error("the build did not end within {} s; {output}", timeout.as_secs())]
     TimedOut {
         /// The time it had.
         timeout: Duration,
-        /// The end of its output.
-        tail: String,
+        /// What it said.
+        output: Output,
     },
     /// The build tool failed, or is not there.
-    #[error("the build {status}; its last output:\n{tail}")]
+    #[error("the build {status}; {output}")]
     Failed {
         /// How it ended.
         status: ExitStatus,
-        /// The end of its output.
-        tail: String,
+        /// What it said.
+        output: Output,
     },
     /// The build tool was content, but the package is not there.
-    #[error("the build tool succeeded without installing {missing}; its last output:\n{tail}")]
+    #[error("the build tool succeeded without installing {missing}; {output}")]
     NotInstalled {
         /// What should be there.
         missing: String,
-        /// The end of its output.
-        tail: String,
+        /// What it said.
+        output: Output,
     },
     /// Processes of the build could not be ended.
     #[error(transparent)]
@@ -116,6 +125,12 @@ impl BuildLimits {
     }
 }
 
+impl std::fmt::Display for Output {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "the end of {}:\n{}", self.log.display(), self.tail)
+    }
+}
+
 /// Ends a build whose future was dropped: whatever the reason, none goes on unwatched.
 struct KillOnDrop(Containment);
 
@@ -135,16 +150,16 @@ pub async fn build(order: &BuildOrder, cancel: &CancellationToken) -> Result<(),
     // An agent that was killed leaves its build running.
     guard.0.end(KILL_TIMEOUT).await?;
     prepare(order, &text)?;
-    let (status, output) = run(order, &guard.0, cancel).await?;
-    let tail = String::from_utf8_lossy(&output).trim().to_owned();
+    let (status, tail) = run(order, &guard.0, cancel).await?;
+    let output = Output { log: order.log.clone(), tail: String::from_utf8_lossy(&tail).trim().to_owned() };
     match status {
         Some(ExitStatus::Code(0)) => {}
-        Some(status) => return Err(BuildError::Failed { status, tail }),
+        Some(status) => return Err(BuildError::Failed { status, output }),
         None if cancel.is_cancelled() => return Err(BuildError::Cancelled),
-        None => return Err(BuildError::TimedOut { timeout: order.limits.timeout, tail }),
+        None => return Err(BuildError::TimedOut { timeout: order.limits.timeout, output }),
     }
     if let Some(missing) = missing_package(&order.version) {
-        return Err(BuildError::NotInstalled { missing, tail });
+        return Err(BuildError::NotInstalled { missing, output });
     }
     let synced = root.to_owned();
     let syncing = tokio::task::spawn_blocking(move || durable::sync_file_system(&synced));

@@ -158,10 +158,10 @@ async fn a_real_ros_package_is_built_and_runs_under_its_shim() {
 async fn a_package_that_does_not_build_fails_with_the_tools_own_words() {
     let build = TestBuild::new(vec![ros()]);
     write_ament_package(&build);
-    write(&build.src("setup.py"), "raise RuntimeError('the gearbox is missing')\n");
+    std::fs::remove_file(build.src("resource/talker")).expect("removed");
     let error = build.run().await.expect_err("failed");
     assert_eq!(error.code(), Some(FailureCode::BUILD_FAILED));
-    assert!(error.to_string().contains("the gearbox is missing"), "{error}");
+    assert!(error.to_string().contains("can't copy 'resource/talker'"), "{error}");
 }
 
 #[tokio::test]

@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
+use indicatif::{MultiProgress, ProgressBar, ProgressFinish, ProgressStyle};
 use task_proto::RobotId;
 use task_proto::api::{AssignmentView, DeploymentView};
 use task_proto::report::Phase;
@@ -18,7 +18,7 @@ pub(super) fn upload_bar(size: u64) -> ProgressBar {
         return ProgressBar::hidden();
     }
     let style = ProgressStyle::with_template("uploading {bar:30} {bytes}/{total_bytes} {binary_bytes_per_sec}");
-    let bar = ProgressBar::new(size);
+    let bar = ProgressBar::new(size).with_finish(ProgressFinish::AndClear);
     if let Ok(style) = style {
         bar.set_style(style);
     }

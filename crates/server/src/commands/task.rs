@@ -49,11 +49,13 @@ impl Verb {
 pub(super) async fn run(session: &Session, verb: Verb, order: TaskOrder) -> Result<Outcome, CommandError> {
     let TaskOrder { task, on, dry_run, yes, idempotency_key } = order;
     let path = format!("/tasks/{task}/{}", verb.as_str());
+    // With a key this may be an order that was carried out before, whose tasks are gone by now: the server knows.
+    let may_be_repeated = idempotency_key.is_some() && !dry_run;
     let key = idempotency_key.unwrap_or_else(super::push::random_key);
     let ask = OrderTask { selector: on.clone(), dry_run: true };
     // A dry run is no order, so it gets a key of its own.
     let matched: MatchedRobots = session.client.order(&path, &ask, &super::push::random_key()).await?;
-    if matched.robots.is_empty() {
+    if matched.robots.is_empty() && !may_be_repeated {
         return Err(CommandError::Usage(format!("no robot that {on} selects has the task {task}")));
     }
     if dry_run {

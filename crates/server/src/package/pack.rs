@@ -192,6 +192,13 @@ mod tests {
                 "task.toml"
             ]
         );
+        fs::write(dir.path().join("task.toml"), TASK.replace("./run.sh", "install/x")).unwrap();
+        fs::set_permissions(dir.path().join("install/x"), Permissions::from_mode(0o755)).unwrap();
+        fs::remove_file(dir.path().join("package.xml")).unwrap();
+        fs::write(dir.path().join("build/COLCON_IGNORE"), "").unwrap();
+        let packed = names(&pack(dir.path()).unwrap());
+        assert!(packed.contains(&"install/x".to_owned()) && packed.contains(&"log/x".to_owned()));
+        assert!(!packed.contains(&"build".to_owned()));
         fs::write(dir.path().join(".taskdignore"), "!keep\n").unwrap();
         refused(&dir, ".taskdignore: line 1: \"!keep\": patterns can't be negated");
     }
@@ -297,16 +304,18 @@ mod tests {
         let task = format!("name = \"talker\"\nversion = \"1\"\n{LAUNCH}");
         let launch = "install/talker/share/talker/launch/talker.launch.py";
         assert!(pack(tree(&[("task.toml", &task, false), (launch, "", false)]).path()).is_ok());
+        let at_top = launch.strip_prefix("install/").unwrap();
+        assert!(pack(tree(&[("task.toml", &task, false), (at_top, "", false)]).path()).is_ok());
         let other = "install/talker/share/talker/package.xml";
         refused(
             &tree(&[("task.toml", &task, false), (other, "", false)]),
-            "\"talker.launch.py\" is not in install/ below share/talker",
+            "\"talker.launch.py\" is not in the install tree below share/talker",
         );
         let linked = tree(&[("task.toml", &task, false), (launch, "", false)]);
         symlink("/ws/build/talker/x.py", linked.path().join("install/talker/x.py")).unwrap();
         refused(
             &linked,
-            "install/talker/x.py: is a link to \"/ws/build/talker/x.py\", out of install/: the tree was built with --symlink-install",
+            "install/talker/x.py: is a link to \"/ws/build/talker/x.py\": the tree was built with --symlink-install",
         );
         let egg = "install/talker/lib/python3/site-packages/talker.egg-link";
         refused(

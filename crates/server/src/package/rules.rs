@@ -108,12 +108,15 @@ fn check_launch(
         })
     };
     if manifest.build.tool == BuildTool::None {
-        let shares = [format!("install/{package}/share/{package}/"), format!("install/share/{package}/")];
+        // An install tree is isolated or merged, and it is in install/ or is the directory itself.
+        let shares =
+            ["install/", ""].map(|top| [format!("{top}{package}/share/{package}/"), format!("{top}share/{package}/")]);
+        let shares = shares.as_flattened();
         let install = tree.entries.keys().any(|path| shares.iter().any(|share| path.starts_with(share)));
         if !install {
             refuse(format!("needs a package.xml to build {package:?} from, or an install/ tree that has it"));
         } else if !shares.iter().any(|share| has_file(share)) {
-            refuse(format!("{file:?} is not in install/ below share/{package}"));
+            refuse(format!("{file:?} is not in the install tree below share/{package}"));
         }
         return;
     }

@@ -14,8 +14,6 @@ use super::{PackageError, Problem};
 const IGNORE_FILE: &str = ".taskdignore";
 /// What never belongs to a package, at any depth.
 const NEVER_PACKED: [&str; 3] = [".git", "__pycache__", IGNORE_FILE];
-/// What a build leaves at the top of a source tree.
-const BUILD_PRODUCTS: [&str; 3] = ["build", "install", "log"];
 
 /// A package's files by path, which is relative, with `/`. A map sorts paths bytewise, so a directory precedes what is in it.
 #[derive(Debug)]
@@ -90,7 +88,7 @@ impl Walk<'_> {
             };
             let path = format!("{prefix}{name}");
             let metadata = item.metadata().map_err(unreadable)?;
-            if self.is_left_out(&path, name, metadata.is_dir()) {
+            if self.is_left_out(&item.path(), &path, name, metadata.is_dir()) {
                 continue;
             }
             if path.len() > MAX_CONTENT_PATH_BYTES || path.split('/').count() > MAX_CONTENT_DEPTH {
@@ -151,9 +149,15 @@ impl Walk<'_> {
         Some(Entry::Link { target: text.to_owned() })
     }
 
-    fn is_left_out(&self, path: &str, name: &str, is_directory: bool) -> bool {
+    fn is_left_out(&self, full: &Path, path: &str, name: &str, is_directory: bool) -> bool {
+        // Beside an install tree that is the package, only what colcon itself marks as its own is no part of it.
+        let is_product = || match path {
+            "install" => self.built_on_robot,
+            "build" | "log" => self.built_on_robot || full.join("COLCON_IGNORE").exists(),
+            _ => false,
+        };
         NEVER_PACKED.contains(&name)
-            || (self.built_on_robot && is_directory && BUILD_PRODUCTS.contains(&path))
+            || (is_directory && is_product())
             || self.patterns.iter().any(|pattern| pattern.matches(path, name, is_directory))
     }
 
@@ -172,11 +176,11 @@ fn link_refusal(path: &str, target: &str) -> Option<String> {
     let up = parts.iter().take_while(|part| **part == "..").count();
     let depth = path.matches('/').count();
     let leaves = target.starts_with('/') || up > depth;
-    let into = path.strip_prefix("install/").is_some() && (leaves || up == depth);
-    if into {
+    let out_of_install = path.starts_with("install/") && (leaves || up == depth);
+    if out_of_install || (leaves && ["/build/", "/src/"].iter().any(|place| target.contains(place))) {
         return Some(format!(
-            "is a link to {target:?}, out of install/: the tree was built with --symlink-install and is not complete \
-             without its build directory; build it again without --symlink-install"
+            "is a link to {target:?}: the tree was built with --symlink-install and is not complete without the \
+             directories its links lead to; build it again without --symlink-install"
         ));
     }
     if leaves {

@@ -30,6 +30,8 @@ pub enum ProcessState {
         /// Its id.
         pid: u32,
     },
+    /// It can't be told now.
+    Unknown,
     /// It was about to be started, and was not.
     NeverStarted,
     /// It ended.

@@ -144,6 +144,9 @@ pub const CALM_MS: u64 = 10 * 60 * 1000;
 /// hour: enough for a sensor to be plugged in again.
 pub const MAX_RESTARTS_IN_A_ROW: u32 = 100;
 
+/// When to look again at a process of which nothing could be told.
+const LOOK_AGAIN_MS: u64 = 5000;
+
 /// The next step about the active run: start, restart, stop, replace, remove.
 pub fn supervise(s: &Situation<'_>) -> Next {
     if let Some(order) = s.desired
@@ -155,6 +158,8 @@ pub fn supervise(s: &Situation<'_>) -> Next {
     let Some(process) = &active.process else { return without_process(s, Some(active)) };
     match s.process {
         ProcessState::Alive { .. } => with_process(s, active, process),
+        // Another process must not be started while this one may live.
+        ProcessState::Unknown => Next::Rest { until_ms: Some(s.now_ms + LOOK_AGAIN_MS) },
         ProcessState::Ended(exit) => record(transition::ended(s, exit)),
         ProcessState::NeverStarted | ProcessState::None => record(transition::never_started(s)),
     }

@@ -6,6 +6,7 @@ use std::process::ExitCode;
 use anyhow::Context as _;
 
 use super::DataDir;
+use crate::effects::HOLD_FILE;
 
 /// Arguments of `hold` and of `release`.
 #[derive(Debug, clap::Args)]
@@ -14,19 +15,16 @@ pub struct Arguments {
     data: DataDir,
 }
 
-/// The flag file's name in the data directory.
-pub const FLAG_FILE: &str = "hold";
-
 /// From now on nothing is started or switched.
 pub fn hold(arguments: Arguments) -> anyhow::Result<ExitCode> {
-    let path = arguments.data.data.join(FLAG_FILE);
+    let path = arguments.data.data.join(HOLD_FILE);
     std::fs::write(&path, b"").with_context(|| format!("cannot write {}", path.display()))?;
     Ok(ExitCode::SUCCESS)
 }
 
 /// From now on orders are followed again.
 pub fn release(arguments: Arguments) -> anyhow::Result<ExitCode> {
-    let path = arguments.data.data.join(FLAG_FILE);
+    let path = arguments.data.data.join(HOLD_FILE);
     match std::fs::remove_file(&path) {
         Ok(()) => Ok(ExitCode::SUCCESS),
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(ExitCode::SUCCESS),

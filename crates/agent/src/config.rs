@@ -1,0 +1,312 @@
+//! The robot's property file, `agent.toml` in the data directory, and the `TASK_AGENT_*` variables above it:
+//! environment > file > defaults. Unknown keys are refused by name. It is read once, at start; it never holds a secret.
+
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+use task_proto::RobotName;
+use task_proto::id::Labels;
+use toml::{Table, Value};
+
+use crate::durable;
+
+/// The file's name.
+pub const FILE_NAME: &str = "agent.toml";
+/// What every variable starts with.
+const VARIABLE_PREFIX: &str = "TASK_AGENT_";
+/// Variables that are no settings: the data directory and the log filter.
+const OTHER_VARIABLES: [&str; 2] = ["TASK_AGENT_DATA", "TASK_AGENT_LOG"];
+
+/// The property file. What is absent has its default.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Settings {
+    /// The server's URL.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub server: Option<String>,
+    /// Whether MQTT is used; `false`: the robot only polls.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub mqtt: Option<bool>,
+    /// The name the robot gives itself; the server's wins.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub name: Option<RobotName>,
+    /// Setup files that are sourced before a task is built or run. Absent: what is in `/opt/ros`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub underlays: Option<Vec<PathBuf>>,
+    /// `ROS_DOMAIN_ID` of every task.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub ros_domain_id: Option<u32>,
+    /// Seconds between two polls while MQTT works.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub poll_interval_s: Option<u64>,
+    /// Seconds between two polls without MQTT.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub poll_interval_without_mqtt_s: Option<u64>,
+    /// The labels the robot gives itself; the server's win.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub labels: Option<Labels>,
+    /// What tasks may use.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub limits: Option<LimitSettings>,
+}
+
+/// The `[limits]` table.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LimitSettings {
+    /// Bytes a package may have when it is unpacked.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub archive_bytes: Option<u64>,
+    /// Files, directories and links a package may have.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub archive_entries: Option<u64>,
+    /// Bytes that stay free on the disk.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub disk_reserve_bytes: Option<u64>,
+    /// Bytes of a task's log file before it is rotated.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub log_bytes: Option<u64>,
+    /// Memory that each process of a build may have.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub build_memory_bytes: Option<u64>,
+    /// Seconds a build may take.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub build_timeout_s: Option<u64>,
+    /// Versions that are prepared at the same time.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub parallel_tasks: Option<usize>,
+}
+
+/// The settings that hold, defaults filled in.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Config {
+    /// The server's URL, if one is given.
+    pub server: Option<reqwest::Url>,
+    /// Whether MQTT is used.
+    pub mqtt: bool,
+    /// The name the robot gives itself.
+    pub name: Option<RobotName>,
+    /// The labels it gives itself, if it gives any.
+    pub labels: Option<Labels>,
+    /// Setup files to source; empty: what is found.
+    pub underlays: Vec<PathBuf>,
+    /// `ROS_DOMAIN_ID` of every task.
+    pub ros_domain_id: Option<u32>,
+    /// Between two polls while MQTT works.
+    pub poll_interval: Duration,
+    /// Between two polls without MQTT.
+    pub poll_interval_without_mqtt: Duration,
+    /// What tasks may use.
+    pub limits: LimitSettings,
+    /// Versions that are prepared at the same time.
+    pub parallel_tasks: usize,
+}
+
+/// A setting that can't be used.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// The file can't be read or written.
+    #[error("cannot use {path}")]
+    Io {
+        /// Which.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The file or the variables do not parse; the parser's text names the key.
+    #[error("{origin}: {reason}")]
+    Invalid {
+        /// File or variable.
+        origin: String,
+        /// What is wrong.
+        reason: String,
+    },
+}
+
+impl Settings {
+    /// The property file of the data directory; empty settings if there is none.
+    pub fn read(data_dir: &Path) -> Result<Self, ConfigError> {
+        let path = data_dir.join(FILE_NAME);
+        deserialize(read_table(&path)?, &path.display().to_string())
+    }
+
+    /// Writes the property file.
+    pub fn write(&self, data_dir: &Path) -> Result<(), ConfigError> {
+        let path = data_dir.join(FILE_NAME);
+        let mut text =
+            "# The robot's settings. task-agent configure asks for them; TASK_AGENT_* variables win.\n".to_owned();
+        let body = toml::to_string(self).map_err(|error| invalid(&path.display().to_string(), &error))?;
+        // Writing to a String can't fail.
+        let _ = write!(text, "{body}");
+        durable::write(&path, text.as_bytes(), 0o644).map_err(|source| ConfigError::Io { path, source })
+    }
+}
+
+impl Config {
+    /// The settings of `data_dir` under `variables`, normally the process's environment.
+    pub fn load(data_dir: &Path, variables: impl Iterator<Item = (String, String)>) -> Result<Self, ConfigError> {
+        let path = data_dir.join(FILE_NAME);
+        let mut table = read_table(&path)?;
+        // The file first, alone, so that an error names where it is.
+        let _: Settings = deserialize(table.clone(), &path.display().to_string())?;
+        for (name, value) in variables {
+            if !name.starts_with(VARIABLE_PREFIX) || OTHER_VARIABLES.contains(&name.as_str()) {
+                continue;
+            }
+            override_by(&mut table, &name, &value)?;
+            let _: Settings = deserialize(table.clone(), &name)?;
+        }
+        Self::from_settings(deserialize(table, "the settings")?)
+    }
+
+    fn from_settings(settings: Settings) -> Result<Self, ConfigError> {
+        let limits = settings.limits.unwrap_or_default();
+        let config = Self {
+            server: settings.server.as_deref().map(parse_server).transpose()?,
+            mqtt: settings.mqtt.unwrap_or(true),
+            name: settings.name,
+            labels: settings.labels,
+            underlays: settings.underlays.unwrap_or_default(),
+            ros_domain_id: settings.ros_domain_id,
+            poll_interval: Duration::from_secs(settings.poll_interval_s.unwrap_or(300)),
+            poll_interval_without_mqtt: Duration::from_secs(settings.poll_interval_without_mqtt_s.unwrap_or(10)),
+            parallel_tasks: limits.parallel_tasks.unwrap_or(2),
+            limits,
+        };
+        let bounds = [
+            ("ros_domain_id", u64::from(config.ros_domain_id.unwrap_or(0)), 0, 232),
+            ("poll_interval_s", config.poll_interval.as_secs(), 1, 86_400),
+            ("poll_interval_without_mqtt_s", config.poll_interval_without_mqtt.as_secs(), 1, 86_400),
+            ("limits.parallel_tasks", config.parallel_tasks as u64, 1, 64),
+            ("limits.build_timeout_s", config.limits.build_timeout_s.unwrap_or(60), 1, 86_400),
+        ];
+        for (key, value, least, most) in bounds {
+            if value < least || value > most {
+                let reason = format!("{value} is not between {least} and {most}");
+                return Err(ConfigError::Invalid { origin: key.to_owned(), reason });
+            }
+        }
+        Ok(config)
+    }
+}
+
+/// A server's URL as people write it.
+pub fn parse_server(text: &str) -> Result<reqwest::Url, ConfigError> {
+    let fault = |reason: String| ConfigError::Invalid { origin: "server".to_owned(), reason };
+    let url: reqwest::Url = text.parse().map_err(|error| fault(format!("{text:?} is no URL: {error}")))?;
+    if !matches!(url.scheme(), "http" | "https") || url.host_str().is_none() {
+        return Err(fault(format!("{text:?} is no URL of a server like http://server:8080")));
+    }
+    Ok(url)
+}
+
+/// Puts one variable's value where its key is: `TASK_AGENT_LIMITS_LOG_BYTES` is `limits.log_bytes`.
+fn override_by(table: &mut Table, name: &str, text: &str) -> Result<(), ConfigError> {
+    let key = name[VARIABLE_PREFIX.len()..].to_ascii_lowercase();
+    let value = match key.as_str() {
+        "server" | "name" => Value::String(text.to_owned()),
+        "underlays" => {
+            let paths = text.split(':').filter(|path| !path.is_empty());
+            Value::Array(paths.map(|path| Value::String(path.to_owned())).collect())
+        }
+        "labels" => {
+            let pairs = text.split(',').filter(|pair| !pair.is_empty()).map(|pair| pair.split_once('='));
+            let labels: Option<Table> =
+                pairs.map(|pair| pair.map(|(key, value)| (key.to_owned(), Value::String(value.to_owned())))).collect();
+            let reason = "expected key=value,key=value".to_owned();
+            Value::Table(labels.ok_or_else(|| ConfigError::Invalid { origin: name.to_owned(), reason })?)
+        }
+        _ => scalar(text),
+    };
+    match key.strip_prefix("limits_") {
+        Some(limit) => {
+            let limits = table.entry("limits").or_insert_with(|| Value::Table(Table::new()));
+            if let Value::Table(limits) = limits {
+                limits.insert(limit.to_owned(), value);
+            }
+        }
+        None => {
+            table.insert(key, value);
+        }
+    }
+    Ok(())
+}
+
+/// A number or a truth value where it is one, else text, which the key's type then refuses by name.
+fn scalar(text: &str) -> Value {
+    let number = text.parse().map(Value::Integer).ok();
+    number.or_else(|| text.parse().map(Value::Boolean).ok()).unwrap_or_else(|| Value::String(text.to_owned()))
+}
+
+fn read_table(path: &Path) -> Result<Table, ConfigError> {
+    match std::fs::read_to_string(path) {
+        Ok(text) => text.parse::<Table>().map_err(|error| invalid(&path.display().to_string(), &error)),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(Table::new()),
+        Err(source) => Err(ConfigError::Io { path: path.to_owned(), source }),
+    }
+}
+
+fn deserialize(table: Table, origin: &str) -> Result<Settings, ConfigError> {
+    table.try_into().map_err(|error: toml::de::Error| invalid(origin, &error))
+}
+
+fn invalid(origin: &str, error: &dyn std::fmt::Display) -> ConfigError {
+    ConfigError::Invalid { origin: origin.to_owned(), reason: error.to_string().trim_end().to_owned() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn load(file: &str, variables: &[(&str, &str)]) -> Result<Config, ConfigError> {
+        let dir = tempfile::tempdir().expect("a directory");
+        std::fs::write(dir.path().join(FILE_NAME), file).expect("written");
+        Config::load(dir.path(), variables.iter().map(|(name, value)| ((*name).to_owned(), (*value).to_owned())))
+    }
+
+    #[test]
+    fn environment_beats_file_beats_defaults() {
+        let file = "mqtt = true\nros_domain_id = 3\n[limits]\nlog_bytes = 5\nbuild_timeout_s = 9\n";
+        let variables = [
+            ("TASK_AGENT_MQTT", "false"),
+            ("TASK_AGENT_UNDERLAYS", "/opt/ros/jazzy/setup.bash:/ws/install/setup.bash"),
+            ("TASK_AGENT_LABELS", "site=lab,base=turtlebot"),
+            ("TASK_AGENT_LIMITS_LOG_BYTES", "7"),
+            ("TASK_AGENT_DATA", "/elsewhere"),
+            ("PATH", "/bin"),
+        ];
+        let config = load(file, &variables).expect("valid");
+        assert_eq!((config.mqtt, config.ros_domain_id), (false, Some(3)));
+        assert_eq!((config.limits.log_bytes, config.limits.build_timeout_s), (Some(7), Some(9)));
+        assert_eq!(config.underlays.len(), 2);
+        assert_eq!(config.labels.expect("given").len(), 2);
+        assert_eq!(config.poll_interval, Duration::from_secs(300));
+    }
+
+    #[test]
+    fn what_is_wrong_is_named() {
+        let text = |file: &str, variables: &[(&str, &str)]| load(file, variables).expect_err("refused").to_string();
+        assert!(text("mqt = true\n", &[]).contains("mqt"));
+        assert!(text("[limits]\nlogs = 1\n", &[]).contains("logs"));
+        assert!(text("", &[("TASK_AGENT_MQT", "true")]).contains("TASK_AGENT_MQT"));
+        assert!(text("", &[("TASK_AGENT_MQTT", "perhaps")]).contains("TASK_AGENT_MQTT"));
+        assert!(text("server = \"ftp://x\"\n", &[]).contains("server"));
+        assert!(text("ros_domain_id = 400\n", &[]).contains("ros_domain_id"));
+        assert!(text("poll_interval_s = 0\n", &[]).contains("poll_interval_s"));
+    }
+
+    #[test]
+    fn a_written_file_reads_back() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let settings = Settings {
+            server: Some("http://server:8080".to_owned()),
+            name: Some("atlas".parse().expect("valid")),
+            labels: Some([("site".parse().expect("valid"), "lab".parse().expect("valid"))].into()),
+            ..Settings::default()
+        };
+        settings.write(dir.path()).expect("written");
+        assert_eq!(Settings::read(dir.path()).expect("read"), settings);
+    }
+}

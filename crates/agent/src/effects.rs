@@ -1,0 +1,102 @@
+//! What the driver may do to the robot, behind one trait, so that its logic is tested against a fake without disk,
+//! processes or time. [`Robot`] is the real one. Effects decide nothing.
+
+use std::future::Future;
+
+use task_proto::TaskName;
+use task_proto::desired::PackageRef;
+use task_proto::report::{HostFacts, Progress};
+use tokio::sync::watch;
+use tokio_util::sync::CancellationToken;
+
+use crate::ledger::{ActiveRun, Ledger, LedgerError, ProcessRecord};
+use crate::observed::{Prepared, ProcessState, RobotFacts};
+use crate::plan::StepFailure;
+
+mod robot;
+
+pub use robot::Robot;
+pub(crate) use robot::chain;
+
+/// The flag file by which `hold` and `release` speak to the agent.
+pub const HOLD_FILE: &str = "hold";
+
+/// Milliseconds by the clocks an agent looks at.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Now {
+    /// Since boot.
+    pub boot_ms: u64,
+    /// Since the Unix epoch, as far as the robot knows.
+    pub wall_ms: u64,
+}
+
+/// Everything the driver does to the robot. Each method may be called again after a crash: doing it twice is harmless.
+pub trait Effects: Send + Sync + 'static {
+    /// What the clocks show.
+    fn now(&self) -> Now;
+
+    /// Writes the ledger. Once this returns it survives a power cut.
+    fn write_ledger(&self, ledger: &Ledger) -> Result<(), LedgerError>;
+
+    /// Whether a person at the robot said `hold`.
+    fn is_held(&self) -> bool;
+
+    /// What packages may require of this robot, apart from the labels the server knows better.
+    fn robot_facts(&self) -> RobotFacts;
+
+    /// What the reports say of the machine.
+    fn host_facts(&self) -> HostFacts;
+
+    /// What is on the disk of this version.
+    fn prepared(&self, package: &PackageRef) -> impl Future<Output = Prepared> + Send;
+
+    /// What became of a process.
+    fn process(&self, task: &TaskName, process: &ProcessRecord) -> impl Future<Output = ProcessState> + Send;
+
+    /// Resolves when a process that lived has ended. Dropping it does nothing to the process.
+    fn process_ended(&self, task: &TaskName, process: &ProcessRecord) -> impl Future<Output = ()> + Send;
+
+    /// Pulls the manifest.
+    fn pull_manifest(
+        &self,
+        package: &PackageRef,
+        cancel: &CancellationToken,
+    ) -> impl Future<Output = Result<(), StepFailure>> + Send;
+
+    /// Pulls and unpacks the content.
+    fn pull_content(
+        &self,
+        package: &PackageRef,
+        progress: &watch::Sender<Progress>,
+        cancel: &CancellationToken,
+    ) -> impl Future<Output = Result<(), StepFailure>> + Send;
+
+    /// Builds it.
+    fn build(
+        &self,
+        package: &PackageRef,
+        cancel: &CancellationToken,
+    ) -> impl Future<Output = Result<(), StepFailure>> + Send;
+
+    /// Makes the run's version the current one and starts the process that its record names; gives the process id.
+    fn start(&self, task: &TaskName, run: &ActiveRun) -> impl Future<Output = Result<u32, StepFailure>> + Send;
+
+    /// Stops a process and all it started.
+    fn stop(
+        &self,
+        task: &TaskName,
+        process: &ProcessRecord,
+        stop_timeout_s: u32,
+    ) -> impl Future<Output = Result<(), StepFailure>> + Send;
+
+    /// Deletes the versions that are not in `kept`, and what ended runs left.
+    fn prune(
+        &self,
+        task: &TaskName,
+        kept: &[task_proto::Digest],
+        running: Option<&ProcessRecord>,
+    ) -> impl Future<Output = Result<(), StepFailure>> + Send;
+
+    /// Deletes a task with all that belongs to it.
+    fn remove(&self, task: &TaskName) -> impl Future<Output = Result<(), StepFailure>> + Send;
+}

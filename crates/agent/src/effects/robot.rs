@@ -1,0 +1,323 @@
+//! The real robot: each effect is a call to the module that owns it, and its error becomes a failure's code and text.
+//! It holds no state beside its settings.
+
+use std::collections::BTreeMap;
+use std::error::Error;
+use std::io::{Read as _, Seek as _, SeekFrom};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use task_proto::desired::PackageRef;
+use task_proto::id::Labels;
+use task_proto::manifest::{BuildTool, TaskManifest};
+use task_proto::report::{Failure, FailureCode, HostFacts, Progress};
+use task_proto::{Digest, MacAddress, TaskName};
+use tokio::sync::watch;
+use tokio_util::sync::CancellationToken;
+
+use super::{Effects, Now};
+use crate::builder::{self, BuildError, BuildLimits, BuildOrder};
+use crate::config::Config;
+use crate::fetch::{FetchError, Fetcher};
+use crate::layout::{DataDir, VersionDir};
+use crate::ledger::{ActiveRun, Ledger, LedgerError, ProcessRecord};
+use crate::observed::{Exit, Prepared, ProcessState, RobotFacts};
+use crate::plan::StepFailure;
+use crate::run_dir::{LogSpec, RunSpec};
+use crate::supervisor::{Observed, Supervisor, SupervisorError};
+use crate::underlay::{self, Underlays};
+use crate::{clock, disk, durable, environment, script};
+
+/// Written into a version's directory once it is built.
+const BUILT_MARKER: &str = "built";
+/// How much of a log's end goes into a failure's text.
+const TAIL_BYTES: u64 = 2048;
+/// Variables of the agent's own environment that say how ROS finds its peers; the tasks get them too.
+const ROS_VARIABLES: [&str; 6] = [
+    "ROS_AUTOMATIC_DISCOVERY_RANGE",
+    "ROS_STATIC_PEERS",
+    "ROS_LOCALHOST_ONLY",
+    "RMW_IMPLEMENTATION",
+    "CYCLONEDDS_URI",
+    "FASTRTPS_DEFAULT_PROFILES_FILE",
+];
+
+/// This robot.
+pub struct Robot {
+    data: DataDir,
+    fetcher: Fetcher,
+    supervisor: Supervisor,
+    underlays: Underlays,
+    environment: BTreeMap<String, String>,
+    build_limits: BuildLimits,
+    log_bytes: Option<u64>,
+    labels: Labels,
+    mac: MacAddress,
+}
+
+impl Robot {
+    /// The robot whose data is in `data`.
+    pub fn new(data: DataDir, fetcher: Fetcher, config: &Config, mac: MacAddress) -> Self {
+        let mut settings: BTreeMap<String, String> =
+            ROS_VARIABLES.iter().filter_map(|name| Some(((*name).to_owned(), std::env::var(name).ok()?))).collect();
+        settings.extend(config.ros_domain_id.map(|id| ("ROS_DOMAIN_ID".to_owned(), id.to_string())));
+        let mut build_limits = BuildLimits::of_this_machine();
+        if let Some(timeout_s) = config.limits.build_timeout_s {
+            build_limits.timeout = Duration::from_secs(timeout_s);
+        }
+        build_limits.memory_bytes = config.limits.build_memory_bytes.or(build_limits.memory_bytes);
+        Self {
+            data,
+            fetcher,
+            supervisor: Supervisor::of_this_program(),
+            underlays: Underlays::find(&config.underlays, Path::new(underlay::SYSTEM_ROOT)),
+            environment: environment::of_this_robot(&settings),
+            build_limits,
+            log_bytes: config.limits.log_bytes,
+            labels: config.labels.clone().unwrap_or_default(),
+            mac,
+        }
+    }
+
+    fn version(&self, package: &PackageRef) -> VersionDir {
+        self.data.task(&package.name).version(&package.manifest.digest)
+    }
+
+    /// The manifest that lies on the disk, verified as if it came from the server.
+    async fn manifest(&self, package: &PackageRef) -> Result<TaskManifest, StepFailure> {
+        self.fetcher.manifest(package, &CancellationToken::new()).await.map_err(fetch_failure)
+    }
+
+    fn run_dir(&self, task: &TaskName, process: &ProcessRecord) -> PathBuf {
+        self.data.task(task).run().join(&process.dir)
+    }
+
+    fn log(&self, task: &TaskName) -> LogSpec {
+        let mut log = LogSpec::at(self.data.task(task).logs().join("task.log"));
+        log.max_bytes = self.log_bytes.unwrap_or(log.max_bytes);
+        log
+    }
+
+    fn setup_files(&self, manifest: &TaskManifest) -> Result<Vec<PathBuf>, StepFailure> {
+        let found = self.underlays.for_task(&manifest.requires.ros_distro);
+        found.map_err(|error| finally(FailureCode::REQUIREMENTS_UNMET, &error))
+    }
+
+    /// The end of the task's log.
+    fn last_lines(&self, task: &TaskName) -> String {
+        let tail = || {
+            let mut file = std::fs::File::open(self.log(task).path)?;
+            let size = file.metadata()?.len();
+            file.seek(SeekFrom::Start(size.saturating_sub(TAIL_BYTES)))?;
+            let mut bytes = Vec::new();
+            file.take(TAIL_BYTES).read_to_end(&mut bytes)?;
+            std::io::Result::Ok(String::from_utf8_lossy(&bytes).into_owned())
+        };
+        tail().unwrap_or_default()
+    }
+}
+
+impl Effects for Robot {
+    fn now(&self) -> Now {
+        Now { boot_ms: clock::boot_ms(), wall_ms: clock::wall_ms() }
+    }
+
+    fn write_ledger(&self, ledger: &Ledger) -> Result<(), LedgerError> {
+        ledger.write(&self.data.ledger())
+    }
+
+    fn is_held(&self) -> bool {
+        self.data.root().join(super::HOLD_FILE).exists()
+    }
+
+    fn robot_facts(&self) -> RobotFacts {
+        RobotFacts {
+            arch: std::env::consts::ARCH.to_owned(),
+            labels: self.labels.clone(),
+            ros_distros: self.underlays.distros(),
+        }
+    }
+
+    fn host_facts(&self) -> HostFacts {
+        host_facts(self.data.root(), self.mac, self.underlays.distros())
+    }
+
+    async fn prepared(&self, package: &PackageRef) -> Prepared {
+        let task = self.data.task(&package.name);
+        let version = self.version(package);
+        // Only what lies on the disk: without the file this would go to the network.
+        let manifest = if version.manifest().exists() { self.manifest(package).await.ok() } else { None };
+        let content = version.src().is_dir();
+        let needs_build = manifest.as_ref().is_none_or(|manifest| manifest.build.tool != BuildTool::None);
+        Prepared {
+            content,
+            built: content && (!needs_build || version.root().join(BUILT_MARKER).exists()),
+            manifest,
+            versions: task.versions().unwrap_or_default(),
+        }
+    }
+
+    async fn process(&self, task: &TaskName, process: &ProcessRecord) -> ProcessState {
+        let exit = |status| ProcessState::Ended(Exit { status, last_lines: self.last_lines(task) });
+        match self.supervisor.observe(&self.run_dir(task, process)).await {
+            Ok(Observed::NeverStarted) => ProcessState::NeverStarted,
+            Ok(Observed::Running { pid, .. }) => ProcessState::Alive { pid },
+            Ok(Observed::Exited(status)) => exit(Some(status)),
+            Ok(Observed::Gone) => exit(None),
+            Err(error) => {
+                tracing::error!(%task, error = %chain(&error), "cannot tell what became of the process");
+                ProcessState::Unknown
+            }
+        }
+    }
+
+    async fn process_ended(&self, task: &TaskName, process: &ProcessRecord) {
+        if let Err(error) = self.supervisor.wait(&self.run_dir(task, process)).await {
+            tracing::error!(%task, error = %chain(&error), "cannot watch the process");
+        }
+    }
+
+    async fn pull_manifest(&self, package: &PackageRef, cancel: &CancellationToken) -> Result<(), StepFailure> {
+        self.fetcher.manifest(package, cancel).await.map(drop).map_err(fetch_failure)
+    }
+
+    async fn pull_content(
+        &self,
+        package: &PackageRef,
+        progress: &watch::Sender<Progress>,
+        cancel: &CancellationToken,
+    ) -> Result<(), StepFailure> {
+        let manifest = self.manifest(package).await?;
+        self.fetcher.content(package, &manifest, progress, cancel).await.map_err(fetch_failure)
+    }
+
+    async fn build(&self, package: &PackageRef, cancel: &CancellationToken) -> Result<(), StepFailure> {
+        let manifest = self.manifest(package).await?;
+        let version = self.version(package);
+        let order = BuildOrder {
+            tool: manifest.build.tool,
+            underlays: self.setup_files(&manifest)?,
+            environment: self.environment.clone(),
+            log: self.data.task(&package.name).logs().join("build.log"),
+            limits: self.build_limits,
+            version: version.clone(),
+        };
+        builder::build(&order, cancel).await.map_err(build_failure)?;
+        let marker = version.root().join(BUILT_MARKER);
+        durable::write(&marker, b"", 0o600).map_err(|error| finally(FailureCode::IO_ERROR, &error))
+    }
+
+    async fn start(&self, task: &TaskName, run: &ActiveRun) -> Result<u32, StepFailure> {
+        let failed = |error: &dyn Error| later(FailureCode::START_FAILED, error, 0);
+        let Some(process) = &run.process else {
+            return Err(failed(&std::io::Error::other("the ledger names no process to start")));
+        };
+        let manifest = self.manifest(&run.package).await?;
+        let version = self.version(&run.package);
+        let text = script::run_script(&manifest, &version, &self.setup_files(&manifest)?);
+        durable::write(&version.run_script(), text.as_bytes(), 0o700).map_err(|error| failed(&error))?;
+        let task_dir = self.data.task(task);
+        task_dir.set_current(&run.package.manifest.digest).map_err(|error| failed(&error))?;
+        durable::create_dir_all(&task_dir.logs()).map_err(|error| failed(&error))?;
+        let spec = RunSpec {
+            assignment: run.deployment.clone(),
+            script: version.run_script(),
+            directory: script::run_directory(manifest.build.tool, &version),
+            environment: self.environment.clone(),
+            log: self.log(task),
+        };
+        let started = self.supervisor.start(&self.run_dir(task, process), &spec).await;
+        Ok(started.map_err(|error| failed(&error))?.task.pid)
+    }
+
+    async fn stop(&self, task: &TaskName, process: &ProcessRecord, stop_timeout_s: u32) -> Result<(), StepFailure> {
+        let grace = Duration::from_secs(u64::from(stop_timeout_s));
+        let stopped = self.supervisor.stop(&self.run_dir(task, process), grace).await;
+        stopped.map(drop).map_err(|error: SupervisorError| later(FailureCode::IO_ERROR, &error, 0))
+    }
+
+    async fn prune(
+        &self,
+        task: &TaskName,
+        kept: &[Digest],
+        running: Option<&ProcessRecord>,
+    ) -> Result<(), StepFailure> {
+        let (task, kept) = (self.data.task(task), kept.to_vec());
+        let running = running.map(|process| task.run().join(&process.dir));
+        on_disk(move || {
+            task.prune(&kept)?;
+            for entry in std::fs::read_dir(task.run()).into_iter().flatten().flatten() {
+                if Some(entry.path()) != running {
+                    durable::remove_dir_all(&entry.path())?;
+                }
+            }
+            Ok(())
+        })
+        .await
+    }
+
+    async fn remove(&self, task: &TaskName) -> Result<(), StepFailure> {
+        let task = self.data.task(task);
+        on_disk(move || task.remove()).await
+    }
+}
+
+async fn on_disk(work: impl FnOnce() -> std::io::Result<()> + Send + 'static) -> Result<(), StepFailure> {
+    let done = tokio::task::spawn_blocking(work).await.map_err(std::io::Error::other);
+    done.flatten().map_err(|error| later(FailureCode::IO_ERROR, &error, 0))
+}
+
+fn fetch_failure(error: FetchError) -> StepFailure {
+    let code = match &error {
+        FetchError::DiskFull(_) => FailureCode::DISK_FULL,
+        FetchError::DigestMismatch { .. } => FailureCode::DIGEST_MISMATCH,
+        FetchError::ManifestInvalid(_) => FailureCode::MANIFEST_INVALID,
+        FetchError::ArchiveRefused(_) => FailureCode::ARCHIVE_REFUSED,
+        FetchError::Disk { .. } => FailureCode::IO_ERROR,
+        _ => FailureCode::PACKAGE_UNAVAILABLE,
+    };
+    if error.is_retryable() || matches!(error, FetchError::Cancelled) {
+        let least_ms = error.retry_after().map_or(0, |wait| u64::try_from(wait.as_millis()).unwrap_or(u64::MAX));
+        return later(code, &error, least_ms);
+    }
+    finally(code, &error)
+}
+
+fn build_failure(error: BuildError) -> StepFailure {
+    match error.code() {
+        Some(code) => finally(code, &error),
+        None => later(FailureCode::BUILD_FAILED, &error, 0),
+    }
+}
+
+fn finally(code: FailureCode, error: &dyn Error) -> StepFailure {
+    StepFailure { failure: Failure::new(code, chain(error)), retry_after_ms: None }
+}
+
+fn later(code: FailureCode, error: &dyn Error, least_ms: u64) -> StepFailure {
+    StepFailure { failure: Failure::new(code, chain(error)), retry_after_ms: Some(least_ms) }
+}
+
+/// An error with all its causes.
+pub(crate) fn chain(error: &dyn Error) -> String {
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(error) = cause {
+        text.push_str(": ");
+        text.push_str(&error.to_string());
+        cause = error.source();
+    }
+    text
+}
+
+/// What the reports say of the machine.
+fn host_facts(data_dir: &Path, mac: MacAddress, ros_distros: Vec<String>) -> HostFacts {
+    HostFacts {
+        agent_version: env!("CARGO_PKG_VERSION").to_owned(),
+        hostname: std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default().trim().to_owned(),
+        arch: std::env::consts::ARCH.to_owned(),
+        mac: Some(mac),
+        ros_distros,
+        disk_free_bytes: disk::room(data_dir).map_or(0, |room| room.free),
+    }
+}

@@ -1,0 +1,164 @@
+//! Who this robot is: `identity.json` (0600), written once by `enroll`, and the MAC it was registered by. Finding the MAC
+//! reads `/sys/class/net`; nothing here talks to the server.
+
+use std::io;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use task_proto::api::MqttEndpoint;
+use task_proto::envelope::PublicKey;
+use task_proto::{MacAddress, RobotId};
+
+use crate::durable;
+
+/// Where the kernel lists network interfaces.
+pub const INTERFACES: &str = "/sys/class/net";
+/// The kernel's "the address is the hardware's own" in `addr_assign_type`.
+const PERMANENT: &str = "0";
+
+/// A registered robot.
+#[derive(Clone, Serialize, Deserialize)]
+pub struct Identity {
+    /// What the server calls it, for ever.
+    pub robot_id: RobotId,
+    /// Its bearer token and MQTT password.
+    pub token: String,
+    /// The server it registered at.
+    pub server: String,
+    /// The key that signs its desired states.
+    pub server_key: PublicKey,
+    /// How to reach MQTT.
+    pub mqtt: MqttEndpoint,
+    /// The MAC it was registered by.
+    pub mac: MacAddress,
+}
+
+/// The identity can't be read or written.
+#[derive(Debug, thiserror::Error)]
+pub enum IdentityError {
+    /// There is none.
+    #[error("this robot is not registered: run task-agent enroll (no {0})")]
+    Missing(PathBuf),
+    /// The file fails.
+    #[error("cannot use {path}")]
+    Io {
+        /// Which.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// The file is not an identity.
+    #[error("{path} is not an identity")]
+    Malformed {
+        /// Which.
+        path: PathBuf,
+        /// What the parser said.
+        source: serde_json::Error,
+    },
+}
+
+/// Why no MAC was chosen.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum MacError {
+    /// There is no physical network interface.
+    #[error("no physical network interface with an address was found: give the robot's MAC with --mac")]
+    NoneFound,
+    /// All there are have addresses that were made up.
+    #[error(
+        "the addresses of this robot's network interfaces are made up, not the hardware's own ({0}): \
+         give the MAC it shall be known by with --mac"
+    )]
+    MadeUp(String),
+}
+
+impl Identity {
+    /// Reads the identity.
+    pub fn read(path: &Path) -> Result<Self, IdentityError> {
+        match std::fs::read(path) {
+            Ok(bytes) => serde_json::from_slice(&bytes)
+                .map_err(|source| IdentityError::Malformed { path: path.to_owned(), source }),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Err(IdentityError::Missing(path.to_owned())),
+            Err(source) => Err(IdentityError::Io { path: path.to_owned(), source }),
+        }
+    }
+
+    /// Writes it, readable by its owner only.
+    pub fn write(&self, path: &Path) -> Result<(), IdentityError> {
+        let bytes = serde_json::to_vec_pretty(self)
+            .map_err(|source| IdentityError::Malformed { path: path.to_owned(), source })?;
+        durable::write(path, &bytes, 0o600).map_err(|source| IdentityError::Io { path: path.to_owned(), source })
+    }
+}
+
+/// The MAC to register by: the permanent address of the first physical interface below `interfaces`, by name, so that
+/// `eth0` comes before `wlan0`.
+pub fn find_mac(interfaces: &Path) -> Result<MacAddress, MacError> {
+    let read = |dir: &Path, file: &str| std::fs::read_to_string(dir.join(file)).map(|text| text.trim().to_owned());
+    let mut dirs: Vec<PathBuf> =
+        std::fs::read_dir(interfaces).into_iter().flatten().flatten().map(|entry| entry.path()).collect();
+    dirs.sort();
+    let mut made_up = Vec::new();
+    for dir in dirs {
+        // A bridge, a tunnel or a container's interface has no device behind it.
+        let is_physical = dir.join("device").exists();
+        let Some(mac) = read(&dir, "address").ok().and_then(|text| text.parse::<MacAddress>().ok()) else { continue };
+        if !is_physical {
+            continue;
+        }
+        if read(&dir, "addr_assign_type").is_ok_and(|kind| kind == PERMANENT) && !mac.is_locally_administered() {
+            return Ok(mac);
+        }
+        made_up.push(format!("{} {mac}", dir.file_name().unwrap_or_default().to_string_lossy()));
+    }
+    if made_up.is_empty() { Err(MacError::NoneFound) } else { Err(MacError::MadeUp(made_up.join(", "))) }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt as _;
+
+    use super::*;
+
+    fn interface(root: &Path, name: &str, address: &str, assign_type: &str, physical: bool) {
+        let dir = root.join(name);
+        std::fs::create_dir_all(&dir).expect("made");
+        std::fs::write(dir.join("address"), format!("{address}\n")).expect("written");
+        std::fs::write(dir.join("addr_assign_type"), format!("{assign_type}\n")).expect("written");
+        if physical {
+            std::fs::create_dir(dir.join("device")).expect("made");
+        }
+    }
+
+    #[test]
+    fn the_mac_is_a_physical_permanent_address() {
+        let root = tempfile::tempdir().expect("a directory");
+        assert_eq!(find_mac(root.path()), Err(MacError::NoneFound));
+        interface(root.path(), "docker0", "00:11:22:33:44:50", "0", false);
+        interface(root.path(), "lo", "00:00:00:00:00:00", "0", false);
+        assert_eq!(find_mac(root.path()), Err(MacError::NoneFound));
+        interface(root.path(), "eth0", "02:11:22:33:44:51", "0", true);
+        interface(root.path(), "usb0", "00:11:22:33:44:52", "1", true);
+        let error = find_mac(root.path()).expect_err("only made-up addresses").to_string();
+        assert!(error.contains("eth0 02:11:22:33:44:51") && error.contains("usb0") && error.contains("--mac"));
+        interface(root.path(), "wlan0", "00:11:22:33:44:53", "0", true);
+        assert_eq!(find_mac(root.path()).expect("found").to_string(), "00:11:22:33:44:53");
+    }
+
+    #[test]
+    fn an_identity_is_private_and_reads_back() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let path = dir.path().join("identity.json");
+        assert!(matches!(Identity::read(&path), Err(IdentityError::Missing(_))));
+        let identity = Identity {
+            robot_id: RobotId::random(),
+            token: "tskr_…".to_owned(),
+            server: "http://server".to_owned(),
+            server_key: task_proto::envelope::SigningKey::random().public_key(),
+            mqtt: MqttEndpoint { host: None, port: 1883, prefix: Default::default() },
+            mac: "02:00:00:00:00:01".parse().expect("valid"),
+        };
+        identity.write(&path).expect("written");
+        assert_eq!(std::fs::metadata(&path).expect("there").permissions().mode() & 0o777, 0o600);
+        assert_eq!(Identity::read(&path).expect("read").robot_id, identity.robot_id);
+    }
+}

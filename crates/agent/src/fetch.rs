@@ -19,7 +19,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use task_proto::desired::{BlobRef, PackageRef};
 use task_proto::manifest::TaskManifest;
-use task_proto::report::Progress;
+use task_proto::report::{FailureCode, Progress};
 use task_proto::{Digest, TaskName};
 use tokio::sync::{OwnedMutexGuard, mpsc, watch};
 use tokio_util::sync::CancellationToken;
@@ -134,21 +134,22 @@ pub enum FetchError {
 }
 
 impl FetchError {
-    /// The failure's stable code.
-    pub fn code(&self) -> &'static str {
+    /// The code that a report gives; `None` for a pull that was cancelled, which is no failure.
+    pub fn code(&self) -> Option<FailureCode> {
         match self {
-            Self::Cancelled => "cancelled",
-            Self::Unreachable(_) | Self::Interrupted { .. } | Self::Stalled(_) | Self::NotTheServer(_) => {
-                "server_unreachable"
-            }
-            Self::Busy { .. } => "server_busy",
-            Self::Unauthorized => "unauthorized",
-            Self::Unavailable { .. } => "package_unavailable",
-            Self::DigestMismatch { .. } => "digest_mismatch",
-            Self::ManifestInvalid(_) => "manifest_invalid",
-            Self::ArchiveRefused(_) => "archive_refused",
-            Self::DiskFull(_) => "disk_full",
-            Self::Disk { .. } => "disk_failed",
+            Self::Cancelled => None,
+            Self::Unreachable(_)
+            | Self::Interrupted { .. }
+            | Self::Stalled(_)
+            | Self::NotTheServer(_)
+            | Self::Busy { .. } => Some(FailureCode::SERVER_UNREACHABLE),
+            Self::Unauthorized => Some(FailureCode::UNAUTHORIZED),
+            Self::Unavailable { .. } => Some(FailureCode::PACKAGE_UNAVAILABLE),
+            Self::DigestMismatch { .. } => Some(FailureCode::DIGEST_MISMATCH),
+            Self::ManifestInvalid(_) => Some(FailureCode::MANIFEST_INVALID),
+            Self::ArchiveRefused(_) => Some(FailureCode::ARCHIVE_REFUSED),
+            Self::DiskFull(_) => Some(FailureCode::DISK_FULL),
+            Self::Disk { .. } => Some(FailureCode::IO_ERROR),
         }
     }
 
@@ -199,14 +200,14 @@ impl Fetcher {
 
     /// The package's task manifest, from the disk if it is there whole. Its bytes are verified either way.
     pub async fn manifest(&self, package: &PackageRef, cancel: &CancellationToken) -> Result<TaskManifest, FetchError> {
-        let version = self.data.task(&package.name).version(&package.manifest.digest);
-        let path = version.manifest();
-        if let Some(manifest) = stored_manifest(&path, package) {
+        if let Some(manifest) = stored_manifest(&self.data, package) {
             return Ok(manifest);
         }
         let pulled = cancel.run_until_cancelled(self.pull_manifest(package)).await;
         let bytes = pulled.ok_or(FetchError::Cancelled)??;
         let manifest = read_manifest(&bytes, package)?;
+        let version = self.data.task(&package.name).version(&package.manifest.digest);
+        let path = version.manifest();
         durable::create_dir_all(version.root()).map_err(|source| FetchError::disk(version.root(), source))?;
         durable::write(&path, &bytes, 0o644).map_err(|source| FetchError::disk(&path, source))?;
         Ok(manifest)
@@ -367,8 +368,9 @@ impl Fetcher {
     }
 }
 
-fn stored_manifest(path: &Path, package: &PackageRef) -> Option<TaskManifest> {
-    let bytes = fs::read(path).ok()?;
+/// The package's task manifest if it was pulled before and is still there whole.
+pub fn stored_manifest(data: &DataDir, package: &PackageRef) -> Option<TaskManifest> {
+    let bytes = fs::read(data.task(&package.name).version(&package.manifest.digest).manifest()).ok()?;
     if Digest::of(&bytes) != package.config.digest {
         return None;
     }

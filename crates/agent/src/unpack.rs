@@ -10,7 +10,10 @@ mod tree;
 use std::io::{self, BufRead, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
 
-use task_proto::manifest::ContentFacts;
+use task_proto::manifest::{
+    CONTENT_RATIO_FREE_BYTES, ContentFacts, MAX_CONTENT_DEPTH, MAX_CONTENT_ENTRIES, MAX_CONTENT_RATIO,
+    MAX_CONTENT_TAR_BYTES,
+};
 
 use self::entry::{Entry, Kind};
 use self::tree::Tree;
@@ -19,10 +22,8 @@ const BLOCK_BYTES: usize = 512;
 const COPY_BUFFER_BYTES: usize = 128 * 1024;
 /// The decoder holds a frame's whole window in memory. 2^24 is what zstd's levels up to 19 need, and a little more.
 const WINDOW_LOG_MAX: u32 = 24;
-/// Small packages may compress as well as they like: a bomb needs room.
-const RATIO_FREE_BYTES: u64 = 64 << 20;
 
-/// How large a package may get on this robot.
+/// How large a package may get on this robot. The default is what a packer holds to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Limits {
     /// Uncompressed bytes.
@@ -31,13 +32,18 @@ pub struct Limits {
     pub entries: u64,
     /// Components of a path.
     pub depth: usize,
-    /// Uncompressed bytes for one compressed byte, beyond the first 64 MiB.
+    /// Uncompressed bytes for one compressed byte. Small packages may compress as well as they like: a bomb needs room.
     pub ratio: u64,
 }
 
 impl Default for Limits {
     fn default() -> Self {
-        Self { bytes: 16 << 30, entries: 100_000, depth: 48, ratio: 200 }
+        Self {
+            bytes: MAX_CONTENT_TAR_BYTES,
+            entries: MAX_CONTENT_ENTRIES,
+            depth: MAX_CONTENT_DEPTH,
+            ratio: MAX_CONTENT_RATIO,
+        }
     }
 }
 
@@ -147,7 +153,7 @@ pub fn unpack(
 
 /// Holds what the manifest announces against the limits, before anything is written.
 fn admit(content_size: u64, facts: &ContentFacts, limits: &Limits) -> Result<(), Refusal> {
-    let unpacked_limit = content_size.saturating_mul(limits.ratio).max(RATIO_FREE_BYTES);
+    let unpacked_limit = content_size.saturating_mul(limits.ratio).max(CONTENT_RATIO_FREE_BYTES);
     for (what, found, limit) in [
         ("uncompressed bytes", facts.tar_size, limits.bytes),
         ("uncompressed bytes for so few compressed ones", facts.tar_size, unpacked_limit),

@@ -292,6 +292,10 @@ failure_codes! {
     DIGEST_MISMATCH = "digest_mismatch";
     /// The package can't be had from the server: deleted, or access refused.
     PACKAGE_UNAVAILABLE = "package_unavailable";
+    /// The server can't be reached, is overloaded, or something else answers in its place.
+    SERVER_UNREACHABLE = "server_unreachable";
+    /// The server does not accept the robot's token.
+    UNAUTHORIZED = "unauthorized";
     /// The task manifest does not parse or contradicts the order.
     MANIFEST_INVALID = "manifest_invalid";
     /// An archive entry that is not allowed, or more of them than the limits.

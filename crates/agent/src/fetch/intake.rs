@@ -74,7 +74,9 @@ impl Intake {
             tracing::warn!(%error, part = %part.display(), "what a pull left can't be removed");
         }
         match result {
-            Err(FetchError::Disk { source, .. }) if source.kind() == io::ErrorKind::StorageFull => {
+            Err(FetchError::Disk { source, .. })
+                if matches!(source.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded) =>
+            {
                 let parent = part.parent().unwrap_or(&part);
                 let room = disk::room(parent).map_err(|source| FetchError::disk(parent, source))?;
                 Err(disk::DiskFull { free: room.free, total: room.total, need }.into())

@@ -3,10 +3,10 @@
 
 use std::io::Read;
 
+use task_proto::manifest::MAX_CONTENT_PATH_BYTES;
+
 use super::{Archive, BLOCK_BYTES, Refusal, UnpackError};
 
-/// The longest path or link target.
-const MAX_PATH_BYTES: usize = 1024;
 /// The longest name of one file: what Linux file systems take.
 const MAX_COMPONENT_BYTES: usize = 255;
 /// The largest block of PAX records.
@@ -179,8 +179,8 @@ fn text(bytes: &[u8]) -> Result<&str, String> {
     if bytes.is_empty() {
         return Err("the path is empty".to_owned());
     }
-    if bytes.len() > MAX_PATH_BYTES {
-        return Err(format!("the path is longer than {MAX_PATH_BYTES} bytes"));
+    if bytes.len() > MAX_CONTENT_PATH_BYTES {
+        return Err(format!("the path is longer than {MAX_CONTENT_PATH_BYTES} bytes"));
     }
     let text = std::str::from_utf8(bytes).map_err(|_| "the path is not UTF-8".to_owned())?;
     if text.chars().any(char::is_control) {
@@ -196,8 +196,8 @@ fn checksum(block: &[u8; BLOCK_BYTES]) -> u32 {
 }
 
 fn long_name<R: Read>(archive: &mut Archive<R>, size: u64) -> Result<Vec<u8>, UnpackError> {
-    if size > MAX_PATH_BYTES as u64 + 1 {
-        return Err(archive.damaged(format!("a name is longer than {MAX_PATH_BYTES} bytes")));
+    if size > MAX_CONTENT_PATH_BYTES as u64 + 1 {
+        return Err(archive.damaged(format!("a name is longer than {MAX_CONTENT_PATH_BYTES} bytes")));
     }
     let mut name = archive.collect(size)?;
     if name.last() == Some(&0) {

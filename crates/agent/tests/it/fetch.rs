@@ -16,7 +16,7 @@ use task_agent::layout::{DataDir, VersionDir};
 use task_proto::Digest;
 use task_proto::desired::{BlobRef, PackageRef};
 use task_proto::manifest::{ContentFacts, TaskManifest};
-use task_proto::report::Progress;
+use task_proto::report::{FailureCode, Progress};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
@@ -347,7 +347,7 @@ async fn wrong_bytes_are_never_used_nor_kept() {
         site.answers([answer.clone()]);
         let error = site.pull().await.unwrap_err();
         assert!(matches!(error, FetchError::DigestMismatch { .. }), "{answer:?}: {error:?}");
-        assert_eq!((error.code(), error.is_retryable()), ("digest_mismatch", false));
+        assert_eq!((error.code(), error.is_retryable()), (Some(FailureCode::DIGEST_MISMATCH), false));
         assert!(!site.part().exists() && !site.version().src().exists());
         site.assert_nothing_staged();
     }
@@ -364,7 +364,7 @@ async fn what_is_not_the_server_counts_as_not_reached() {
         site.answers([answer.clone()]);
         let error = site.pull().await.unwrap_err();
         assert!(matches!(error, FetchError::NotTheServer(_)), "{answer:?}: {error:?}");
-        assert_eq!((error.code(), error.is_retryable()), ("server_unreachable", true));
+        assert_eq!((error.code(), error.is_retryable()), (Some(FailureCode::SERVER_UNREACHABLE), true));
         assert_eq!(fs::metadata(site.part()).unwrap().len(), 1000);
     }
 }
@@ -373,19 +373,23 @@ async fn what_is_not_the_server_counts_as_not_reached() {
 async fn statuses_say_whether_to_come_back() {
     let seconds = |seconds| Some(Duration::from_secs(seconds));
     for (status, retry_after, code, retryable, wait) in [
-        (503, Some("7"), "server_busy", true, seconds(7)),
-        (429, Some("999999"), "server_busy", true, seconds(3600)),
-        (500, Some("Fri, 31 Dec 1999 23:59:59 GMT"), "server_busy", true, None),
-        (502, None, "server_busy", true, None),
-        (401, None, "unauthorized", true, None),
-        (403, None, "package_unavailable", false, None),
-        (404, None, "package_unavailable", false, None),
-        (410, None, "package_unavailable", false, None),
+        (503, Some("7"), FailureCode::SERVER_UNREACHABLE, true, seconds(7)),
+        (429, Some("999999"), FailureCode::SERVER_UNREACHABLE, true, seconds(3600)),
+        (500, Some("Fri, 31 Dec 1999 23:59:59 GMT"), FailureCode::SERVER_UNREACHABLE, true, None),
+        (502, None, FailureCode::SERVER_UNREACHABLE, true, None),
+        (401, None, FailureCode::UNAUTHORIZED, true, None),
+        (403, None, FailureCode::PACKAGE_UNAVAILABLE, false, None),
+        (404, None, FailureCode::PACKAGE_UNAVAILABLE, false, None),
+        (410, None, FailureCode::PACKAGE_UNAVAILABLE, false, None),
     ] {
         let site = Site::new(&tar()).await;
         site.answers([Answer::Status(status, retry_after.map(|value| ("retry-after", value)).into_iter().collect())]);
         let error = site.pull().await.unwrap_err();
-        assert_eq!((error.code(), error.is_retryable(), error.retry_after()), (code, retryable, wait), "{status}");
+        assert_eq!(
+            (error.code(), error.is_retryable(), error.retry_after()),
+            (Some(code), retryable, wait),
+            "{status}"
+        );
     }
 }
 
@@ -403,7 +407,7 @@ async fn a_refused_archive_is_blamed_only_when_its_bytes_are_the_ordered_ones() 
     let hostile = Tar::default().file("../escape", b"x").file("data", &noise()).end();
     let site = Site::new(&hostile).await;
     let error = site.pull().await.unwrap_err();
-    assert_eq!((error.code(), error.is_retryable()), ("archive_refused", false));
+    assert_eq!((error.code(), error.is_retryable()), (Some(FailureCode::ARCHIVE_REFUSED), false));
     assert!(error.to_string().contains("the path has '..'"), "{error}");
     assert!(!site.part().exists() && !site.version().src().exists());
     site.assert_nothing_staged();
@@ -413,7 +417,7 @@ async fn a_refused_archive_is_blamed_only_when_its_bytes_are_the_ordered_ones() 
 async fn too_little_room_is_said_before_anything_travels() {
     let site = Site::with(&tar(), FetchSettings { reserve_bytes: u64::MAX, ..settings() }).await;
     let error = site.pull().await.unwrap_err();
-    assert_eq!(error.code(), "disk_full");
+    assert_eq!(error.code(), Some(FailureCode::DISK_FULL));
     assert!(error.to_string().contains("in reserve"), "{error}");
     assert_eq!(site.asked(), [0; 0]);
 }
@@ -433,7 +437,7 @@ async fn a_manifest_for_something_else_is_refused() {
     let cancel = CancellationToken::new();
     site.package.version = "2.0.0".parse().unwrap();
     let error = site.fetcher.manifest(&site.package, &cancel).await.unwrap_err();
-    assert_eq!(error.code(), "manifest_invalid");
+    assert_eq!(error.code(), Some(FailureCode::MANIFEST_INVALID));
     site.package.config.size = 2 << 20;
     let error = site.fetcher.manifest(&site.package, &cancel).await.unwrap_err();
     assert!(error.to_string().contains("at most 1048576 are allowed"), "{error}");
@@ -447,5 +451,5 @@ async fn an_unreachable_server_is_tried_again_later() {
     let server = format!("http://{nowhere}").parse().unwrap();
     let fetcher = Fetcher::new(client(), server, TOKEN.to_owned(), site.data.clone(), settings());
     let error = fetcher.manifest(&site.package, &CancellationToken::new()).await.unwrap_err();
-    assert_eq!((error.code(), error.is_retryable()), ("server_unreachable", true));
+    assert_eq!((error.code(), error.is_retryable()), (Some(FailureCode::SERVER_UNREACHABLE), true));
 }

@@ -2,5 +2,6 @@
 //! It never holds SQL and never decides what an order means.
 
 pub mod auth;
+pub mod drain;
 pub mod error;
 pub mod oci;

@@ -55,12 +55,12 @@ impl Containment {
     pub fn signal_group(&self, group: u32, signal: Signal) -> io::Result<()> {
         let (table, members) = self.entries()?;
         let in_group: HashSet<u32> = table.iter().filter(|e| e.group == group).map(|e| e.pid).collect();
-        members.iter().filter(|member| in_group.contains(&member.pid)).try_for_each(|member| member.signal(signal))
+        signal_each(members.iter().filter(|member| in_group.contains(&member.pid)), signal)
     }
 
     /// Sends `signal` to all members.
     pub fn signal_all(&self, signal: Signal) -> io::Result<()> {
-        self.members()?.iter().try_for_each(|member| member.signal(signal))
+        signal_each(&self.members()?, signal)
     }
 
     /// Kills all members. They are stopped first, until a look finds no new one, so that none forks away between the
@@ -72,13 +72,12 @@ impl Containment {
             if new.is_empty() {
                 break;
             }
-            for member in new {
-                member.signal(Signal::SIGSTOP)?;
-                stopped.insert(member);
-            }
+            // Refused or not: the SIGKILL below goes to all of them and gives the error.
+            let _ = signal_each(&new, Signal::SIGSTOP);
+            stopped.extend(new);
         }
         let killed: Vec<_> = stopped.into_iter().collect();
-        killed.iter().try_for_each(|member| member.signal(Signal::SIGKILL))?;
+        signal_each(&killed, Signal::SIGKILL)?;
         Ok(killed)
     }
 
@@ -119,6 +118,11 @@ impl Containment {
         let members = table.iter().filter(is_member).map(|entry| entry.identity(&boot_id)).collect();
         Ok((table, members))
     }
+}
+
+/// Signals all of them, also when one can't be, and then gives the last error.
+fn signal_each<'a>(members: impl IntoIterator<Item = &'a ProcessIdentity>, signal: Signal) -> io::Result<()> {
+    members.into_iter().map(|member| member.signal(signal)).fold(Ok(()), |all, one| one.and(all))
 }
 
 fn descendants(table: &[ProcessEntry], ancestor: u32) -> HashSet<u32> {

@@ -2,9 +2,9 @@
 //! when the disk is full the output is dropped and counted, because a task that blocks on its own log is worse.
 
 use std::fs::{File, OpenOptions};
-use std::io::{self, Read, Write};
+use std::io::{self, Read, Seek, SeekFrom, Write};
 use std::os::unix::fs::OpenOptionsExt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use crate::run_dir::LogSpec;
 
@@ -22,6 +22,21 @@ pub struct RotatedLog {
 struct Current {
     file: File,
     size: u64,
+}
+
+/// The last lines of the log at `path`, at most `max_bytes` of them; empty when there is no log.
+pub fn last_lines(path: &Path, max_bytes: u64) -> String {
+    let read = || {
+        let mut file = File::open(path)?;
+        let begin = file.metadata()?.len().saturating_sub(max_bytes);
+        file.seek(SeekFrom::Start(begin))?;
+        let mut bytes = Vec::new();
+        file.take(max_bytes).read_to_end(&mut bytes)?;
+        // What was cut in the middle of a line is not worth showing, unless there is nothing else.
+        let cut = if begin == 0 { 0 } else { bytes.iter().position(|byte| *byte == b'\n').map_or(0, |at| at + 1) };
+        Ok::<_, io::Error>(String::from_utf8_lossy(&bytes[cut..]).into_owned())
+    };
+    read().unwrap_or_default()
 }
 
 impl RotatedLog {
@@ -137,8 +152,8 @@ mod tests {
         let path = temp.path().join("task.log");
         let mut log = RotatedLog::new(LogSpec { path: path.clone(), max_bytes: 10, files: 3 });
         log.copy_from(&b"one\ntwo\nthree\nfour\nfive\nsix\n"[..]);
-        assert_eq!(read(path.clone()), "five\nsix\n");
-        assert_eq!(read(log.aged(1)), "four\n");
+        assert_eq!(read(path.clone()), "six\n");
+        assert_eq!(read(log.aged(1)), "four\nfive\n");
         assert_eq!(read(log.aged(2)), "three\n");
         assert_eq!(std::fs::read_dir(temp.path()).expect("list").count(), 3);
     }
@@ -161,6 +176,17 @@ mod tests {
         std::fs::create_dir(temp.path().join("later")).expect("create");
         log.write(b"kept");
         assert_eq!(read(path), "\n[taskd: 4 bytes of output could not be written here]\nkept");
+    }
+
+    #[test]
+    fn the_last_lines_are_whole() {
+        let temp = tempfile::tempdir().expect("temp dir");
+        let path = temp.path().join("task.log");
+        assert_eq!(last_lines(&path, 10), "");
+        std::fs::write(&path, "one\ntwo\nthree\n").expect("write");
+        assert_eq!(last_lines(&path, 100), "one\ntwo\nthree\n");
+        assert_eq!(last_lines(&path, 8), "three\n");
+        assert_eq!(last_lines(&path, 3), "");
     }
 
     #[test]

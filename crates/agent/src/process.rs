@@ -131,7 +131,8 @@ impl ProcessEntry {
         for item in std::fs::read_dir("/proc")? {
             let name = item?.file_name();
             if let Some(pid) = name.to_str().and_then(|name| name.parse().ok()) {
-                entries.extend(Self::of(pid)?);
+                // One that another user hides is not of our making.
+                entries.extend(Self::of(pid).ok().flatten());
             }
         }
         Ok(entries)
@@ -276,10 +277,10 @@ pub fn spawn_build(
     let prepare = move || {
         reset_for_exec()?;
         // Being nice is a courtesy: where it is refused the build still runs.
-        // SAFETY: both calls take integers only. The second is ioprio_set(this process, idle class).
+        // SAFETY: both calls take integers only. The second is ioprio_set(this process, best effort, last).
         let _ = unsafe {
             libc::setpriority(libc::PRIO_PROCESS, 0, priority.nice)
-                | libc::syscall(libc::SYS_ioprio_set, 1, 0, 3 << 13) as libc::c_int
+                | libc::syscall(libc::SYS_ioprio_set, 1, 0, (2 << 13) | 7) as libc::c_int
         };
         if let Some(bytes) = priority.memory_bytes {
             setrlimit(Resource::RLIMIT_AS, bytes, bytes)?;

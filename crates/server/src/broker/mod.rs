@@ -18,6 +18,7 @@ use task_proto::topic::{RobotTopic, TopicPrefix};
 use tokio::sync::watch;
 
 use front::Front;
+use router::Router;
 
 /// What a client shows at the door.
 #[derive(Clone)]
@@ -202,8 +203,11 @@ impl Broker {
         gatekeeper: Arc<dyn Gatekeeper>,
         inbox: Arc<dyn Inbox>,
     ) -> Result<Self, BrokerError> {
-        let front = Front::start(config, gatekeeper, inbox).await?;
-        let health = watchdog::start(front.clone());
+        let limits = config.limits.clone();
+        let router = Router::start(&config.prefix, limits.max_operators).await;
+        let router = router.map_err(|error| BrokerError::Router { reason: error.to_string() })?;
+        let front = Front::start(config, gatekeeper, inbox, router.clone()).await?;
+        let health = watchdog::start(&front, router, &limits);
         Ok(Self { front, health })
     }
 
@@ -213,7 +217,7 @@ impl Broker {
         self.front.ring(robot, payload)
     }
 
-    /// Ends the robot's session, if it has one: its token was revoked or it was removed. Its will counts as unsaid.
+    /// Ends the robot's session, if it has one: its token was revoked or it was removed.
     pub fn disconnect(&self, robot: &RobotId) {
         self.front.disconnect(robot);
     }

@@ -1,1 +1,295 @@
-//! The rumqttd router.
+//! Owns rumqttd's router thread: what is published here reaches every listener. It never sees a client's bytes, topics
+//! or filters unchecked, because its thread dies of some of them; and since the router keeps a log for each filter and a
+//! record for each link name for ever, it gets two filters and a fixed set of names. Listeners pick out what they want.
+
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use bytes::Bytes;
+use rumqttd::local::{LinkBuilder, LinkError, LinkRx, LinkTx};
+use rumqttd::protocol::{Disconnect, DisconnectReasonCode, Packet, Publish, QoS};
+use rumqttd::{Notification, RouterConfig};
+use task_proto::topic::TopicPrefix;
+use tokio::sync::{Notify, oneshot};
+use tokio_util::sync::CancellationToken;
+
+/// What the watchdog's canary travels on. No prefix can contain a space, so it meets nobody else.
+pub(super) const CANARY_TOPIC: &str = "router canary";
+/// What the publishing link may have waiting; the router being this far behind, messages to listeners are dropped.
+const MAX_BACKLOG: usize = 1000;
+/// The router's log for each of the two filters: so much may a listener fall behind before it misses messages.
+const SEGMENT_BYTES: usize = 2 * 1024 * 1024;
+const SEGMENTS: usize = 4;
+/// Messages the router hands a listener at a time.
+const MAX_BATCH: u64 = 32;
+/// For the router to answer a new link.
+const LINK_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// The router, also across restarts of its thread.
+pub(super) struct Router {
+    everything: String,
+    slots: Mutex<Vec<usize>>,
+    max_listeners: usize,
+    listeners: AtomicUsize,
+    current: Mutex<Arc<Running>>,
+    trouble: Notify,
+}
+
+/// One life of the router's thread.
+struct Running {
+    connect: Connect,
+    publisher: Mutex<LinkTx>,
+    /// Ends when another life has taken this one's place.
+    replaced: CancellationToken,
+}
+
+/// Builds a link by name, if the thread lives. It blocks. (The router's sender has a type that can't be named, so it lives in a closure.)
+type Connect = Arc<dyn Fn(&str) -> Option<(LinkTx, LinkRx)> + Send + Sync>;
+
+/// What a listener asks for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Listening {
+    /// Everything below the prefix.
+    Everything,
+    /// Canaries.
+    Canary,
+}
+
+/// A message as it comes out of the router.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Heard {
+    pub(super) topic: String,
+    pub(super) payload: Bytes,
+    pub(super) qos: QoS,
+}
+
+/// Why there is no listener, or no longer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub(super) enum RouterError {
+    #[error("the router's thread has ended")]
+    Gone,
+    #[error("the router does not answer")]
+    Stuck,
+    #[error("as many listeners as there may be")]
+    Full,
+}
+
+impl Router {
+    /// Starts the router's thread.
+    pub(super) async fn start(prefix: &TopicPrefix, max_listeners: usize) -> Result<Arc<Self>, RouterError> {
+        // One more for the publisher and one for the canary.
+        let everything = format!("{prefix}/#");
+        let running = Running::start(&everything, max_listeners + 2).await?;
+        Ok(Arc::new(Self {
+            everything,
+            slots: Mutex::new((0..=max_listeners).rev().collect()),
+            max_listeners,
+            listeners: AtomicUsize::new(0),
+            current: Mutex::new(Arc::new(running)),
+            trouble: Notify::new(),
+        }))
+    }
+
+    /// Starts over with a new thread. Listeners of the old one find that it is gone.
+    pub(super) async fn restart(&self) -> Result<(), RouterError> {
+        let running = Arc::new(Running::start(&self.everything, self.max_listeners + 2).await?);
+        let before = std::mem::replace(&mut *lock(&self.current), running);
+        before.replaced.cancel();
+        Ok(())
+    }
+
+    /// Publishes to whoever listens now. It never waits; what a router in trouble can't take is dropped, and the
+    /// watchdog told.
+    pub(super) fn publish(&self, topic: &str, qos: QoS, payload: Bytes) {
+        if topic != CANARY_TOPIC && self.listeners.load(Ordering::Relaxed) == 0 {
+            return;
+        }
+        let running = lock(&self.current).clone();
+        let mut publisher = lock(&running.publisher);
+        if publisher.buffer().len() >= MAX_BACKLOG {
+            tracing::debug!(topic, "the router is behind, a message for listeners is dropped");
+            return;
+        }
+        // Inside the router all is QoS 0, so the real one travels as one more level of the topic.
+        let message = Publish::new(Bytes::from(format!("{topic}/{}", qos as u8)), payload, false);
+        publisher.buffer().push_back(Packet::Publish(message, None));
+        // Says that there is something in the buffer; a full channel has such notes in it already.
+        if let Err(LinkError::TrySend(flume::TrySendError::Disconnected(_))) = publisher.try_unsubscribe(NOTHING) {
+            self.trouble.notify_one();
+        }
+    }
+
+    /// A new listener, which hears what is published from now on.
+    pub(super) async fn listen(self: &Arc<Self>, listening: Listening) -> Result<Listener, RouterError> {
+        let place = Place::take(self.clone(), listening)?;
+        let running = lock(&self.current).clone();
+        let filter = match listening {
+            Listening::Everything => self.everything.clone(),
+            Listening::Canary => format!("{CANARY_TOPIC}/#"),
+        };
+        let link = Link::open(&running.connect, format!("listener-{}", place.slot), Some(place)).await?;
+        let mut listener = Listener { link, replaced: running.replaced.clone(), owes_ready: false };
+        listener.subscribe(filter).await?;
+        Ok(listener)
+    }
+
+    /// Returns when something was seen that only a dead router explains.
+    pub(super) async fn trouble(&self) {
+        self.trouble.notified().await;
+    }
+
+    /// Kills the router's thread the way a client once could: by a topic that is not ASCII.
+    #[cfg(test)]
+    pub(super) fn kill(&self) {
+        let running = lock(&self.current).clone();
+        let _ = lock(&running.publisher).publish("é", "x");
+    }
+}
+
+/// A filter that nobody subscribes to.
+const NOTHING: &str = "";
+
+impl Running {
+    async fn start(everything: &str, max_connections: usize) -> Result<Self, RouterError> {
+        let config = RouterConfig {
+            max_connections,
+            max_outgoing_packet_count: MAX_BATCH,
+            max_segment_size: SEGMENT_BYTES,
+            max_segment_count: SEGMENTS,
+            initialized_filters: Some(vec![everything.to_owned(), format!("{CANARY_TOPIC}/#")]),
+            ..RouterConfig::default()
+        };
+        let sender = rumqttd::Router::new(0, config).spawn();
+        let connect: Connect =
+            Arc::new(move |name| LinkBuilder::new(name, sender.clone()).build().ok().map(|(tx, rx, _)| (tx, rx)));
+        let mut link = Link::open(&connect, "publisher".to_owned(), None).await?;
+        let publisher = link.tx.take().ok_or(RouterError::Gone)?;
+        Ok(Self { connect, publisher: Mutex::new(publisher), replaced: CancellationToken::new() })
+    }
+}
+
+/// A link to the router's thread, which hears of it when this is dropped.
+struct Link {
+    tx: Option<LinkTx>,
+    rx: LinkRx,
+    /// Free again only after the router was told that the link is gone.
+    _place: Option<Place>,
+}
+
+impl Link {
+    async fn open(connect: &Connect, name: String, place: Option<Place>) -> Result<Self, RouterError> {
+        let (reply, answer) = oneshot::channel();
+        let connect = connect.clone();
+        tokio::task::spawn_blocking(move || {
+            let link = connect(&name).map(|(tx, rx)| Link { tx: Some(tx), rx, _place: place });
+            // If nobody waits any more, the link is dropped, and so closed, right here.
+            let _ = reply.send(link);
+        });
+        match tokio::time::timeout(LINK_TIMEOUT, answer).await {
+            Ok(Ok(Some(link))) => Ok(link),
+            Ok(_) => Err(RouterError::Gone),
+            Err(_) => Err(RouterError::Stuck),
+        }
+    }
+}
+
+impl Drop for Link {
+    fn drop(&mut self) {
+        let Some(mut tx) = self.tx.take() else { return };
+        let reason_code = DisconnectReasonCode::NormalDisconnection;
+        tx.buffer().push_back(Packet::Disconnect(Disconnect { reason_code }, None));
+        if let Err(LinkError::TrySend(flume::TrySendError::Full(_))) = tx.try_unsubscribe(NOTHING)
+            && let Ok(runtime) = tokio::runtime::Handle::try_current()
+        {
+            // The router is busy and must not miss this: wait for it where waiting is allowed.
+            runtime.spawn_blocking(move || tx.unsubscribe(NOTHING).is_ok());
+        }
+    }
+}
+
+/// One of the names that links to the router have, free again when this is dropped.
+struct Place {
+    router: Arc<Router>,
+    slot: usize,
+    listening: Listening,
+}
+
+impl Place {
+    fn take(router: Arc<Router>, listening: Listening) -> Result<Self, RouterError> {
+        let slot = lock(&router.slots).pop().ok_or(RouterError::Full)?;
+        if listening == Listening::Everything {
+            router.listeners.fetch_add(1, Ordering::Relaxed);
+        }
+        Ok(Self { router, slot, listening })
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        if self.listening == Listening::Everything {
+            self.router.listeners.fetch_sub(1, Ordering::Relaxed);
+        }
+        lock(&self.router.slots).push(self.slot);
+    }
+}
+
+/// Hears what is published.
+pub(super) struct Listener {
+    link: Link,
+    replaced: CancellationToken,
+    /// The router waits to be told that what it handed over was taken.
+    owes_ready: bool,
+}
+
+impl Listener {
+    async fn subscribe(&mut self, filter: String) -> Result<(), RouterError> {
+        let tx = self.link.tx.as_mut().ok_or(RouterError::Gone)?;
+        tx.try_subscribe(filter).map_err(|error| match error {
+            LinkError::TrySend(flume::TrySendError::Full(_)) => RouterError::Stuck,
+            _ => RouterError::Gone,
+        })?;
+        let acknowledged = async {
+            while !matches!(self.notification().await?, Some(Notification::DeviceAck(_))) {}
+            Ok(())
+        };
+        tokio::time::timeout(LINK_TIMEOUT, acknowledged).await.unwrap_or(Err(RouterError::Stuck))
+    }
+
+    /// The next message. Cancel-safe.
+    pub(super) async fn next(&mut self) -> Result<Heard, RouterError> {
+        loop {
+            if self.owes_ready {
+                self.link.rx.wake().await.map_err(|_| RouterError::Gone)?;
+                self.owes_ready = false;
+            }
+            match self.notification().await? {
+                Some(Notification::Forward(forward)) => {
+                    return heard(forward.publish).ok_or(RouterError::Gone);
+                }
+                // The last of its batch.
+                Some(Notification::Unschedule) => self.owes_ready = true,
+                _ => {}
+            }
+        }
+    }
+
+    async fn notification(&mut self) -> Result<Option<Notification>, RouterError> {
+        tokio::select! {
+            notification = self.link.rx.next() => notification.map_err(|_| RouterError::Gone),
+            () = self.replaced.cancelled() => Err(RouterError::Gone),
+        }
+    }
+}
+
+/// Undoes what [`Router::publish`] did to the topic.
+fn heard(publish: Publish) -> Option<Heard> {
+    let (topic, qos) = std::str::from_utf8(&publish.topic).ok()?.rsplit_once('/')?;
+    let qos = rumqttd::protocol::qos(qos.parse().ok()?)?;
+    Some(Heard { topic: topic.to_owned(), payload: publish.payload, qos })
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    // Every change under these locks is complete in itself, so a panic elsewhere leaves nothing half-done.
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

@@ -1,6 +1,15 @@
-//! The MQTT front: everything between the network and the inbox or the router.
+//! The MQTT front: all that lies between the network and the inbox or the router. rumqttd's own listeners must not face
+//! clients; what they get wrong is done here: admission, access, takeover, wills, time limits, bounds on memory.
+//! It never retains a message and never keeps a session beyond its connection; the retain flag and the wish for a
+//! lasting session are ignored.
 
+mod access;
+mod codec;
 mod doorbell;
+mod entrance;
+mod listener;
+mod outgoing;
+mod session;
 mod takeover;
 
 use std::net::SocketAddr;
@@ -9,56 +18,88 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use task_proto::RobotId;
+use task_proto::topic::TopicPrefix;
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-use super::{BrokerConfig, BrokerError, Gatekeeper, Inbox, NotConnected};
+use super::router::Router;
+use super::{BrokerConfig, BrokerError, Gatekeeper, Inbox, Limits, NotConnected};
+pub(super) use entrance::{CANARY_ID, CanaryPass};
 use takeover::Seats;
 
+/// The running front.
 pub(super) struct Front {
     local_addr: SocketAddr,
-    seats: Arc<Seats>,
-    stop: CancellationToken,
+    context: Arc<Context>,
     sessions: TaskTracker,
 }
 
+/// What every session shares.
+struct Context {
+    prefix: TopicPrefix,
+    limits: Limits,
+    gatekeeper: Arc<dyn Gatekeeper>,
+    inbox: Arc<dyn Inbox>,
+    router: Arc<Router>,
+    seats: Arc<Seats>,
+    canary_pass: Arc<CanaryPass>,
+    stop: CancellationToken,
+}
+
 impl Front {
+    /// Binds the listener and begins to accept.
     pub(super) async fn start(
         config: BrokerConfig,
-        _gatekeeper: Arc<dyn Gatekeeper>,
-        _inbox: Arc<dyn Inbox>,
+        gatekeeper: Arc<dyn Gatekeeper>,
+        inbox: Arc<dyn Inbox>,
+        router: Arc<Router>,
     ) -> Result<Arc<Self>, BrokerError> {
         let listen = |source| BrokerError::Listen { address: config.listen, source };
         let listener = TcpListener::bind(config.listen).await.map_err(listen)?;
         let local_addr = listener.local_addr().map_err(listen)?;
-        Ok(Arc::new(Self {
-            local_addr,
+        let context = Arc::new(Context {
+            prefix: config.prefix,
+            limits: config.limits,
+            gatekeeper,
+            inbox,
+            router,
             seats: Arc::default(),
+            canary_pass: Arc::default(),
             stop: CancellationToken::new(),
-            sessions: TaskTracker::new(),
-        }))
+        });
+        let front = Arc::new(Self { local_addr, context, sessions: TaskTracker::new() });
+        tokio::spawn(listener::run(front.clone(), listener));
+        Ok(front)
     }
 
     pub(super) fn ring(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotConnected> {
-        self.seats.doorbell(robot).ok_or(NotConnected)?.ring(payload);
+        self.context.seats.doorbell(robot).ok_or(NotConnected)?.ring(payload);
         Ok(())
     }
 
     pub(super) fn disconnect(&self, robot: &RobotId) {
-        self.seats.ask_to_leave(robot);
+        self.context.seats.ask_to_leave(robot);
     }
 
     pub(super) fn connected_count(&self) -> usize {
-        self.seats.robots()
+        self.context.seats.robots()
     }
 
     pub(super) fn local_addr(&self) -> SocketAddr {
         self.local_addr
     }
 
+    pub(super) fn canary_pass(&self) -> Arc<CanaryPass> {
+        self.context.canary_pass.clone()
+    }
+
+    pub(super) fn stop(&self) -> CancellationToken {
+        self.context.stop.clone()
+    }
+
     pub(super) async fn shutdown(&self, patience: Duration) {
-        self.stop.cancel();
+        self.context.stop.cancel();
         self.sessions.close();
         if tokio::time::timeout(patience, self.sessions.wait()).await.is_err() {
             tracing::warn!(left = self.sessions.len(), "MQTT sessions did not end in time");

@@ -14,6 +14,8 @@ use super::doorbell::Doorbell;
 pub(super) enum SeatName {
     Robot(RobotId),
     Operator(String),
+    /// An operator who left the choice of a client id to us.
+    Unnamed(u128),
     Canary,
 }
 

@@ -1,0 +1,170 @@
+//! Who may say and hear what: pure functions of the visitor and the topic. It never looks anything up.
+
+use task_proto::RobotId;
+use task_proto::topic::{RobotTopic, Topic, TopicPrefix};
+
+use crate::broker::router::CANARY_TOPIC;
+
+/// Who a session belongs to.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Visitor {
+    Robot(RobotId),
+    Operator,
+    /// Our own watchdog.
+    Canary,
+}
+
+/// Where a message that may be published goes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Route {
+    /// To the inbox, to be stored before it is acknowledged, and then to whoever listens.
+    Inbox(RobotTopic),
+    /// To whoever listens.
+    Listeners,
+    /// Through the router whether anyone listens or not.
+    Canary,
+}
+
+/// What a session hears by a subscription that may be made.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Hearing {
+    /// The server's words to this robot, straight from its doorbell.
+    Desired,
+    /// The server's questions to this robot. Nothing asks yet.
+    Request,
+    /// What matches the filter among what goes through the router.
+    Router,
+}
+
+/// Where the visitor's message on `topic` goes; `None` if the visitor may not send it. A robot speaks on its own
+/// from-robot topics only, an operator not at all.
+pub(super) fn may_publish(visitor: &Visitor, prefix: &TopicPrefix, topic: &str) -> Option<Route> {
+    match visitor {
+        Visitor::Canary => (topic == CANARY_TOPIC).then_some(Route::Canary),
+        Visitor::Operator => None,
+        Visitor::Robot(robot) => match prefix.parse(topic)? {
+            Topic::Robot(owner, last) if owner == *robot => match last {
+                RobotTopic::Report | RobotTopic::Status | RobotTopic::Reply => Some(Route::Inbox(last)),
+                RobotTopic::Telemetry | RobotTopic::Log => Some(Route::Listeners),
+                RobotTopic::Desired | RobotTopic::Request => None,
+            },
+            Topic::Robot(..) | Topic::Package(_) => None,
+        },
+    }
+}
+
+/// What the visitor hears by a subscription to `filter`; `None` if the visitor may not make it. A robot hears what is
+/// said to it, by exact name; an operator anything whose first levels are the prefix.
+pub(super) fn may_subscribe(visitor: &Visitor, prefix: &TopicPrefix, filter: &str) -> Option<Hearing> {
+    match visitor {
+        Visitor::Canary => (filter == CANARY_TOPIC).then_some(Hearing::Router),
+        Visitor::Operator => {
+            filter.strip_prefix(prefix.as_str()).is_some_and(|rest| rest.starts_with('/')).then_some(Hearing::Router)
+        }
+        Visitor::Robot(robot) => match prefix.parse(filter)? {
+            Topic::Robot(owner, RobotTopic::Desired) if owner == *robot => Some(Hearing::Desired),
+            Topic::Robot(owner, RobotTopic::Request) if owner == *robot => Some(Hearing::Request),
+            // Direct-push opens this to the packages that are assigned to the robot.
+            Topic::Package(_) | Topic::Robot(..) => None,
+        },
+    }
+}
+
+/// Whether a valid filter matches a valid topic name, by MQTT 3.1.1 section 4.7.
+pub(super) fn matches(filter: &str, topic: &str) -> bool {
+    let mut levels = topic.split('/');
+    for wanted in filter.split('/') {
+        match (wanted, levels.next()) {
+            ("#", _) => return true,
+            (_, None) => return false,
+            ("+", Some(_)) => {}
+            (wanted, Some(level)) if wanted == level => {}
+            _ => return false,
+        }
+    }
+    levels.next().is_none()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn robot() -> Visitor {
+        Visitor::Robot("r00000000000000a1".parse().expect("valid"))
+    }
+
+    #[test]
+    fn a_robot_speaks_on_its_own_topics_only() {
+        let prefix = TopicPrefix::default();
+        let route = |topic: &str| may_publish(&robot(), &prefix, topic);
+        assert_eq!(route("taskd/v1/r/r00000000000000a1/report"), Some(Route::Inbox(RobotTopic::Report)));
+        assert_eq!(route("taskd/v1/r/r00000000000000a1/log"), Some(Route::Listeners));
+        for denied in [
+            "taskd/v1/r/r00000000000000a1/desired",
+            "taskd/v1/r/r00000000000000a1/request",
+            "taskd/v1/r/r00000000000000a2/report",
+            "taskd/v1/r/r00000000000000a1/report/",
+            "/taskd/v1/r/r00000000000000a1/report",
+            "$SYS/x",
+            "é",
+            CANARY_TOPIC,
+        ] {
+            assert_eq!(route(denied), None, "{denied}");
+        }
+        assert_eq!(may_publish(&Visitor::Operator, &prefix, "taskd/v1/r/r00000000000000a1/report"), None);
+    }
+
+    #[test]
+    fn a_robot_hears_only_what_is_said_to_it() {
+        let prefix = TopicPrefix::default();
+        let hearing = |filter: &str| may_subscribe(&robot(), &prefix, filter);
+        assert_eq!(hearing("taskd/v1/r/r00000000000000a1/desired"), Some(Hearing::Desired));
+        assert_eq!(hearing("taskd/v1/r/r00000000000000a1/request"), Some(Hearing::Request));
+        let package = format!("taskd/v1/p/{}", task_proto::Digest::of(b"x"));
+        for denied in [
+            "#",
+            "+/+/+/+/+",
+            "taskd/v1/#",
+            "taskd/v1/r/+/desired",
+            "taskd/v1/r/r00000000000000a1/#",
+            "taskd/v1/r/r00000000000000a1/+",
+            "taskd/v1/r/r00000000000000a1/report",
+            "taskd/v1/r/r00000000000000a2/desired",
+            "$share/g/taskd/v1/r/r00000000000000a1/desired",
+            package.as_str(),
+        ] {
+            assert_eq!(hearing(denied), None, "{denied}");
+        }
+    }
+
+    #[test]
+    fn an_operator_hears_what_lies_below_the_prefix() {
+        let prefix = TopicPrefix::default();
+        let hearing = |filter: &str| may_subscribe(&Visitor::Operator, &prefix, filter);
+        for allowed in ["taskd/v1/#", "taskd/v1/r/+/report", "taskd/v1/r/r00000000000000a1/status"] {
+            assert_eq!(hearing(allowed), Some(Hearing::Router), "{allowed}");
+        }
+        for denied in ["#", "+/v1/#", "taskd/#", "taskd/+/r/#", "taskd/v1", "taskd/v10/#", "$SYS/#", CANARY_TOPIC] {
+            assert_eq!(hearing(denied), None, "{denied}");
+        }
+    }
+
+    #[test]
+    fn filters_match_as_the_standard_says() {
+        for (filter, topic) in [
+            ("a/#", "a"),
+            ("a/#", "a/b/c"),
+            ("#", "a/b"),
+            ("+", "a"),
+            ("+/+", "/a"),
+            ("/+", "/a"),
+            ("a/+/c", "a//c"),
+            ("a/b", "a/b"),
+        ] {
+            assert!(matches(filter, topic), "{filter} {topic}");
+        }
+        for (filter, topic) in [("a/+", "a"), ("+", "/a"), ("a", "a/b"), ("a/b", "a"), ("a/+", "a/b/c"), ("A", "a")] {
+            assert!(!matches(filter, topic), "{filter} {topic}");
+        }
+    }
+}

@@ -1,0 +1,269 @@
+//! Reads what clients send: MQTT 3.1.1, strictly. rumqttd's decoder is not used, because it overlooks wrong flags,
+//! trailing bytes, zero packet ids and bad filters, some of which its router does not survive; its encoder is.
+//! It never answers anything and holds no state between packets.
+
+use bytes::{Buf, BufMut, Bytes, BytesMut};
+use rumqttd::protocol::v4::{V4, write_remaining_length};
+use rumqttd::protocol::{Packet, Protocol, QoS};
+
+/// A packet from a client, with everything checked that can be checked without knowing the session.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Received {
+    Connect(Connect),
+    Publish(Publish),
+    PubAck(u16),
+    PubRec(u16),
+    PubRel(u16),
+    PubComp(u16),
+    Subscribe { packet_id: u16, filters: Vec<(String, QoS)> },
+    Unsubscribe { packet_id: u16, filters: Vec<String> },
+    PingReq,
+    Disconnect,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Connect {
+    pub(super) client_id: String,
+    pub(super) clean_session: bool,
+    pub(super) keep_alive_s: u16,
+    pub(super) will: Option<Will>,
+    pub(super) user_name: Option<String>,
+    pub(super) password: Option<String>,
+}
+
+/// The retain flag is read and dropped: nothing is retained here.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Will {
+    pub(super) topic: String,
+    pub(super) payload: Bytes,
+    pub(super) qos: QoS,
+}
+
+/// As with the will, no retain flag. The packet id is 0 for QoS 0.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Publish {
+    pub(super) topic: String,
+    pub(super) qos: QoS,
+    pub(super) packet_id: u16,
+    pub(super) payload: Bytes,
+}
+
+/// Why bytes are not a packet. Only [`DecodeError::UnknownProtocol`] deserves an answer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub(super) enum DecodeError {
+    #[error("asks for a protocol other than MQTT 3.1.1")]
+    UnknownProtocol,
+    #[error("sends a packet of {0} bytes, which is too large")]
+    TooLarge(usize),
+    #[error("sends a malformed packet: {0}")]
+    Malformed(&'static str),
+}
+
+use DecodeError::Malformed;
+
+/// Takes one packet off the front of `input`; `None` if more bytes are needed. What is wrong is said as early as the
+/// bytes show it, so that nobody has to wait for the rest of a packet that will be refused.
+pub(super) fn decode(input: &mut BytesMut, max_bytes: usize) -> Result<Option<Received>, DecodeError> {
+    let Some(&first) = input.first() else { return Ok(None) };
+    check_first_byte(first)?;
+    let Some((length, header_bytes)) = remaining_length(&input[1..])? else { return Ok(None) };
+    if length > max_bytes {
+        return Err(DecodeError::TooLarge(length));
+    }
+    let whole = 1 + header_bytes + length;
+    if input.len() < whole {
+        return Ok(None);
+    }
+    let mut body = input.split_to(whole).freeze();
+    body.advance(1 + header_bytes);
+    decode_body(first, Body(body)).map(Some)
+}
+
+/// Writes `packet`, one that we send.
+pub(super) fn encode(packet: Packet, output: &mut BytesMut) {
+    if let Err(error) = V4.write(packet, output) {
+        // What we write is bounded and complete, so this is a bug; the client notices a missing packet by itself.
+        tracing::error!(%error, "could not encode an MQTT packet");
+    }
+}
+
+/// Writes a PUBLISH, which rumqttd lets nobody else build with a QoS.
+pub(super) fn encode_publish(publish: &Publish, output: &mut BytesMut) {
+    let (Publish { topic, qos, packet_id, payload }, before) = (publish, output.len());
+    let has_id = *qos != QoS::AtMostOnce;
+    let length = 2 + topic.len() + if has_id { 2 } else { 0 } + payload.len();
+    output.put_u8(0x30 | (*qos as u8) << 1);
+    let (Ok(topic_bytes), Ok(_)) = (u16::try_from(topic.len()), write_remaining_length(output, length)) else {
+        output.truncate(before);
+        tracing::error!(length, "could not encode an MQTT message");
+        return;
+    };
+    output.put_u16(topic_bytes);
+    output.put_slice(topic.as_bytes());
+    if has_id {
+        output.put_u16(*packet_id);
+    }
+    output.put_slice(payload);
+}
+
+/// The packet type, and the flags that go with it.
+fn check_first_byte(first: u8) -> Result<(), DecodeError> {
+    let flags = first & 0x0f;
+    match first >> 4 {
+        3 if flags & 0b0110 == 0b0110 => Err(Malformed("PUBLISH with QoS 3")),
+        3 if flags & 0b1110 == 0b1000 => Err(Malformed("PUBLISH with DUP and QoS 0")),
+        3 => Ok(()),
+        6 | 8 | 10 if flags == 0b0010 => Ok(()),
+        1 | 4 | 5 | 7 | 12 | 14 if flags == 0 => Ok(()),
+        1 | 4..=8 | 10 | 12 | 14 => Err(Malformed("reserved flags are set")),
+        2 | 9 | 11 | 13 => Err(Malformed("a packet that only servers send")),
+        _ => Err(Malformed("unknown packet type")),
+    }
+}
+
+/// The remaining length and how many bytes it took; `None` if it is not complete.
+fn remaining_length(input: &[u8]) -> Result<Option<(usize, usize)>, DecodeError> {
+    let mut length = 0;
+    for (index, byte) in input.iter().take(4).enumerate() {
+        length |= usize::from(byte & 0x7f) << (7 * index);
+        if byte & 0x80 == 0 {
+            return Ok(Some((length, index + 1)));
+        }
+    }
+    if input.len() >= 4 { Err(Malformed("remaining length of more than four bytes")) } else { Ok(None) }
+}
+
+fn decode_body(first: u8, mut body: Body) -> Result<Received, DecodeError> {
+    let received = match first >> 4 {
+        1 => Received::Connect(connect(&mut body)?),
+        3 => return publish(first, body).map(Received::Publish),
+        4 => Received::PubAck(body.packet_id()?),
+        5 => Received::PubRec(body.packet_id()?),
+        6 => Received::PubRel(body.packet_id()?),
+        7 => Received::PubComp(body.packet_id()?),
+        8 => Received::Subscribe { packet_id: body.packet_id()?, filters: body.list(filter_with_qos)? },
+        10 => Received::Unsubscribe { packet_id: body.packet_id()?, filters: body.list(filter)? },
+        12 => Received::PingReq,
+        _ => Received::Disconnect,
+    };
+    if body.0.is_empty() { Ok(received) } else { Err(Malformed("bytes after the end of the packet")) }
+}
+
+fn connect(body: &mut Body) -> Result<Connect, DecodeError> {
+    let name = body.binary()?;
+    let level = body.byte()?;
+    match (&name[..], level) {
+        (b"MQTT", 4) => {}
+        // 3.1, 5.0 and versions to come: the answer is a CONNACK that says so.
+        (b"MQTT", _) | (b"MQIsdp", 3) => return Err(DecodeError::UnknownProtocol),
+        _ => return Err(Malformed("not the protocol name MQTT")),
+    }
+    let flags = body.byte()?;
+    let will_bits = flags & 0b0011_1000;
+    if flags & 1 != 0 {
+        return Err(Malformed("CONNECT with the reserved flag"));
+    }
+    if flags & 0b100 == 0 && will_bits != 0 {
+        return Err(Malformed("CONNECT with a will's flags, but no will"));
+    }
+    if flags & 0b1100_0000 == 0b0100_0000 {
+        return Err(Malformed("CONNECT with a password, but no user name"));
+    }
+    let will_qos = qos((flags >> 3) & 0b11)?;
+    let keep_alive_s = body.number()?;
+    let client_id = body.text()?;
+    let will = if flags & 0b100 == 0 {
+        None
+    } else {
+        Some(Will { topic: topic_name(body)?, payload: body.binary()?, qos: will_qos })
+    };
+    let user_name = if flags & 0b1000_0000 == 0 { None } else { Some(body.text()?) };
+    // A password may be any bytes; ours are text, so whatever is lost here would have been refused anyway.
+    let password = match flags & 0b0100_0000 {
+        0 => None,
+        _ => Some(String::from_utf8_lossy(&body.binary()?).into_owned()),
+    };
+    Ok(Connect { client_id, clean_session: flags & 0b10 != 0, keep_alive_s, will, user_name, password })
+}
+
+fn publish(first: u8, mut body: Body) -> Result<Publish, DecodeError> {
+    let qos = qos((first >> 1) & 0b11)?;
+    let topic = topic_name(&mut body)?;
+    let packet_id = if qos == QoS::AtMostOnce { 0 } else { body.packet_id()? };
+    Ok(Publish { topic, qos, packet_id, payload: body.0 })
+}
+
+fn qos(bits: u8) -> Result<QoS, DecodeError> {
+    rumqttd::protocol::qos(bits).ok_or(Malformed("QoS 3"))
+}
+
+fn topic_name(body: &mut Body) -> Result<String, DecodeError> {
+    let name = body.text()?;
+    if name.is_empty() || name.contains(['+', '#']) {
+        return Err(Malformed("a topic name that is empty or has wildcards"));
+    }
+    Ok(name)
+}
+
+fn filter(body: &mut Body) -> Result<String, DecodeError> {
+    let filter = body.text()?;
+    let levels = filter.split('/').count();
+    let level_ok = |(index, level): (usize, &str)| match level {
+        "+" => true,
+        "#" => index + 1 == levels,
+        _ => !level.contains(['+', '#']),
+    };
+    if filter.is_empty() || !filter.split('/').enumerate().all(level_ok) {
+        return Err(Malformed("a topic filter that is empty or has misplaced wildcards"));
+    }
+    Ok(filter)
+}
+
+fn filter_with_qos(body: &mut Body) -> Result<(String, QoS), DecodeError> {
+    Ok((filter(body)?, qos(body.byte()?)?))
+}
+
+/// What is left of a packet.
+struct Body(Bytes);
+
+impl Body {
+    fn byte(&mut self) -> Result<u8, DecodeError> {
+        self.0.try_get_u8().map_err(|_| Malformed("it ends too early"))
+    }
+
+    fn number(&mut self) -> Result<u16, DecodeError> {
+        self.0.try_get_u16().map_err(|_| Malformed("it ends too early"))
+    }
+
+    fn packet_id(&mut self) -> Result<u16, DecodeError> {
+        match self.number()? {
+            0 => Err(Malformed("packet id 0")),
+            id => Ok(id),
+        }
+    }
+
+    fn binary(&mut self) -> Result<Bytes, DecodeError> {
+        let length = usize::from(self.number()?);
+        if length > self.0.len() {
+            return Err(Malformed("it ends too early"));
+        }
+        Ok(self.0.split_to(length))
+    }
+
+    fn text(&mut self) -> Result<String, DecodeError> {
+        let bytes = self.binary()?;
+        match std::str::from_utf8(&bytes) {
+            Ok(text) if !text.contains('\0') => Ok(text.to_owned()),
+            _ => Err(Malformed("text that is not UTF-8 or has a NUL")),
+        }
+    }
+
+    /// One or more of `item`, to the end.
+    fn list<T>(&mut self, item: fn(&mut Self) -> Result<T, DecodeError>) -> Result<Vec<T>, DecodeError> {
+        let mut items = vec![item(self)?];
+        while !self.0.is_empty() {
+            items.push(item(self)?);
+        }
+        Ok(items)
+    }
+}

@@ -1,0 +1,204 @@
+//! Lets a client in: one CONNECT, checked, admitted or refused with the right CONNACK. Until then a client gets little
+//! memory and little time. It never builds a session.
+
+use std::net::SocketAddr;
+use std::sync::{Mutex, PoisonError};
+use std::time::Duration;
+
+use bytes::BytesMut;
+use rumqttd::protocol::{ConnAck, ConnectReturnCode, Packet};
+use subtle::ConstantTimeEq;
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
+use tokio::time::timeout;
+
+use super::Context;
+use super::access::{Visitor, may_publish};
+use super::codec::{Connect, DecodeError, Received, Will, decode, encode};
+use super::takeover::SeatName;
+use crate::broker::{Login, Principal, Refusal};
+
+/// The largest CONNECT, in bytes after the fixed header.
+const MAX_CONNECT_BYTES: usize = 4 * 1024;
+/// The longest client id of an operator.
+const MAX_CLIENT_ID_BYTES: usize = 256;
+/// The watchdog's client id.
+pub(in crate::broker) const CANARY_ID: &str = "router canary";
+
+/// A client that may come in.
+pub(super) struct Guest {
+    pub(super) visitor: Visitor,
+    pub(super) seat_name: SeatName,
+    pub(super) keep_alive: Option<Duration>,
+    pub(super) will: Option<Will>,
+    /// What was sent after CONNECT already, without waiting for the answer.
+    pub(super) input: BytesMut,
+}
+
+/// Why a client does not come in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub(super) enum Rejection {
+    /// Nobody to answer: the client went away, was too slow, or does not speak MQTT.
+    #[error("{0}")]
+    Silent(&'static str),
+    #[error(transparent)]
+    Malformed(DecodeError),
+    /// Answered with a CONNACK.
+    #[error("{reason}")]
+    Answered { code: ConnectReturnCode, reason: &'static str },
+}
+
+/// The watchdog's password: good for one entry, then made anew.
+#[derive(Default)]
+pub(in crate::broker) struct CanaryPass(Mutex<Option<String>>);
+
+impl CanaryPass {
+    /// A new password in the place of the last.
+    pub(in crate::broker) fn renew(&self) -> String {
+        let secret = format!("{:032x}", rand::random::<u128>());
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Some(secret.clone());
+        secret
+    }
+
+    /// Whether `password` is the one; if so it is used up.
+    fn redeem(&self, password: &str) -> bool {
+        let mut secret = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let good = secret.as_ref().is_some_and(|secret| secret.as_bytes().ct_eq(password.as_bytes()).into());
+        if good {
+            *secret = None;
+        }
+        good
+    }
+}
+
+/// Reads CONNECT and finds out who it is.
+pub(super) async fn welcome<S>(context: &Context, stream: &mut S, peer: SocketAddr) -> Result<Guest, Rejection>
+where
+    S: AsyncRead + AsyncWrite + Unpin,
+{
+    let mut input = BytesMut::new();
+    let connect = timeout(context.limits.connect_timeout, read_connect(stream, &mut input))
+        .await
+        .unwrap_or(Err(Rejection::Silent("sends no CONNECT in time")))?;
+    if connect.client_id.is_empty() && !connect.clean_session {
+        return Err(answer(ConnectReturnCode::ClientIdentifierNotValid, "an empty client id without a clean session"));
+    }
+    let visitor = admit(context, &connect, peer).await?;
+    if let Some(will) = &connect.will
+        && may_publish(&visitor, &context.prefix, &will.topic).is_none()
+    {
+        return Err(answer(ConnectReturnCode::NotAuthorized, "a will on a topic that is not its own"));
+    }
+    let seat_name = match &visitor {
+        Visitor::Robot(robot) => SeatName::Robot(robot.clone()),
+        Visitor::Canary => SeatName::Canary,
+        Visitor::Operator if connect.client_id.is_empty() => SeatName::Unnamed(rand::random()),
+        Visitor::Operator => SeatName::Operator(connect.client_id),
+    };
+    // 3.1.2.10: one and a half times what the client promised.
+    let keep_alive = match connect.keep_alive_s {
+        0 => None,
+        seconds => Some(Duration::from_millis(u64::from(seconds) * 1500)),
+    };
+    Ok(Guest { visitor, seat_name, keep_alive, will: connect.will, input })
+}
+
+/// A CONNACK.
+pub(super) fn connack(code: ConnectReturnCode, output: &mut BytesMut) {
+    // Sessions are always clean, so there is never one to come back to.
+    encode(Packet::ConnAck(ConnAck { session_present: false, code }, None), output);
+}
+
+/// Tells the client why, as far as the protocol has an answer. Bounded by the write timeout.
+pub(super) async fn reject<S: AsyncWrite + Unpin>(context: &Context, stream: &mut S, rejection: Rejection) {
+    let code = match rejection {
+        Rejection::Answered { code, .. } => code,
+        Rejection::Malformed(DecodeError::UnknownProtocol) => ConnectReturnCode::RefusedProtocolVersion,
+        Rejection::Malformed(_) | Rejection::Silent(_) => return,
+    };
+    let mut output = BytesMut::new();
+    connack(code, &mut output);
+    // If it does not arrive the client sees the connection end, which says enough.
+    let _ = timeout(context.limits.write_timeout, stream.write_all(&output)).await;
+}
+
+fn answer(code: ConnectReturnCode, reason: &'static str) -> Rejection {
+    Rejection::Answered { code, reason }
+}
+
+async fn read_connect<S: AsyncRead + Unpin>(stream: &mut S, input: &mut BytesMut) -> Result<Connect, Rejection> {
+    loop {
+        if input.first().is_some_and(|first| first >> 4 != 1) {
+            return Err(Rejection::Silent("sends something before CONNECT"));
+        }
+        match decode(input, MAX_CONNECT_BYTES).map_err(Rejection::Malformed)? {
+            Some(Received::Connect(connect)) => return Ok(connect),
+            Some(_) => return Err(Rejection::Silent("sends something before CONNECT")),
+            None => {}
+        }
+        input.reserve(512);
+        match stream.read_buf(input).await {
+            Ok(0) | Err(_) => return Err(Rejection::Silent("goes away before CONNECT")),
+            Ok(_) => {}
+        }
+    }
+}
+
+async fn admit(context: &Context, connect: &Connect, peer: SocketAddr) -> Result<Visitor, Rejection> {
+    if connect.client_id == CANARY_ID {
+        let pass = connect.password.as_deref().unwrap_or_default();
+        return match context.canary_pass.redeem(pass) {
+            true => Ok(Visitor::Canary),
+            false => {
+                Err(answer(ConnectReturnCode::BadUserNamePassword, "the watchdog's client id without its password"))
+            }
+        };
+    }
+    let login = Login {
+        client_id: connect.client_id.clone(),
+        user_name: connect.user_name.clone(),
+        password: connect.password.clone(),
+        peer,
+    };
+    let principal = timeout(context.limits.admit_timeout, context.gatekeeper.admit(login)).await;
+    match principal.unwrap_or(Err(Refusal::Unavailable)) {
+        Err(Refusal::BadCredentials) => {
+            Err(answer(ConnectReturnCode::BadUserNamePassword, "a bad user name or password"))
+        }
+        Err(Refusal::NotAuthorised) => Err(answer(ConnectReturnCode::NotAuthorized, "credentials that allow nothing")),
+        Err(Refusal::Unavailable) => {
+            Err(answer(ConnectReturnCode::ServiceUnavailable, "credentials that can't be checked now"))
+        }
+        Ok(Principal::Operator) if connect.client_id.len() > MAX_CLIENT_ID_BYTES => {
+            Err(answer(ConnectReturnCode::ClientIdentifierNotValid, "a client id that is too long"))
+        }
+        Ok(Principal::Operator) => Ok(Visitor::Operator),
+        Ok(Principal::Robot(_)) if connect.client_id.is_empty() => {
+            Err(answer(ConnectReturnCode::ClientIdentifierNotValid, "a robot's credentials without a client id"))
+        }
+        // A robot's name on another robot's token, or the other way round.
+        Ok(Principal::Robot(robot))
+            if connect.client_id != robot.as_str() || connect.user_name.as_deref() != Some(robot.as_str()) =>
+        {
+            Err(answer(ConnectReturnCode::NotAuthorized, "a client id or user name that is not the token's robot id"))
+        }
+        Ok(Principal::Robot(robot)) => Ok(Visitor::Robot(robot)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_canary_pass_is_good_once() {
+        let pass = CanaryPass::default();
+        assert!(!pass.redeem(""));
+        let first = pass.renew();
+        assert!(!pass.redeem("x"));
+        assert!(pass.redeem(&first));
+        assert!(!pass.redeem(&first));
+        let second = pass.renew();
+        assert!(!pass.redeem(&first));
+        assert!(pass.redeem(&second));
+    }
+}

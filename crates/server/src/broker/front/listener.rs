@@ -1,0 +1,43 @@
+//! Accepts connections and gives each a task of its own, so that no client waits for another. It reads no byte.
+//! A TLS listener would do its handshake inside that task too, with a timeout, and hand the stream to the same session.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::net::TcpListener;
+use tokio::sync::Semaphore;
+
+use super::{Front, session};
+
+/// For the system to have file descriptors again.
+const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+
+/// Accepts until the front stops.
+pub(super) async fn run(front: Arc<Front>, listener: TcpListener) {
+    let places = Arc::new(Semaphore::new(front.context.limits.max_connections));
+    loop {
+        let accepted = tokio::select! {
+            accepted = listener.accept() => accepted,
+            () = front.context.stop.cancelled() => return,
+        };
+        let (stream, peer) = match accepted {
+            Ok(accepted) => accepted,
+            Err(error) => {
+                tracing::warn!(%error, "cannot accept an MQTT connection");
+                tokio::time::sleep(ACCEPT_PAUSE).await;
+                continue;
+            }
+        };
+        let Ok(place) = places.clone().try_acquire_owned() else {
+            tracing::debug!(%peer, "as many MQTT connections as there may be, one more is closed");
+            continue;
+        };
+        // Small packets, each of which somebody waits for. If it can't be set, they come a little later.
+        let _ = stream.set_nodelay(true);
+        let context = front.context.clone();
+        front.sessions.spawn(async move {
+            session::serve(context, stream, peer).await;
+            drop(place);
+        });
+    }
+}

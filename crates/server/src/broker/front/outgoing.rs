@@ -1,0 +1,115 @@
+//! One session's messages to its client that are not yet acknowledged: packet ids, the window, the QoS 2 steps.
+//! It never holds a payload, since a clean session sends nothing again.
+
+use std::collections::HashMap;
+
+use rumqttd::protocol::QoS;
+
+/// Messages under way at a time.
+const MAX_IN_FLIGHT: usize = 32;
+
+/// The window of messages under way.
+#[derive(Debug, Default)]
+pub(super) struct Outgoing {
+    last_id: u16,
+    in_flight: HashMap<u16, Awaiting>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Awaiting {
+    Acknowledgement,
+    Receipt,
+    Completion,
+}
+
+impl Outgoing {
+    /// Whether another message may be sent.
+    pub(super) fn has_room(&self) -> bool {
+        self.in_flight.len() < MAX_IN_FLIGHT
+    }
+
+    /// The packet id for a message that is about to be sent; 0 for QoS 0, which needs none.
+    pub(super) fn begin(&mut self, qos: QoS) -> u16 {
+        let awaiting = match qos {
+            QoS::AtMostOnce => return 0,
+            QoS::AtLeastOnce => Awaiting::Acknowledgement,
+            QoS::ExactlyOnce => Awaiting::Receipt,
+        };
+        // Ends soon: far fewer ids are in flight than there are.
+        loop {
+            self.last_id = self.last_id.checked_add(1).unwrap_or(1);
+            if !self.in_flight.contains_key(&self.last_id) {
+                self.in_flight.insert(self.last_id, awaiting);
+                return self.last_id;
+            }
+        }
+    }
+
+    /// A PUBACK came. Acknowledgements of what was not sent are ignored; they change nothing.
+    pub(super) fn acknowledged(&mut self, id: u16) {
+        self.end(id, Awaiting::Acknowledgement);
+    }
+
+    /// A PUBREC came; it is answered with PUBREL in any case, as a client may repeat it.
+    pub(super) fn received(&mut self, id: u16) {
+        if let Some(awaiting) = self.in_flight.get_mut(&id)
+            && *awaiting == Awaiting::Receipt
+        {
+            *awaiting = Awaiting::Completion;
+        }
+    }
+
+    /// A PUBCOMP came.
+    pub(super) fn completed(&mut self, id: u16) {
+        self.end(id, Awaiting::Completion);
+    }
+
+    fn end(&mut self, id: u16, expected: Awaiting) {
+        if self.in_flight.get(&id) == Some(&expected) {
+            self.in_flight.remove(&id);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ids_in_flight_are_not_used_twice() {
+        let mut outgoing = Outgoing { last_id: u16::MAX - 1, ..Outgoing::default() };
+        assert_eq!(outgoing.begin(QoS::AtLeastOnce), u16::MAX);
+        assert_eq!(outgoing.begin(QoS::AtLeastOnce), 1);
+        outgoing.last_id = 0;
+        assert_eq!(outgoing.begin(QoS::AtLeastOnce), 2);
+        assert_eq!(outgoing.begin(QoS::AtMostOnce), 0);
+    }
+
+    #[test]
+    fn each_quality_of_service_ends_with_its_own_answer() {
+        let mut outgoing = Outgoing::default();
+        let (once, exactly) = (outgoing.begin(QoS::AtLeastOnce), outgoing.begin(QoS::ExactlyOnce));
+        outgoing.completed(once);
+        outgoing.acknowledged(exactly);
+        outgoing.completed(exactly);
+        assert_eq!(outgoing.in_flight.len(), 2, "wrong answers change nothing");
+        outgoing.acknowledged(once);
+        outgoing.received(exactly);
+        outgoing.completed(exactly);
+        assert!(outgoing.in_flight.is_empty());
+    }
+
+    #[test]
+    fn the_window_is_bounded() {
+        let mut outgoing = Outgoing::default();
+        for _ in 0..MAX_IN_FLIGHT {
+            assert!(outgoing.has_room());
+            outgoing.begin(QoS::ExactlyOnce);
+        }
+        assert!(!outgoing.has_room());
+        outgoing.received(1);
+        assert!(!outgoing.has_room());
+        outgoing.completed(1);
+        assert!(outgoing.has_room());
+    }
+}

@@ -1,0 +1,501 @@
+//! One client's session, from its seat to its end: a single task that reads, acts, answers and keeps the time.
+//! Everything it holds is bounded; it stops reading while a message is being stored or answers are not read.
+
+use std::collections::{HashMap, HashSet};
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::{Bytes, BytesMut};
+use futures_util::future::BoxFuture;
+use rumqttd::protocol::{
+    ConnectReturnCode, Packet, PingResp, PubAck, PubAckReason, PubComp, PubCompReason, PubRec, PubRecReason, PubRel,
+    PubRelReason, QoS, SubAck, SubscribeReasonCode, UnsubAck,
+};
+use task_proto::RobotId;
+use task_proto::topic::{RobotTopic, Topic};
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt, ReadHalf, WriteHalf};
+use tokio::time::{Instant, sleep_until, timeout};
+
+use super::Context;
+use super::access::{Hearing, Route, Visitor, matches, may_publish, may_subscribe};
+use super::codec::{DecodeError, Publish, Received, Will, decode, encode, encode_publish};
+use super::entrance::{Guest, Rejection, connack, reject, welcome};
+use super::outgoing::Outgoing;
+use super::takeover::Seat;
+use crate::broker::router::{Heard, Listener, Listening, RouterError};
+use crate::broker::{Inbox, NotStored, RobotMessage};
+
+/// Answers a client may leave unread before nothing more is read from it.
+const MAX_UNREAD_BYTES: usize = 64 * 1024;
+/// Buffers above this are given back when they are empty.
+const MAX_IDLE_BYTES: usize = 8 * 1024;
+/// QoS 2 messages a client may leave unreleased.
+const MAX_UNRELEASED: usize = 64;
+/// How long a connection is kept open for the client to read what was said last.
+const LINGER: Duration = Duration::from_secs(1);
+
+/// Why a session ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+enum End {
+    /// DISCONNECT: the one end that leaves the will unsaid.
+    #[error("says goodbye")]
+    Goodbye,
+    #[error("goes away without a word")]
+    Gone,
+    #[error("is silent for longer than its keepalive")]
+    Silent,
+    #[error("does not read, or does not acknowledge, what it is sent")]
+    Deaf,
+    #[error("{0}")]
+    Malformed(#[from] DecodeError),
+    #[error("{0}")]
+    Violation(&'static str),
+    #[error("sent a message that could not be stored")]
+    NotStored,
+    #[error("must leave: a newer session, or the server's decision")]
+    Asked,
+    #[error("lost the router")]
+    RouterLost,
+    #[error("ends with the server")]
+    Stopped,
+}
+
+/// Serves one connection to its end. For TLS, `stream` is what the handshake returns.
+pub(super) async fn serve<S>(context: Arc<Context>, mut stream: S, peer: SocketAddr)
+where
+    S: AsyncRead + AsyncWrite + Send + Unpin,
+{
+    let entered = tokio::select! {
+        entered = enter(&context, &mut stream, peer) => entered,
+        () = context.stop.cancelled() => return,
+    };
+    match entered {
+        Err(rejection) => {
+            tracing::debug!(%peer, "MQTT client turned away: {rejection}");
+            reject(&context, &mut stream, rejection).await;
+        }
+        Ok((guest, seat, listener)) => {
+            let end = live(&context, &mut stream, peer, guest, seat, listener).await;
+            tracing::debug!(%peer, "MQTT client {end}");
+        }
+    }
+    linger(&mut stream).await;
+}
+
+/// Everything before the session is live: who it is, the seat, and a link to the router if it needs one.
+async fn enter<S>(
+    context: &Context,
+    stream: &mut S,
+    peer: SocketAddr,
+) -> Result<(Guest, Seat, Option<Listener>), Rejection>
+where
+    S: AsyncRead + AsyncWrite + Unpin,
+{
+    let guest = welcome(context, stream, peer).await?;
+    let seat = context.seats.take(guest.seat_name.clone()).await;
+    let listening = match guest.visitor {
+        Visitor::Robot(_) => return Ok((guest, seat, None)),
+        Visitor::Operator => Listening::Everything,
+        Visitor::Canary => Listening::Canary,
+    };
+    let unavailable = |error| Rejection::Answered {
+        code: ConnectReturnCode::ServiceUnavailable,
+        reason: match error {
+            RouterError::Full => "there are as many operators as there may be",
+            RouterError::Gone | RouterError::Stuck => "the router does not answer",
+        },
+    };
+    let listener = context.router.listen(listening).await.map_err(unavailable)?;
+    Ok((guest, seat, Some(listener)))
+}
+
+/// The session, and what must happen at its end in this order: the link to the router ends, the will is said, the inbox
+/// hears of the end, and the seat is free.
+async fn live<S>(
+    context: &Context,
+    stream: &mut S,
+    peer: SocketAddr,
+    guest: Guest,
+    seat: Seat,
+    listener: Option<Listener>,
+) -> End
+where
+    S: AsyncRead + AsyncWrite + Unpin,
+{
+    let _attendance = Attendance::begin(context, &guest.visitor, peer, seat.number());
+    let (reader, writer) = tokio::io::split(stream);
+    let mut output = BytesMut::new();
+    connack(ConnectReturnCode::Success, &mut output);
+    let now = Instant::now();
+    let mut session = Session {
+        context,
+        visitor: guest.visitor,
+        peer,
+        seat: &seat,
+        reader,
+        writer,
+        input: guest.input,
+        output,
+        listener,
+        hearing: HashMap::new(),
+        outgoing: Outgoing::default(),
+        unreleased: HashSet::new(),
+        storing: None,
+        keep_alive: guest.keep_alive.unwrap_or(context.limits.max_silence),
+        heard_at: now,
+        progress_at: now,
+    };
+    let end = session.run().await;
+    session.listener = None;
+    if !matches!(end, End::Goodbye | End::Stopped)
+        && let Some(will) = guest.will
+    {
+        session.say_will(will).await;
+    }
+    end
+}
+
+/// Lets the client read what was written last: closing with bytes unread on our side would reset the connection.
+async fn linger<S: AsyncRead + AsyncWrite + Unpin>(stream: &mut S) {
+    let read_out = async {
+        stream.shutdown().await?;
+        let mut scrap = [0; 1024];
+        while stream.read(&mut scrap).await? > 0 {}
+        std::io::Result::Ok(())
+    };
+    // Whatever went wrong, the connection is over.
+    let _ = timeout(LINGER, read_out).await;
+}
+
+/// Tells the inbox of a robot's session, and of its end even if the session's task should panic.
+struct Attendance<'a> {
+    inbox: &'a dyn Inbox,
+    robot: RobotId,
+    connection: u64,
+}
+
+impl<'a> Attendance<'a> {
+    fn begin(context: &'a Context, visitor: &Visitor, peer: SocketAddr, connection: u64) -> Option<Self> {
+        let Visitor::Robot(robot) = visitor else { return None };
+        context.inbox.connected(robot, peer, connection);
+        Some(Self { inbox: &*context.inbox, robot: robot.clone(), connection })
+    }
+}
+
+impl Drop for Attendance<'_> {
+    fn drop(&mut self) {
+        self.inbox.disconnected(&self.robot, self.connection);
+    }
+}
+
+struct Session<'a, S> {
+    context: &'a Context,
+    visitor: Visitor,
+    peer: SocketAddr,
+    seat: &'a Seat,
+    reader: ReadHalf<&'a mut S>,
+    writer: WriteHalf<&'a mut S>,
+    input: BytesMut,
+    output: BytesMut,
+    listener: Option<Listener>,
+    hearing: HashMap<String, (Hearing, QoS)>,
+    outgoing: Outgoing,
+    unreleased: HashSet<u16>,
+    storing: Option<Storing<'a>>,
+    keep_alive: Duration,
+    /// When the last packet came.
+    heard_at: Instant,
+    /// When the client last took something of what it was sent, or there was nothing to take.
+    progress_at: Instant,
+}
+
+/// A message on its way into the inbox, and the acknowledgement that waits for it.
+struct Storing<'a> {
+    publish: Publish,
+    stored: BoxFuture<'a, Result<(), NotStored>>,
+}
+
+/// What a session wakes up for.
+enum Woken {
+    Read(std::io::Result<usize>),
+    Wrote(std::io::Result<usize>),
+    Stored(Result<(), NotStored>),
+    Rung(Bytes),
+    Heard(Result<Heard, RouterError>),
+    Late(End),
+}
+
+impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
+    async fn run(&mut self) -> End {
+        let end = loop {
+            if let Err(end) = self.act_on_input() {
+                break end;
+            }
+            let woken = tokio::select! {
+                biased;
+                () = self.seat.leave().cancelled() => return End::Asked,
+                () = self.context.stop.cancelled() => return End::Stopped,
+                woken = self.wait() => woken,
+            };
+            if let Err(end) = self.act_on(woken) {
+                break end;
+            }
+        };
+        if end != End::Deaf {
+            // What was answered before the end is still due. If it can't be had any more, the connection is over anyway.
+            let _ = timeout(LINGER, self.writer.write_all_buf(&mut self.output)).await;
+        }
+        end
+    }
+
+    /// Waits for whatever comes first. Every branch is cancel-safe: bytes stay in the socket or the buffers, payloads in
+    /// the doorbell or the link, and what is being stored is polled in place.
+    async fn wait(&mut self) -> Woken {
+        let (deadline, lateness) = self.deadline();
+        let may_read = self.may_read();
+        let may_send = self.output.is_empty() && self.outgoing.has_room();
+        let hears_desired = self.desired_qos().is_some();
+        if may_read {
+            self.input.reserve(1024);
+        }
+        tokio::select! {
+            stored = stored(&mut self.storing) => Woken::Stored(stored),
+            wrote = self.writer.write_buf(&mut self.output), if !self.output.is_empty() => Woken::Wrote(wrote),
+            read = self.reader.read_buf(&mut self.input), if may_read => Woken::Read(read),
+            payload = self.seat.doorbell().answer(), if may_send && hears_desired => Woken::Rung(payload),
+            heard = heard(&mut self.listener), if may_send => Woken::Heard(heard),
+            () = sleep_until(deadline) => Woken::Late(lateness),
+        }
+    }
+
+    /// By when something must happen, and what it means if it does not.
+    fn deadline(&mut self) -> (Instant, End) {
+        if self.output.is_empty() && self.outgoing.has_room() {
+            self.progress_at = Instant::now();
+        }
+        let unread_until = self.progress_at + self.context.limits.write_timeout;
+        let silent_until = self.heard_at + self.keep_alive;
+        // While we don't read, the client can't be blamed for its silence.
+        if self.may_read() && silent_until < unread_until || self.caught_up() && self.storing.is_none() {
+            (silent_until, End::Silent)
+        } else {
+            (unread_until, End::Deaf)
+        }
+    }
+
+    /// Whether the client has taken all it was sent.
+    fn caught_up(&self) -> bool {
+        self.output.is_empty() && self.outgoing.has_room()
+    }
+
+    fn may_read(&self) -> bool {
+        self.storing.is_none() && self.output.len() < MAX_UNREAD_BYTES
+    }
+
+    fn act_on(&mut self, woken: Woken) -> Result<(), End> {
+        match woken {
+            Woken::Read(Ok(0) | Err(_)) | Woken::Wrote(Ok(0) | Err(_)) => return Err(End::Gone),
+            Woken::Read(Ok(_)) => {}
+            Woken::Wrote(Ok(_)) => {
+                self.progress_at = Instant::now();
+                give_back(&mut self.output);
+            }
+            Woken::Stored(stored) => self.acknowledge_stored(stored)?,
+            Woken::Rung(payload) => self.send_desired(payload),
+            Woken::Heard(heard) => self.pass_on(heard.map_err(|_| End::RouterLost)?),
+            Woken::Late(end) => return Err(end),
+        }
+        Ok(())
+    }
+
+    fn act_on_input(&mut self) -> Result<(), End> {
+        while self.may_read() {
+            let Some(received) = decode(&mut self.input, self.context.limits.max_packet_bytes)? else { break };
+            self.heard_at = Instant::now();
+            self.act_on_packet(received)?;
+        }
+        give_back(&mut self.input);
+        Ok(())
+    }
+
+    fn act_on_packet(&mut self, received: Received) -> Result<(), End> {
+        match received {
+            Received::Connect(_) => return Err(End::Violation("sends a second CONNECT")),
+            Received::Publish(publish) => self.publish(publish)?,
+            Received::PubAck(id) => {
+                self.outgoing.acknowledged(id);
+                self.progress_at = self.heard_at;
+            }
+            Received::PubRec(pkid) => {
+                self.outgoing.received(pkid);
+                self.send(Packet::PubRel(PubRel { pkid, reason: PubRelReason::Success }, None));
+            }
+            Received::PubRel(pkid) => {
+                self.unreleased.remove(&pkid);
+                self.send(Packet::PubComp(PubComp { pkid, reason: PubCompReason::Success }, None));
+            }
+            Received::PubComp(id) => {
+                self.outgoing.completed(id);
+                self.progress_at = self.heard_at;
+            }
+            Received::Subscribe { packet_id, filters } => self.subscribe(packet_id, filters)?,
+            Received::Unsubscribe { packet_id, filters } => {
+                for filter in &filters {
+                    self.hearing.remove(filter);
+                }
+                self.send(Packet::UnsubAck(UnsubAck { pkid: packet_id, reasons: Vec::new() }, None));
+            }
+            Received::PingReq => self.send(Packet::PingResp(PingResp)),
+            Received::Disconnect => return Err(End::Goodbye),
+        }
+        Ok(())
+    }
+
+    fn publish(&mut self, publish: Publish) -> Result<(), End> {
+        let Some(route) = may_publish(&self.visitor, &self.context.prefix, &publish.topic) else {
+            return Err(End::Violation("publishes where it may not"));
+        };
+        if publish.qos == QoS::ExactlyOnce {
+            if self.unreleased.contains(&publish.packet_id) {
+                self.acknowledge(&publish);
+                return Ok(());
+            }
+            if self.unreleased.len() >= MAX_UNRELEASED {
+                return Err(End::Violation("leaves too many QoS 2 messages unreleased"));
+            }
+        }
+        match (route, &self.visitor) {
+            (Route::Inbox(topic), Visitor::Robot(robot)) => {
+                let message = self.message(robot, topic, publish.payload.clone());
+                let stored = Box::pin(store(self.context, message));
+                self.storing = Some(Storing { publish, stored });
+            }
+            _ => {
+                self.context.router.publish(&publish.topic, publish.qos, publish.payload.clone());
+                self.acknowledge(&publish);
+            }
+        }
+        Ok(())
+    }
+
+    fn acknowledge_stored(&mut self, stored: Result<(), NotStored>) -> Result<(), End> {
+        let Some(Storing { publish, .. }) = self.storing.take() else { return Ok(()) };
+        stored.map_err(|NotStored| End::NotStored)?;
+        self.acknowledge(&publish);
+        self.context.router.publish(&publish.topic, publish.qos, publish.payload);
+        self.heard_at = Instant::now();
+        Ok(())
+    }
+
+    fn acknowledge(&mut self, publish: &Publish) {
+        let pkid = publish.packet_id;
+        match publish.qos {
+            QoS::AtMostOnce => {}
+            QoS::AtLeastOnce => self.send(Packet::PubAck(PubAck { pkid, reason: PubAckReason::Success }, None)),
+            QoS::ExactlyOnce => {
+                self.unreleased.insert(pkid);
+                self.send(Packet::PubRec(PubRec { pkid, reason: PubRecReason::Success }, None));
+            }
+        }
+    }
+
+    fn subscribe(&mut self, pkid: u16, filters: Vec<(String, QoS)>) -> Result<(), End> {
+        if filters.len() > self.context.limits.max_filters {
+            return Err(End::Violation("subscribes to too many filters at a time"));
+        }
+        let mut return_codes = Vec::with_capacity(filters.len());
+        for (filter, qos) in filters {
+            let hearing = may_subscribe(&self.visitor, &self.context.prefix, &filter);
+            let has_room = self.hearing.len() < self.context.limits.max_filters || self.hearing.contains_key(&filter);
+            return_codes.push(match hearing {
+                Some(hearing) if has_room => {
+                    self.hearing.insert(filter, (hearing, qos));
+                    SubscribeReasonCode::Success(qos)
+                }
+                _ => SubscribeReasonCode::Failure,
+            });
+        }
+        self.send(Packet::SubAck(SubAck { pkid, return_codes }, None));
+        Ok(())
+    }
+
+    fn desired_qos(&self) -> Option<QoS> {
+        self.hearing.values().find(|(hearing, _)| *hearing == Hearing::Desired).map(|(_, qos)| *qos)
+    }
+
+    fn send_desired(&mut self, payload: Bytes) {
+        if let (Visitor::Robot(robot), Some(granted)) = (&self.visitor, self.desired_qos()) {
+            let topic = self.context.prefix.format(&Topic::Robot(robot.clone(), RobotTopic::Desired));
+            self.send_message(topic, payload, lower(granted, QoS::AtLeastOnce));
+        }
+    }
+
+    /// Sends what came out of the router if a subscription matches, once, as the best of them has it.
+    fn pass_on(&mut self, heard: Heard) {
+        let matching = self.hearing.iter().filter(|(filter, _)| matches(filter, &heard.topic));
+        let best = matching.map(|(_, (_, qos))| *qos).max_by_key(|qos| *qos as u8);
+        if let Some(granted) = best {
+            self.send_message(heard.topic, heard.payload, lower(granted, heard.qos));
+        }
+    }
+
+    fn send_message(&mut self, topic: String, payload: Bytes, qos: QoS) {
+        let packet_id = self.outgoing.begin(qos);
+        encode_publish(&Publish { topic, qos, packet_id, payload }, &mut self.output);
+    }
+
+    fn send(&mut self, packet: Packet) {
+        encode(packet, &mut self.output);
+    }
+
+    fn message(&self, robot: &RobotId, topic: RobotTopic, payload: Bytes) -> RobotMessage {
+        RobotMessage { robot: robot.clone(), topic, payload, peer: self.peer, connection: self.seat.number() }
+    }
+
+    async fn say_will(&mut self, will: Will) {
+        match (may_publish(&self.visitor, &self.context.prefix, &will.topic), &self.visitor) {
+            (Some(Route::Inbox(topic)), Visitor::Robot(robot)) => {
+                if store(self.context, self.message(robot, topic, will.payload.clone())).await.is_err() {
+                    tracing::warn!(%robot, "a robot's will could not be stored");
+                    return;
+                }
+            }
+            (Some(_), _) => {}
+            (None, _) => return,
+        }
+        self.context.router.publish(&will.topic, will.qos, will.payload);
+    }
+}
+
+/// Hands a message to the inbox, within the time it has.
+async fn store(context: &Context, message: RobotMessage) -> Result<(), NotStored> {
+    timeout(context.limits.inbox_timeout, context.inbox.receive(message)).await.unwrap_or(Err(NotStored))
+}
+
+/// When the message on its way has arrived; never if there is none.
+async fn stored(storing: &mut Option<Storing<'_>>) -> Result<(), NotStored> {
+    match storing {
+        Some(storing) => (&mut storing.stored).await,
+        None => std::future::pending().await,
+    }
+}
+
+/// The next message from the router; never if there is no link.
+async fn heard(listener: &mut Option<Listener>) -> Result<Heard, RouterError> {
+    match listener {
+        Some(listener) => listener.next().await,
+        None => std::future::pending().await,
+    }
+}
+
+fn lower(a: QoS, b: QoS) -> QoS {
+    if (a as u8) < b as u8 { a } else { b }
+}
+
+/// An idle connection holds no large buffer.
+fn give_back(buffer: &mut BytesMut) {
+    if buffer.is_empty() && buffer.capacity() > MAX_IDLE_BYTES {
+        *buffer = BytesMut::new();
+    }
+}

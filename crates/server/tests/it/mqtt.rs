@@ -1,0 +1,274 @@
+//! What clients of the broker may rely on, over real TCP: admission, access, delivery, takeover, wills, time limits.
+
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use bytes::Bytes;
+use rumqttc::{AsyncClient, Event, MqttOptions, Packet, QoS, SubscribeReasonCode};
+use task_proto::RobotId;
+use task_proto::topic::RobotTopic;
+use tokio::time::timeout;
+
+use crate::mqtt_harness::{Connect, PATIENCE, Seen, TestBroker, publish, subscribe, topic, unsubscribe};
+
+#[tokio::test(flavor = "multi_thread")]
+async fn logins_get_the_right_answer() {
+    let broker = TestBroker::with(|limits| limits.admit_timeout = Duration::from_millis(50)).await;
+    let (robot, other) = (RobotId::random(), RobotId::random());
+    let with = |change: fn(&mut Connect, &RobotId)| {
+        let mut connect = Connect::robot(&robot);
+        change(&mut connect, &other);
+        connect.packet()
+    };
+    let cases: [(Vec<u8>, u8); 12] = [
+        (with(|_, _| {}), 0),
+        (with(|connect, _| connect.clean = false), 0),
+        (Connect::operator("").packet(), 0),
+        (with(|connect, _| connect.password = Some("wrong".to_owned())), 4),
+        (with(|connect, _| connect.password = None), 5),
+        (with(|connect, _| (connect.user_name, connect.password) = (None, None)), 5),
+        (with(|connect, _| connect.password = Some("revoked".to_owned())), 5),
+        (with(|connect, other| connect.client_id = other.to_string()), 5),
+        (with(|connect, other| connect.user_name = Some(other.to_string())), 5),
+        (with(|connect, _| (connect.client_id, connect.clean) = (String::new(), false)), 2),
+        (with(|connect, _| connect.password = Some("outage".to_owned())), 3),
+        (with(|connect, _| connect.password = Some("slow".to_owned())), 3),
+    ];
+    for (index, (packet, code)) in cases.iter().enumerate() {
+        let mut raw = broker.raw_with(packet).await;
+        raw.expect(&[0x20, 2, 0, *code]).await;
+        if *code == 0 {
+            raw.expect_nothing().await
+        } else {
+            raw.expect_close().await
+        }
+        assert_eq!(broker.broker.connected_count(), usize::from(*code == 0 && index < 2), "case {index}");
+        raw.send(&[0xe0, 0]).await;
+        raw.expect_close().await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_independent_client_listens_and_speaks() {
+    let broker = TestBroker::start().await;
+    let robot = RobotId::random();
+    let client = |id: &str, user: &str, password: &str| {
+        let mut options = MqttOptions::new(id, "127.0.0.1", broker.address().port());
+        options.set_credentials(user, password);
+        AsyncClient::new(options, 10)
+    };
+    let (operator, mut from_operator) = client("somebody", "x", "operator");
+    operator.subscribe("taskd/v1/r/+/report", QoS::ExactlyOnce).await.unwrap();
+    operator.subscribe("#", QoS::AtLeastOnce).await.unwrap();
+    let (speaker, mut from_speaker) = client(robot.as_str(), robot.as_str(), &format!("pw-{robot}"));
+    speaker.subscribe(topic(&robot, RobotTopic::Desired), QoS::AtLeastOnce).await.unwrap();
+
+    let mut codes = Vec::new();
+    let (mut rung, mut heard) = (None, Vec::new());
+    timeout(PATIENCE, async {
+        while codes.len() < 2 {
+            if let Event::Incoming(Packet::SubAck(ack)) = from_operator.poll().await.unwrap() {
+                codes.extend(ack.return_codes);
+            }
+        }
+        for qos in [QoS::AtMostOnce, QoS::AtLeastOnce, QoS::ExactlyOnce] {
+            speaker.publish(topic(&robot, RobotTopic::Report), qos, true, "report").await.unwrap();
+        }
+        while rung.is_none() || heard.len() < 3 {
+            let incoming = tokio::select! {
+                event = from_speaker.poll() => event.unwrap(),
+                event = from_operator.poll() => event.unwrap(),
+            };
+            match incoming {
+                Event::Incoming(Packet::SubAck(_)) => {
+                    broker.broker.ring(&robot, Bytes::from_static(b"ding")).unwrap();
+                }
+                Event::Incoming(Packet::Publish(message)) if message.topic.ends_with("desired") => rung = Some(message),
+                Event::Incoming(Packet::Publish(message)) => heard.push((message.qos, message.retain)),
+                _ => {}
+            }
+        }
+    })
+    .await
+    .expect("all should arrive");
+    assert_eq!(codes, [SubscribeReasonCode::Success(QoS::ExactlyOnce), SubscribeReasonCode::Failure]);
+    assert_eq!(rung.unwrap().payload, "ding");
+    assert_eq!(heard, [(QoS::AtMostOnce, false), (QoS::AtLeastOnce, false), (QoS::ExactlyOnce, false)]);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn denied_subscriptions_are_refused_one_by_one() {
+    let broker = TestBroker::start().await;
+    let (robot, other) = (RobotId::random(), RobotId::random());
+    let (own, foreign) = (topic(&robot, RobotTopic::Desired), topic(&other, RobotTopic::Desired));
+    let mut raw = broker.robot(&robot).await;
+    raw.send(&subscribe(3, &[(&foreign, 1), (&own, 2), ("#", 0), ("taskd/v1/#", 0), ("$SYS/#", 0)])).await;
+    raw.expect(&[0x90, 7, 0, 3, 0x80, 2, 0x80, 0x80, 0x80]).await;
+    let _other = broker.robot(&other).await;
+    broker.broker.ring(&other, Bytes::from_static(b"secret")).unwrap();
+    broker.broker.ring(&robot, Bytes::from_static(b"mine")).unwrap();
+    raw.expect(&publish(&own, 1, 1, b"mine")).await;
+    raw.send(&unsubscribe(4, &[&own, "never/subscribed"])).await;
+    raw.expect(&[0xb0, 2, 0, 4]).await;
+    broker.broker.ring(&robot, Bytes::from_static(b"unheard")).unwrap();
+    raw.expect_nothing().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn publishing_elsewhere_ends_the_connection() {
+    let broker = TestBroker::start().await;
+    let (robot, other) = (RobotId::random(), RobotId::random());
+    for name in [topic(&other, RobotTopic::Report), topic(&robot, RobotTopic::Desired), "x".to_owned()] {
+        let mut raw = broker.robot(&robot).await;
+        raw.send(&publish(&name, 1, 1, b"forged")).await;
+        raw.expect_close().await;
+    }
+    let mut operator = broker.operator("taskd/v1/#", 0).await;
+    operator.send(&publish(&topic(&robot, RobotTopic::Report), 0, 0, b"forged")).await;
+    operator.expect_close().await;
+    broker.assert_serves().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn nothing_is_acknowledged_before_it_is_stored() {
+    let broker = TestBroker::with(|limits| limits.inbox_timeout = Duration::from_millis(100)).await;
+    let robot = RobotId::random();
+    let report = topic(&robot, RobotTopic::Report);
+    broker.refuses.store(true, Ordering::SeqCst);
+    for qos in 0..=2 {
+        let mut raw = broker.robot(&robot).await;
+        raw.send(&publish(&report, qos, 1, b"x")).await;
+        raw.expect_close().await;
+    }
+    broker.refuses.store(false, Ordering::SeqCst);
+    let mut raw = broker.robot(&robot).await;
+    raw.send(&publish(&report, 1, 1, b"stall")).await;
+    raw.expect_close().await;
+    let mut raw = broker.robot(&robot).await;
+    raw.send(&publish(&report, 1, 1, b"x")).await;
+    raw.expect(&[0x40, 2, 0, 1]).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn qos_2_arrives_exactly_once() {
+    let broker = TestBroker::start().await;
+    let robot = RobotId::random();
+    let mut raw = broker.robot(&robot).await;
+    assert!(matches!(broker.next_of(&robot).await, Seen::Connected(..)));
+    let mut message = publish(&topic(&robot, RobotTopic::Report), 2, 5, b"once");
+    raw.send(&message).await;
+    raw.expect(&[0x50, 2, 0, 5]).await;
+    message[0] |= 0x08;
+    raw.send(&message).await;
+    raw.expect(&[0x50, 2, 0, 5]).await;
+    for _ in 0..2 {
+        raw.send(&[0x62, 2, 0, 5]).await;
+        raw.expect(&[0x70, 2, 0, 5]).await;
+    }
+    raw.send(&publish(&topic(&robot, RobotTopic::Report), 2, 5, b"twice")).await;
+    raw.expect(&[0x50, 2, 0, 5]).await;
+    for payload in ["once", "twice"] {
+        assert_eq!(broker.next_of(&robot).await, Seen::Received(robot.clone(), RobotTopic::Report, payload.into()));
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_slow_robot_hears_the_newest_word_only() {
+    let broker = TestBroker::start().await;
+    let robot = RobotId::random();
+    let desired = topic(&robot, RobotTopic::Desired);
+    assert!(broker.broker.ring(&robot, Bytes::new()).is_err());
+    let mut raw = broker.robot(&robot).await;
+    for word in ["old", "older", "new"] {
+        broker.broker.ring(&robot, word.into()).unwrap();
+    }
+    raw.send(&subscribe(1, &[(&desired, 1)])).await;
+    raw.expect(&[0x90, 3, 0, 1, 1]).await;
+    raw.expect(&publish(&desired, 1, 1, b"new")).await;
+    raw.expect_nothing().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_old_session_has_ended_before_the_new_one_lives() {
+    let broker = TestBroker::start().await;
+    let robot = RobotId::random();
+    let status = topic(&robot, RobotTopic::Status);
+    let mut connect = Connect::robot(&robot);
+    connect.will = Some((status, b"gone".to_vec()));
+    let mut last = None;
+    for round in 0..20 {
+        let mut raw = broker.raw_with(&connect.packet()).await;
+        raw.expect(&[0x20, 2, 0, 0]).await;
+        if let Some((mut old, number)) = last.take() {
+            let old: &mut crate::mqtt_harness::Raw = &mut old;
+            old.expect_close().await;
+            let gone = Seen::Received(robot.clone(), RobotTopic::Status, "gone".into());
+            assert_eq!(broker.next_of(&robot).await, gone, "round {round}");
+            assert_eq!(broker.next_of(&robot).await, Seen::Disconnected(robot.clone(), number));
+        }
+        let Seen::Connected(_, number) = broker.next_of(&robot).await else { panic!("connected should come") };
+        last = Some((raw, number));
+    }
+    assert_eq!(broker.broker.connected_count(), 1);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_will_is_said_unless_the_robot_says_goodbye() {
+    let broker = TestBroker::start().await;
+    let robot = RobotId::random();
+    let status = topic(&robot, RobotTopic::Status);
+    let mut connect = Connect::robot(&robot);
+    connect.will = Some((status.clone(), b"gone".to_vec()));
+    let mut operator = broker.operator(&status, 0).await;
+
+    let mut polite = broker.raw_with(&connect.packet()).await;
+    polite.expect(&[0x20, 2, 0, 0]).await;
+    polite.send(&[0xe0, 0]).await;
+    polite.expect_close().await;
+    operator.expect_nothing().await;
+
+    let mut rude = broker.raw_with(&connect.packet()).await;
+    rude.expect(&[0x20, 2, 0, 0]).await;
+    drop(rude);
+    operator.expect(&publish(&status, 0, 0, b"gone")).await;
+
+    let mut violent = broker.raw_with(&connect.packet()).await;
+    violent.expect(&[0x20, 2, 0, 0]).await;
+    violent.send(&connect.packet()).await;
+    violent.expect_close().await;
+    operator.expect(&publish(&status, 0, 0, b"gone")).await;
+
+    connect.will = Some((topic(&RobotId::random(), RobotTopic::Status), b"forged".to_vec()));
+    let mut forger = broker.raw_with(&connect.packet()).await;
+    forger.expect(&[0x20, 2, 0, 5]).await;
+    forger.expect_close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn silence_beyond_the_keepalive_ends_the_session() {
+    let broker = TestBroker::start().await;
+    let robot = RobotId::random();
+    let mut connect = Connect::robot(&robot);
+    connect.keep_alive_s = 1;
+    let mut raw = broker.raw_with(&connect.packet()).await;
+    raw.expect(&[0x20, 2, 0, 0]).await;
+    let begin = tokio::time::Instant::now();
+    raw.expect_close().await;
+    assert!((Duration::from_millis(1400)..Duration::from_secs(5)).contains(&begin.elapsed()));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn revoked_and_stopped_sessions_end() {
+    let broker = TestBroker::start().await;
+    let (revoked, stopped) = (RobotId::random(), RobotId::random());
+    let (mut first, mut second) = (broker.robot(&revoked).await, broker.robot(&stopped).await);
+    broker.broker.disconnect(&revoked);
+    first.expect_close().await;
+    let mut silent = broker.raw().await;
+    let (broker, closed) = (broker.broker.clone(), async {
+        second.expect_close().await;
+        silent.expect_close().await;
+    });
+    tokio::join!(broker.shutdown(PATIENCE), closed);
+    assert_eq!(broker.connected_count(), 0);
+}

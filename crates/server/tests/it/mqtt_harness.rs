@@ -1,0 +1,309 @@
+//! A broker with an in-memory gatekeeper and inbox, and a client that sends any bytes it is told to.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use bytes::Bytes;
+use futures_util::future::BoxFuture;
+use task_proto::RobotId;
+use task_proto::topic::{RobotTopic, Topic, TopicPrefix};
+use taskd::broker::{
+    Broker, BrokerConfig, Gatekeeper, Inbox, Limits, Login, NotStored, Principal, Refusal, RobotMessage,
+};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+use tokio::sync::{Mutex, mpsc};
+use tokio::time::timeout;
+
+/// More than anything here takes, unless it hangs.
+pub const PATIENCE: Duration = Duration::from_secs(10);
+
+/// Lets robots in with `pw-<robot id>` and operators with `operator`; some passwords meet other ends.
+struct Door;
+
+impl Gatekeeper for Door {
+    fn admit(&self, login: Login) -> BoxFuture<'_, Result<Principal, Refusal>> {
+        Box::pin(async move {
+            let user = login.user_name.unwrap_or_default();
+            match login.password.as_deref().ok_or(Refusal::NotAuthorised)? {
+                "operator" => Ok(Principal::Operator),
+                "revoked" => Err(Refusal::NotAuthorised),
+                "outage" => Err(Refusal::Unavailable),
+                "slow" => std::future::pending().await,
+                password => match password.strip_prefix("pw-").map(str::parse) {
+                    Some(Ok(robot)) if !user.is_empty() => Ok(Principal::Robot(robot)),
+                    _ => Err(Refusal::BadCredentials),
+                },
+            }
+        })
+    }
+}
+
+/// What the inbox saw.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Seen {
+    Connected(RobotId, u64),
+    Disconnected(RobotId, u64),
+    Received(RobotId, RobotTopic, Bytes),
+}
+
+struct Letterbox {
+    seen: mpsc::UnboundedSender<Seen>,
+    refuses: Arc<AtomicBool>,
+}
+
+impl Inbox for Letterbox {
+    fn receive(&self, message: RobotMessage) -> BoxFuture<'_, Result<(), NotStored>> {
+        Box::pin(async move {
+            if self.refuses.load(Ordering::SeqCst) {
+                return Err(NotStored);
+            }
+            if &message.payload[..] == b"stall" {
+                return std::future::pending().await;
+            }
+            let _ = self.seen.send(Seen::Received(message.robot, message.topic, message.payload));
+            Ok(())
+        })
+    }
+    fn connected(&self, robot: &RobotId, _peer: SocketAddr, connection: u64) {
+        let _ = self.seen.send(Seen::Connected(robot.clone(), connection));
+    }
+    fn disconnected(&self, robot: &RobotId, connection: u64) {
+        let _ = self.seen.send(Seen::Disconnected(robot.clone(), connection));
+    }
+}
+
+/// A running broker.
+pub struct TestBroker {
+    pub broker: Broker,
+    pub refuses: Arc<AtomicBool>,
+    seen: Mutex<mpsc::UnboundedReceiver<Seen>>,
+}
+
+impl TestBroker {
+    pub async fn start() -> Self {
+        Self::with(|_| {}).await
+    }
+
+    pub async fn with(change: impl FnOnce(&mut Limits)) -> Self {
+        let mut limits = Limits { canary_interval: Duration::from_secs(3600), ..Limits::default() };
+        change(&mut limits);
+        let config = BrokerConfig { listen: "127.0.0.1:0".parse().unwrap(), prefix: TopicPrefix::default(), limits };
+        let (sender, receiver) = mpsc::unbounded_channel();
+        let refuses = Arc::new(AtomicBool::new(false));
+        let inbox = Letterbox { seen: sender, refuses: refuses.clone() };
+        let broker = Broker::start(config, Arc::new(Door), Arc::new(inbox)).await.unwrap();
+        Self { broker, refuses, seen: Mutex::new(receiver) }
+    }
+
+    pub fn address(&self) -> SocketAddr {
+        self.broker.local_addr()
+    }
+
+    /// The next thing the inbox sees about `robot`.
+    pub async fn next_of(&self, robot: &RobotId) -> Seen {
+        let mut seen = self.seen.lock().await;
+        timeout(PATIENCE, async {
+            loop {
+                let next = seen.recv().await.unwrap();
+                let (Seen::Connected(who, _) | Seen::Disconnected(who, _) | Seen::Received(who, ..)) = &next;
+                if who == robot {
+                    return next;
+                }
+            }
+        })
+        .await
+        .expect("the inbox should see something")
+    }
+
+    pub async fn raw(&self) -> Raw {
+        Raw { stream: timeout(PATIENCE, TcpStream::connect(self.address())).await.unwrap().unwrap() }
+    }
+
+    /// A client that has sent `packet` first.
+    pub async fn raw_with(&self, packet: &[u8]) -> Raw {
+        let mut raw = self.raw().await;
+        raw.send(packet).await;
+        raw
+    }
+
+    /// A robot that is in.
+    pub async fn robot(&self, robot: &RobotId) -> Raw {
+        let mut raw = self.raw_with(&Connect::robot(robot).packet()).await;
+        raw.expect(&[0x20, 2, 0, 0]).await;
+        raw
+    }
+
+    /// An operator who is in and hears `filter`.
+    pub async fn operator(&self, filter: &str, qos: u8) -> Raw {
+        let mut raw = self.raw_with(&Connect::operator("").packet()).await;
+        raw.expect(&[0x20, 2, 0, 0]).await;
+        raw.send(&subscribe(1, &[(filter, qos)])).await;
+        raw.expect(&[0x90, 3, 0, 1, qos]).await;
+        raw
+    }
+
+    /// Healthy clients still get through, all the way.
+    pub async fn assert_serves(&self) {
+        let robot = RobotId::random();
+        let report = topic(&robot, RobotTopic::Report);
+        let mut operator = self.operator(&report, 0).await;
+        let mut client = self.robot(&robot).await;
+        client.send(&subscribe(7, &[(&topic(&robot, RobotTopic::Desired), 1)])).await;
+        client.expect(&[0x90, 3, 0, 7, 1]).await;
+        self.broker.ring(&robot, Bytes::from_static(b"ding")).unwrap();
+        client.expect(&publish(&topic(&robot, RobotTopic::Desired), 1, 1, b"ding")).await;
+        client.send(&[0x40, 2, 0, 1]).await;
+        client.send(&publish(&report, 1, 9, b"fine")).await;
+        client.expect(&[0x40, 2, 0, 9]).await;
+        operator.expect(&publish(&report, 0, 0, b"fine")).await;
+    }
+}
+
+/// A CONNECT to be.
+pub struct Connect {
+    pub client_id: String,
+    pub user_name: Option<String>,
+    pub password: Option<String>,
+    pub clean: bool,
+    pub keep_alive_s: u16,
+    pub will: Option<(String, Vec<u8>)>,
+}
+
+impl Connect {
+    pub fn robot(robot: &RobotId) -> Self {
+        Self {
+            client_id: robot.to_string(),
+            user_name: Some(robot.to_string()),
+            password: Some(format!("pw-{robot}")),
+            clean: true,
+            keep_alive_s: 0,
+            will: None,
+        }
+    }
+
+    pub fn operator(client_id: &str) -> Self {
+        Self {
+            client_id: client_id.to_owned(),
+            user_name: Some("anyone".to_owned()),
+            password: Some("operator".to_owned()),
+            clean: true,
+            keep_alive_s: 0,
+            will: None,
+        }
+    }
+
+    pub fn packet(&self) -> Vec<u8> {
+        let mut flags = u8::from(self.clean) << 1;
+        let mut fields = text(&self.client_id);
+        if let Some((topic, payload)) = &self.will {
+            flags |= 0x04 | 0x08;
+            fields.extend(text(topic));
+            fields.extend(binary(payload));
+        }
+        for (flag, field) in [(0x80, &self.user_name), (0x40, &self.password)] {
+            if let Some(field) = field {
+                flags |= flag;
+                fields.extend(text(field));
+            }
+        }
+        let mut body = text("MQTT");
+        body.extend([4, flags]);
+        body.extend(self.keep_alive_s.to_be_bytes());
+        body.extend(fields);
+        framed(0x10, &body)
+    }
+}
+
+pub fn topic(robot: &RobotId, last: RobotTopic) -> String {
+    TopicPrefix::default().format(&Topic::Robot(robot.clone(), last))
+}
+
+pub fn publish(topic: &str, qos: u8, id: u16, payload: &[u8]) -> Vec<u8> {
+    let mut body = text(topic);
+    if qos > 0 {
+        body.extend(id.to_be_bytes());
+    }
+    body.extend(payload);
+    framed(0x30 | qos << 1, &body)
+}
+
+pub fn subscribe(id: u16, filters: &[(&str, u8)]) -> Vec<u8> {
+    let mut body = id.to_be_bytes().to_vec();
+    for (filter, qos) in filters {
+        body.extend(text(filter));
+        body.push(*qos);
+    }
+    framed(0x82, &body)
+}
+
+pub fn unsubscribe(id: u16, filters: &[&str]) -> Vec<u8> {
+    let mut body = id.to_be_bytes().to_vec();
+    for filter in filters {
+        body.extend(text(filter));
+    }
+    framed(0xa2, &body)
+}
+
+pub fn framed(first: u8, body: &[u8]) -> Vec<u8> {
+    let mut packet = vec![first];
+    let mut length = body.len();
+    loop {
+        let byte = (length % 128) as u8;
+        length /= 128;
+        packet.push(if length > 0 { byte | 0x80 } else { byte });
+        if length == 0 {
+            break;
+        }
+    }
+    packet.extend(body);
+    packet
+}
+
+pub fn text(text: &str) -> Vec<u8> {
+    binary(text.as_bytes())
+}
+
+pub fn binary(bytes: &[u8]) -> Vec<u8> {
+    let mut field = u16::try_from(bytes.len()).unwrap().to_be_bytes().to_vec();
+    field.extend(bytes);
+    field
+}
+
+/// A client that knows no MQTT.
+pub struct Raw {
+    pub stream: TcpStream,
+}
+
+impl Raw {
+    /// Sends; that the other side has closed already is not this end's business.
+    pub async fn send(&mut self, bytes: &[u8]) {
+        let _ = timeout(PATIENCE, self.stream.write_all(bytes)).await.expect("the broker should read");
+    }
+
+    /// The next packet must be this.
+    pub async fn expect(&mut self, packet: &[u8]) {
+        let mut got = vec![0; packet.len()];
+        timeout(PATIENCE, self.stream.read_exact(&mut got))
+            .await
+            .unwrap_or_else(|_| panic!("{packet:02x?} should come"))
+            .unwrap_or_else(|error| panic!("{packet:02x?} should come: {error}"));
+        assert_eq!(got, packet, "{got:02x?} came, not {packet:02x?}");
+    }
+
+    /// The other side must close, and say nothing before.
+    pub async fn expect_close(&mut self) {
+        let mut rest = Vec::new();
+        // A reset is a close as well.
+        let _ = timeout(PATIENCE, self.stream.read_to_end(&mut rest)).await.expect("the broker should close");
+        assert_eq!(rest, b"", "nothing should come before the end");
+    }
+
+    /// Nothing may have come before the answer to a ping.
+    pub async fn expect_nothing(&mut self) {
+        self.send(&[0xc0, 0]).await;
+        self.expect(&[0xd0, 0]).await;
+    }
+}

@@ -171,6 +171,9 @@ fn prepare(order: &BuildOrder, script: &str) -> Result<(), BuildError> {
     for stale in [order.version.build(), order.version.install(), root.join("log")] {
         durable::remove_dir_all(&stale).map_err(failed(&stale))?;
     }
+    if let Some(logs) = order.log.parent() {
+        durable::create_dir_all(logs).map_err(failed(logs))?;
+    }
     let path = script_path(order);
     durable::write(&path, script.as_bytes(), 0o700).map_err(failed(&path))
 }

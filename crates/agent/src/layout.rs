@@ -23,6 +23,10 @@ use task_proto::{Digest, TaskName};
 
 use crate::durable;
 
+/// What a directory is called while it is being removed; no task or version can have such a name. Were it removed in
+/// place, a power cut would leave half a tree where a whole one is expected.
+const REMOVED: &str = ".removed-";
+
 /// The agent's data directory.
 #[derive(Debug, Clone)]
 pub struct DataDir {
@@ -77,9 +81,16 @@ impl DataDir {
         TaskDir { root: self.tasks().join(name.as_str()) }
     }
 
-    /// Removes what an agent that died left half done. Only at start: a pull in progress would lose its tree.
-    pub fn clean_staging(&self) -> io::Result<()> {
-        durable::remove_dir_all(&self.staging())
+    /// Removes what an agent that died left half done: trees half unpacked or half removed. Only at start: a pull in
+    /// progress would lose its tree.
+    pub fn clean_leftovers(&self) -> io::Result<()> {
+        durable::remove_dir_all(&self.staging())?;
+        let tasks = entries(&self.tasks())?;
+        remove_marked(&tasks)?;
+        for task in tasks.iter().filter(|path| path.is_dir()) {
+            remove_marked(&entries(task)?)?;
+        }
+        Ok(())
     }
 
     /// Removes all gathered bytes except those of the blobs in `wanted`.
@@ -148,7 +159,7 @@ impl TaskDir {
         let current = self.current();
         for digest in self.versions()? {
             if !kept.contains(&digest) && current != Some(digest) {
-                durable::remove_dir_all(self.version(&digest).root())?;
+                remove_whole(self.version(&digest).root())?;
             }
         }
         Ok(())
@@ -156,7 +167,7 @@ impl TaskDir {
 
     /// Removes the task with all it left.
     pub fn remove(&self) -> io::Result<()> {
-        durable::remove_dir_all(&self.root)
+        remove_whole(&self.root)
     }
 
     fn current_link(&self) -> PathBuf {
@@ -194,6 +205,20 @@ impl VersionDir {
     pub fn run_script(&self) -> PathBuf {
         self.root.join("run.sh")
     }
+}
+
+/// Removes a directory so that it is there whole or not at all, at any moment.
+fn remove_whole(dir: &Path) -> io::Result<()> {
+    let Some(name) = file_name(dir).filter(|_| dir.exists()) else { return Ok(()) };
+    let removed = dir.with_file_name(format!("{REMOVED}{name}"));
+    durable::remove_dir_all(&removed)?;
+    durable::rename(dir, &removed)?;
+    durable::remove_dir_all(&removed)
+}
+
+fn remove_marked(paths: &[PathBuf]) -> io::Result<()> {
+    let is_marked = |path: &&PathBuf| file_name(path).is_some_and(|name| name.starts_with(REMOVED));
+    paths.iter().filter(is_marked).try_for_each(|path| durable::remove_dir_all(path))
 }
 
 /// A directory's entries, sorted; none if it is not there.
@@ -241,12 +266,35 @@ mod tests {
     }
 
     #[test]
+    fn what_was_half_removed_is_never_taken_for_whole() {
+        let dir = tempfile::tempdir().unwrap();
+        let data = DataDir::new(dir.path()).unwrap();
+        data.clean_leftovers().unwrap();
+        let task = data.task(&"talker".parse().unwrap());
+        let [kept, half] = [b"1", b"2"].map(|bytes| Digest::of(bytes));
+        durable::create_dir_all(&task.version(&kept).src()).unwrap();
+        // As a power cut in the middle of removing leaves it.
+        let marked = task.root().join(format!("{REMOVED}{}", half.hex()));
+        durable::create_dir_all(&marked.join("src")).unwrap();
+        durable::create_dir_all(&data.tasks().join(".removed-gone/run")).unwrap();
+        durable::create_dir_all(&data.staging().join("x")).unwrap();
+        assert_eq!((task.versions().unwrap(), data.task_names().unwrap().len()), (vec![kept], 1));
+        // The version comes back and is removed again while the rest of the first removal is still there.
+        durable::create_dir_all(&task.version(&half).src()).unwrap();
+        task.prune(&[kept]).unwrap();
+        assert!(!marked.exists() && !task.version(&half).root().exists());
+        durable::create_dir_all(&marked.join("src")).unwrap();
+        data.clean_leftovers().unwrap();
+        assert!(!marked.exists() && !data.staging().exists());
+        assert_eq!(entries(&data.tasks()).unwrap(), [task.root()]);
+    }
+
+    #[test]
     fn cleaning_keeps_wanted_parts_only() {
         let dir = tempfile::tempdir().unwrap();
         let data = DataDir::new(dir.path()).unwrap();
         let (wanted, other) = (Digest::of(b"wanted"), Digest::of(b"other"));
         data.clean_parts(&[]).unwrap();
-        data.clean_staging().unwrap();
         durable::create_dir_all(&data.blobs()).unwrap();
         for digest in [wanted, other] {
             fs::write(data.blob_part(&digest), "…").unwrap();

@@ -18,7 +18,7 @@ use tokio_util::sync::CancellationToken;
 use super::{Effects, Now};
 use crate::builder::{self, BuildError, BuildLimits, BuildOrder};
 use crate::config::Config;
-use crate::fetch::{FetchError, Fetcher};
+use crate::fetch::{self, FetchError, Fetcher};
 use crate::layout::{DataDir, VersionDir};
 use crate::ledger::{ActiveRun, Ledger, LedgerError, ProcessRecord};
 use crate::observed::{Exit, Prepared, ProcessState, RobotFacts};
@@ -145,8 +145,7 @@ impl Effects for Robot {
     async fn prepared(&self, package: &PackageRef) -> Prepared {
         let task = self.data.task(&package.name);
         let version = self.version(package);
-        // Only what lies on the disk: without the file this would go to the network.
-        let manifest = if version.manifest().exists() { self.manifest(package).await.ok() } else { None };
+        let manifest = fetch::stored_manifest(&self.data, package);
         let content = version.src().is_dir();
         let needs_build = manifest.as_ref().is_none_or(|manifest| manifest.build.tool != BuildTool::None);
         Prepared {
@@ -268,14 +267,8 @@ async fn on_disk(work: impl FnOnce() -> std::io::Result<()> + Send + 'static) ->
 }
 
 fn fetch_failure(error: FetchError) -> StepFailure {
-    let code = match &error {
-        FetchError::DiskFull(_) => FailureCode::DISK_FULL,
-        FetchError::DigestMismatch { .. } => FailureCode::DIGEST_MISMATCH,
-        FetchError::ManifestInvalid(_) => FailureCode::MANIFEST_INVALID,
-        FetchError::ArchiveRefused(_) => FailureCode::ARCHIVE_REFUSED,
-        FetchError::Disk { .. } => FailureCode::IO_ERROR,
-        _ => FailureCode::PACKAGE_UNAVAILABLE,
-    };
+    // A cancelled pull is no failure: the driver lets go of its outcome.
+    let code = error.code().unwrap_or(FailureCode::INTERRUPTED);
     if error.is_retryable() || matches!(error, FetchError::Cancelled) {
         let least_ms = error.retry_after().map_or(0, |wait| u64::try_from(wait.as_millis()).unwrap_or(u64::MAX));
         return later(code, &error, least_ms);

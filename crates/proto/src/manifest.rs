@@ -12,6 +12,8 @@ use crate::{Digest, TaskName, Version};
 pub const MAX_TEXT_BYTES: usize = 4096;
 /// The most elements any list or table in a manifest may have.
 pub const MAX_LIST_LEN: usize = 256;
+/// The largest manifest, in bytes of JSON.
+pub const MAX_MANIFEST_BYTES: usize = 1024 * 1024;
 /// The largest uncompressed content that is packed, in bytes, and that a robot unpacks by default.
 pub const MAX_CONTENT_TAR_BYTES: u64 = 16 << 30;
 /// The most files, directories and links, likewise.

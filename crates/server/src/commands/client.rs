@@ -211,6 +211,11 @@ impl Client {
                 break;
             }
         }
+        if body.is_empty() {
+            // The answer to a HEAD has only its status.
+            let message = status.canonical_reason().unwrap_or("refused").to_lowercase();
+            return ClientError::Refused { status, code: status.as_str().to_owned(), message };
+        }
         if let Ok(ErrorBody { error }) = serde_json::from_slice(&body) {
             return ClientError::Refused { status, code: error.code, message: error.message };
         }
@@ -307,5 +312,64 @@ mod tests {
         assert_eq!(refused(StatusCode::CONFLICT, "no_robots_match"), Outcome::Usage);
         assert_eq!(refused(StatusCode::NOT_FOUND, "not_found"), Outcome::Failed);
         assert_eq!(refused(StatusCode::BAD_REQUEST, "invalid_request"), Outcome::Usage);
+    }
+
+    /// A server that says 503 twice and then tells which keys it was asked with.
+    async fn busy_server() -> std::net::SocketAddr {
+        use std::sync::{Arc, Mutex};
+
+        use axum::http::HeaderMap;
+        use axum::response::IntoResponse as _;
+        let keys = Arc::new(Mutex::new(Vec::new()));
+        let order = move |headers: HeaderMap| async move {
+            let mut keys = keys.lock().unwrap();
+            keys.push(headers[IDEMPOTENCY_KEY].to_str().unwrap().to_owned());
+            match keys.len() {
+                3 => axum::Json(keys.clone()).into_response(),
+                _ => (StatusCode::SERVICE_UNAVAILABLE, [(RETRY_AFTER, "0")], "busy").into_response(),
+            }
+        };
+        let router = axum::Router::new()
+            .route("/api/v1/orders", axum::routing::post(order))
+            .route("/api/v1/page", axum::routing::get(|| async { "<html>sign in to the hotel's network</html>" }));
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = listener.local_addr().unwrap();
+        tokio::spawn(async move { axum::serve(listener, router).await });
+        address
+    }
+
+    fn client(address: std::net::SocketAddr) -> Client {
+        let token = Token::random(task_proto::token::TokenKind::Operator).reveal();
+        let connection = Connection {
+            server: Some(format!("http://{address}/")),
+            token: Some(token),
+            token_file: None,
+            data: None,
+            output: super::super::Format::Json,
+        };
+        Client::connect(&connection).unwrap()
+    }
+
+    #[tokio::test]
+    async fn an_order_is_retried_with_the_same_key() {
+        let client = client(busy_server().await);
+        let keys: Vec<String> = client.order("/orders", &serde_json::json!({}), "k1").await.unwrap();
+        assert_eq!(keys, ["k1", "k1", "k1"]);
+    }
+
+    #[tokio::test]
+    async fn another_program_is_not_taken_for_the_server() {
+        let client = client(busy_server().await);
+        let answer = client.get::<Vec<String>>("/page", &[]).await;
+        assert!(matches!(answer, Err(ClientError::NotTheServer { .. })), "{answer:?}");
+    }
+
+    #[test]
+    fn the_server_on_this_machine_is_found_by_its_data_directory() {
+        let dir = tempfile::tempdir().unwrap();
+        assert_eq!(local_server(Some(dir.path())), None);
+        std::fs::write(dir.path().join("addresses.json"), r#"{"http":"127.0.0.1:8081","mqtt":"127.0.0.1:1884"}"#)
+            .unwrap();
+        assert_eq!(local_server(Some(dir.path())).as_deref(), Some("http://127.0.0.1:8081"));
     }
 }

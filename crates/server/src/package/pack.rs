@@ -6,7 +6,7 @@ use std::path::Path;
 
 use task_proto::Digest;
 use task_proto::desired::{BlobRef, PackageRef};
-use task_proto::manifest::{CONTENT_RATIO_FREE_BYTES, MAX_CONTENT_RATIO};
+use task_proto::manifest::{CONTENT_RATIO_FREE_BYTES, MAX_CONTENT_RATIO, MAX_MANIFEST_BYTES};
 use task_proto::oci::ImageManifest;
 use tempfile::NamedTempFile;
 
@@ -15,8 +15,10 @@ use super::{PackageError, Packed, Problem, archive, source};
 /// Packs `dir`. Reads every file once and blocks meanwhile.
 pub fn pack(dir: &Path) -> Result<Packed, PackageError> {
     let source::Source { mut manifest, tree } = source::read(dir)?;
-    let failed =
-        |source| PackageError::Io { what: "can't write the packed content to a temporary file".to_owned(), source };
+    let failed = |source| PackageError::Io {
+        what: "can't write the packed content to a temporary file (TMPDIR says where)".to_owned(),
+        source,
+    };
     let mut content = NamedTempFile::with_prefix("taskd-content-").map_err(failed)?;
     let mut output = BufWriter::with_capacity(256 * 1024, content.as_file_mut());
     let (content_blob, facts) = archive::write(&tree, &mut output)?;
@@ -27,13 +29,14 @@ pub fn pack(dir: &Path) -> Result<Packed, PackageError> {
             "compresses more than {MAX_CONTENT_RATIO} times ({} to {} bytes), which robots refuse; leave out what is empty",
             facts.tar_size, content_blob.size
         );
-        return Err(PackageError::Invalid {
-            dir: dir.to_owned(),
-            problems: vec![Problem { file: ".".to_owned(), reason }],
-        });
+        return Err(invalid(dir, ".", reason));
     }
     manifest.content = facts;
     let config_bytes = json(&manifest)?;
+    if config_bytes.len() > MAX_MANIFEST_BYTES {
+        let reason = format!("makes a manifest of more than {MAX_MANIFEST_BYTES} bytes");
+        return Err(invalid(dir, "task.toml", reason));
+    }
     let config = blob(&config_bytes);
     let manifest_bytes = json(&ImageManifest::package(config, content_blob))?;
     let package = PackageRef {
@@ -44,6 +47,10 @@ pub fn pack(dir: &Path) -> Result<Packed, PackageError> {
         content: content_blob,
     };
     Ok(Packed { package, manifest, config_bytes, manifest_bytes, content })
+}
+
+fn invalid(dir: &Path, file: &str, reason: String) -> PackageError {
+    PackageError::Invalid { dir: dir.to_owned(), problems: vec![Problem { file: file.to_owned(), reason }] }
 }
 
 /// Compact JSON with the fields in the order of their declaration and maps sorted: one text for one value.

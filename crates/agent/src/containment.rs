@@ -1,6 +1,7 @@
 //! Everything a run has started, whatever it did to get away: all that carry the run directory in their environment
 //! (it survives `fork`, `setsid` and the shim's death) and all that descend from the shim, which is their subreaper
 //! (that survives a cleared environment). It signals them and proves that none is left; it never signals the shim.
+//! Out of reach is only a process that clears its environment, leaves its parent and then sees its shim killed.
 
 use std::collections::HashSet;
 use std::io;
@@ -122,7 +123,8 @@ impl Containment {
 
 /// Signals all of them, also when one can't be, and then gives the last error.
 fn signal_each<'a>(members: impl IntoIterator<Item = &'a ProcessIdentity>, signal: Signal) -> io::Result<()> {
-    members.into_iter().map(|member| member.signal(signal)).fold(Ok(()), |all, one| one.and(all))
+    let failed = members.into_iter().filter_map(|member| member.signal(signal).err()).last();
+    failed.map_or(Ok(()), Err)
 }
 
 fn descendants(table: &[ProcessEntry], ancestor: u32) -> HashSet<u32> {

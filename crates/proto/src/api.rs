@@ -363,6 +363,13 @@ pub struct SignIn {
     pub token: String,
 }
 
+/// Answer to a sign-in, and `GET /session` (anyone).
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SessionView {
+    /// When the caller's session ends; absent: not signed in.
+    pub expires_at_ms: Option<u64>,
+}
+
 /// What `GET /events` (operator) streams: each is the `data` of a server-sent event whose `event` is the tag's value.
 /// A view replaces what was known before. After (re)connecting, fetch the lists once.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -27,6 +27,11 @@ impl Digest {
         Self(bytes)
     }
 
+    /// The 32 bytes.
+    pub fn to_bytes(&self) -> [u8; 32] {
+        self.0
+    }
+
     /// The 64 hex digits, without the algorithm: the blob's file name.
     pub fn hex(&self) -> String {
         hex(&self.0)

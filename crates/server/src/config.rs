@@ -327,11 +327,6 @@ impl Config {
         Ok(config)
     }
 
-    /// The database's URL, with the default filled in.
-    pub fn database_url(&self) -> String {
-        self.database.clone().unwrap_or_else(|| format!("sqlite:{}", self.data.join("taskd.sqlite").display()))
-    }
-
     fn apply(&mut self, key: &str, text: &str, origin: Origin) -> Result<(), ConfigError> {
         let Some(setting) = Setting::by_key(key) else {
             return Err(ConfigError::Unknown { hint: nearest(key), origin });

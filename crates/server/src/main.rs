@@ -1,3 +1,115 @@
 //! The `taskd` binary: parses the command line and hands over. It never holds logic of its own.
 
-fn main() {}
+use std::io::Write as _;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use anyhow::Context as _;
+use clap::{Parser, Subcommand};
+use taskd::clock::Clock;
+use taskd::commands;
+use taskd::config::{Config, ServeFlags};
+use taskd::serve::Server;
+use tokio::signal::unix::{Signal, SignalKind, signal};
+use tracing_subscriber::EnvFilter;
+
+/// What may still run on a blocking thread when everything else has ended.
+const LEFTOVER_PATIENCE: Duration = Duration::from_millis(500);
+
+/// Distributes task packages to robots and runs them there
+#[derive(Parser)]
+#[command(name = "taskd", version, propagate_version = true)]
+struct CommandLine {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Run the server
+    Serve(ServeFlags),
+    #[command(flatten)]
+    Operator(commands::Command),
+}
+
+fn main() -> ExitCode {
+    let CommandLine { command } = CommandLine::parse();
+    let runtime = match tokio::runtime::Runtime::new() {
+        Ok(runtime) => runtime,
+        Err(error) => return complain(&anyhow::Error::new(error).context("no threads to run on")),
+    };
+    let code = match command {
+        Command::Serve(flags) => runtime.block_on(serve(&flags)).unwrap_or_else(|error| complain(&error)),
+        Command::Operator(command) => runtime.block_on(commands::run(command)),
+    };
+    runtime.shutdown_timeout(LEFTOVER_PATIENCE);
+    code
+}
+
+async fn serve(flags: &ServeFlags) -> anyhow::Result<ExitCode> {
+    let filter =
+        EnvFilter::try_from_env("TASKD_LOG").unwrap_or_else(|_| EnvFilter::new("info,sqlx=warn,rumqttd=error"));
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    let config = Config::load(flags, std::env::vars_os())?;
+    // Installed before anything is started, so that an early signal stops it softly as well.
+    let mut signals = Signals::install().context("signals can't be caught")?;
+    let server = Server::start(config, Clock::system()).await?;
+    say_what_next(&server);
+    let code = tokio::select! {
+        () = signals.next() => ExitCode::SUCCESS,
+        seen = server.broken() => {
+            tracing::error!(seen, "MQTT can't be served any more, so the server ends; start it again");
+            ExitCode::FAILURE
+        }
+    };
+    tracing::info!("stopping; a second signal ends it at once");
+    tokio::select! {
+        () = server.stop() => Ok(code),
+        () = signals.next() => Ok(ExitCode::FAILURE),
+    }
+}
+
+/// On stdout: where the server is, and the first three things to do with it.
+fn say_what_next(server: &Server) {
+    let addresses = server.addresses();
+    let url = format!("http://{}", addresses.http);
+    let data = server.data().path().display();
+    let token = server.data().operator_token_path();
+    let text = format!(
+        "taskd serves HTTP on {url} and MQTT on {mqtt}, all its state is in {data}\n\
+         \n\
+         The page:        {url}/   (sign in with the token in {token})\n\
+         A robot:         taskd enroll-token create --data {data}\n\
+         \x20                task-agent enroll --server {url} --token TOKEN\n\
+         A first package: taskd push DIR --to '*' --wait --data {data}\n",
+        mqtt = addresses.mqtt,
+        token = token.display(),
+    );
+    // Nobody may be reading; the server serves all the same.
+    let _ = std::io::stdout().write_all(text.as_bytes()).and_then(|()| std::io::stdout().flush());
+}
+
+/// SIGTERM and Ctrl-C.
+struct Signals {
+    terminate: Signal,
+    interrupt: Signal,
+}
+
+impl Signals {
+    fn install() -> std::io::Result<Self> {
+        Ok(Self { terminate: signal(SignalKind::terminate())?, interrupt: signal(SignalKind::interrupt())? })
+    }
+
+    async fn next(&mut self) {
+        tokio::select! {
+            _ = self.terminate.recv() => {}
+            _ = self.interrupt.recv() => {}
+        }
+    }
+}
+
+/// Says on stderr what went wrong, with all causes. A broken stderr is no reason to panic.
+fn complain(error: &anyhow::Error) -> ExitCode {
+    let _ = writeln!(std::io::stderr(), "taskd: {error:#}");
+    ExitCode::FAILURE
+}

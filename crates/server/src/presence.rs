@@ -98,6 +98,17 @@ impl Presence {
         self.get(robot, now_ms).is_some_and(|sighting| sighting.online)
     }
 
+    /// Robots without a connection that were online at `since_ms` and no longer are at `now_ms`, because they were not
+    /// heard for the window.
+    pub fn fell_silent(&self, since_ms: u64, now_ms: u64) -> Vec<RobotId> {
+        let robots = self.robots();
+        let fell = robots.iter().filter(|(_, sightings)| {
+            let ends_ms = sightings.last_seen_ms.saturating_add(self.window_ms);
+            sightings.connection.is_none() && (since_ms..now_ms).contains(&ends_ms)
+        });
+        fell.map(|(robot, _)| robot.clone()).collect()
+    }
+
     /// Whether two instances of the robot keep displacing each other.
     pub fn is_duplicate(&self, robot: &RobotId, now_ms: u64) -> bool {
         self.robots().get(robot).is_some_and(|sightings| sightings.instances.is_duplicate(now_ms))

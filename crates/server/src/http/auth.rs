@@ -1,11 +1,22 @@
 //! Who is calling, and may they: every route names its [`Access`], the guard finds the [`Caller`] and refuses the rest.
-//! Secrets are compared as SHA-256 in constant time. It never decides what a caller's order means.
+//! It never decides what a caller's order means.
 
-use axum::extract::FromRequestParts;
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use axum::extract::{ConnectInfo, FromRequestParts, RawPathParams, Request, State};
+use axum::middleware::Next;
+use axum::response::{IntoResponse, Response};
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
 use http::request::Parts;
+use http::{HeaderMap, Method, StatusCode, header};
 use task_proto::RobotId;
+use task_proto::token::Token;
 
+use super::App;
 use super::error::ApiError;
+use crate::store::TokenHolder;
 
 /// Who may call a route.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -28,17 +39,11 @@ pub enum Caller {
     /// Nobody known: only on routes for anyone.
     Anyone,
     /// An operator.
-    Operator {
-        /// The public part of the token.
-        token_id: String,
-    },
+    Operator,
     /// A robot.
     Robot(RobotId),
     /// The holder of an enrolment token.
-    Enrolment {
-        /// The public part of the token.
-        token_id: String,
-    },
+    Enrolment(Token),
 }
 
 impl Caller {
@@ -50,9 +55,14 @@ impl Caller {
         }
     }
 
-    /// Whether an operator calls.
-    pub fn is_operator(&self) -> bool {
-        matches!(self, Self::Operator { .. })
+    fn may(&self, access: Access, own: Option<&str>) -> bool {
+        match access {
+            Access::Anyone => true,
+            Access::Operator => *self == Self::Operator,
+            Access::OwnRobot => self.robot().is_some_and(|robot| own == Some(robot.as_str())),
+            Access::Enrolment => matches!(self, Self::Enrolment(_)),
+            Access::OperatorOrRobot => matches!(self, Self::Operator | Self::Robot(_)),
+        }
     }
 }
 
@@ -62,5 +72,139 @@ impl<S: Sync> FromRequestParts<S> for Caller {
     async fn from_request_parts(parts: &mut Parts, _state: &S) -> Result<Self, ApiError> {
         // Absent only if a handler was mounted without the guard: then nobody is let in.
         parts.extensions.get::<Self>().cloned().ok_or_else(|| ApiError::unauthorized("this route has no guard"))
+    }
+}
+
+/// What the guard of one route knows.
+#[derive(Clone)]
+pub(super) struct Gate {
+    pub(super) app: App,
+    pub(super) access: Access,
+    pub(super) deadline: Option<Duration>,
+}
+
+/// Stands before every handler: finds the caller, refuses whoever may not, and ends what takes too long.
+pub(super) async fn guard(
+    State(gate): State<Gate>,
+    ConnectInfo(peer): ConnectInfo<SocketAddr>,
+    params: RawPathParams,
+    mut request: Request,
+    next: Next,
+) -> Response {
+    let is_oci = request.uri().path().starts_with("/v2");
+    let own = params.iter().find(|(name, _)| *name == "robot").map(|(_, value)| value);
+    match admit(&gate, peer, own, request.method(), request.headers()).await {
+        Ok(caller) => request.extensions_mut().insert(caller),
+        Err(error) if is_oci => return error.into_oci_response(),
+        Err(error) => return error.into_response(),
+    };
+    let Some(deadline) = gate.deadline else { return next.run(request).await };
+    tokio::time::timeout(deadline, next.run(request)).await.unwrap_or_else(|_| {
+        let message = "the request took too long to arrive or to be answered";
+        ApiError::new(StatusCode::REQUEST_TIMEOUT, "timeout", message).into_response()
+    })
+}
+
+async fn admit(
+    gate: &Gate,
+    peer: SocketAddr,
+    own: Option<&str>,
+    method: &Method,
+    headers: &HeaderMap,
+) -> Result<Caller, ApiError> {
+    if gate.access == Access::Anyone {
+        return Ok(Caller::Anyone);
+    }
+    match identify(&gate.app, method, headers).await {
+        Ok(caller) if caller.may(gate.access, own) => Ok(caller),
+        Ok(Caller::Anyone) => Err(ApiError::unauthorized("a token is needed: Authorization: Bearer …")),
+        Ok(_) => Err(ApiError::forbidden("this token may not do that")),
+        Err(error) if error.status == StatusCode::UNAUTHORIZED => {
+            let is_too_many = gate.app.attempts.record(peer.ip(), gate.app.clock.now_ms());
+            Err(if is_too_many { ApiError::too_many("too many wrong tokens from this address") } else { error })
+        }
+        Err(error) => Err(error),
+    }
+}
+
+/// Who sent these headers. `Anyone` if they don't say; an error if they say it wrongly.
+async fn identify(app: &App, method: &Method, headers: &HeaderMap) -> Result<Caller, ApiError> {
+    let now_ms = app.clock.now_ms();
+    let token = if let Some(value) = headers.get(header::AUTHORIZATION) {
+        let text = value.to_str().ok().and_then(presented_token);
+        let text = text.ok_or_else(|| ApiError::unauthorized("Authorization: expected Bearer or Basic and a token"))?;
+        text.parse().map_err(|error| ApiError::unauthorized(format!("Authorization: {error}")))?
+    } else if let Some(session) = app.sessions.find(headers, now_ms) {
+        if !matches!(*method, Method::GET | Method::HEAD) {
+            require_same_origin(headers)?;
+        }
+        session.token
+    } else {
+        return Ok(Caller::Anyone);
+    };
+    match app.store.token_holder(&token, now_ms).await? {
+        Some(TokenHolder::Operator) => Ok(Caller::Operator),
+        Some(TokenHolder::Robot(robot)) => Ok(Caller::Robot(robot)),
+        Some(TokenHolder::Enrolment) => Ok(Caller::Enrolment(token)),
+        None => Err(ApiError::unauthorized("the token is unknown, expired or revoked")),
+    }
+}
+
+/// The token of `Bearer TOKEN` or `Basic base64(anything:TOKEN)`.
+fn presented_token(value: &str) -> Option<String> {
+    let (scheme, rest) = value.trim().split_once(' ')?;
+    if scheme.eq_ignore_ascii_case("bearer") {
+        return Some(rest.trim().to_owned());
+    }
+    if !scheme.eq_ignore_ascii_case("basic") {
+        return None;
+    }
+    let decoded = String::from_utf8(STANDARD.decode(rest.trim()).ok()?).ok()?;
+    decoded.split_once(':').map(|(_, password)| password.to_owned())
+}
+
+/// Refuses what a foreign page could have made a signed-in browser send.
+pub(super) fn require_same_origin(headers: &HeaderMap) -> Result<(), ApiError> {
+    let text = |name| headers.get(name).and_then(|value: &http::HeaderValue| value.to_str().ok());
+    let is_same = match (text(http::HeaderName::from_static("sec-fetch-site")), text(header::ORIGIN)) {
+        (Some(site), _) => site == "same-origin",
+        (None, Some(origin)) => origin.split_once("://").map(|(_, host)| host) == text(header::HOST),
+        (None, None) => false,
+    };
+    if is_same { Ok(()) } else { Err(ApiError::forbidden("Origin: a signed-in page may only call its own server")) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tokens_come_as_bearer_or_as_a_password() {
+        assert_eq!(presented_token("Bearer abc").as_deref(), Some("abc"));
+        assert_eq!(presented_token("bearer  abc ").as_deref(), Some("abc"));
+        let basic = format!("Basic {}", STANDARD.encode("anyone:a:b"));
+        assert_eq!(presented_token(&basic).as_deref(), Some("a:b"));
+        for bad in ["", "Bearer", "Basic !", "Digest abc", &format!("Basic {}", STANDARD.encode("abc"))] {
+            assert_eq!(presented_token(bad), None, "{bad:?}");
+        }
+    }
+
+    #[test]
+    fn only_the_page_itself_may_change_things() {
+        let check = |pairs: &[(&'static str, &'static str)]| {
+            let headers: HeaderMap = pairs
+                .iter()
+                .map(|(name, value)| (http::HeaderName::from_static(name), http::HeaderValue::from_static(value)))
+                .collect();
+            require_same_origin(&headers).is_ok()
+        };
+        let host = ("host", "fleet.example:8080");
+        assert!(check(&[host, ("origin", "http://fleet.example:8080")]));
+        assert!(check(&[host, ("sec-fetch-site", "same-origin")]));
+        assert!(!check(&[host]));
+        assert!(!check(&[host, ("origin", "null")]));
+        assert!(!check(&[host, ("origin", "http://evil.example")]));
+        assert!(!check(&[host, ("origin", "http://fleet.example:9090")]));
+        assert!(!check(&[host, ("origin", "http://fleet.example:8080"), ("sec-fetch-site", "cross-site")]));
     }
 }

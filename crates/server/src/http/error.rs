@@ -1,13 +1,15 @@
-//! The API's one error shape: a status, a stable code for programs and a sentence for people. Bodies that do not parse
-//! are answered here too, naming the field. It never shows a caller what went wrong inside: that is logged.
+//! The API's one error shape: a status, a stable code for programs and a sentence for people. It never tells a caller
+//! what went wrong inside: that is logged.
 
 use axum::Json;
-use axum::extract::{FromRequest, Request};
 use axum::response::{IntoResponse, Response};
-use bytes::Bytes;
-use http::{StatusCode, header};
-use serde::de::DeserializeOwned;
+use http::{HeaderValue, StatusCode, header};
+use serde_json::json;
 use task_proto::api;
+
+use crate::actions::ActionError;
+use crate::report_writer::ReportError;
+use crate::store::StoreError;
 
 /// An answer that is not the one hoped for.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -51,7 +53,17 @@ impl ApiError {
         Self::new(StatusCode::CONFLICT, code, message)
     }
 
-    /// 500: our own failure, logged here with its causes and told to nobody.
+    /// 429: too much of it.
+    pub fn too_many(message: impl Into<String>) -> Self {
+        Self::new(StatusCode::TOO_MANY_REQUESTS, "too_many_requests", message)
+    }
+
+    /// 503: not now; the caller is expected to try again.
+    pub fn unavailable(message: impl Into<String>) -> Self {
+        Self::new(StatusCode::SERVICE_UNAVAILABLE, "unavailable", message)
+    }
+
+    /// 500: our own failure, logged here with its causes.
     pub fn internal(error: &(dyn std::error::Error + 'static)) -> Self {
         let mut chain = error.to_string();
         let mut source = error.source();
@@ -62,50 +74,71 @@ impl ApiError {
         tracing::error!(error = chain, "a request failed");
         Self::new(StatusCode::INTERNAL_SERVER_ERROR, "internal", "the server failed; its log says why")
     }
-}
 
-impl IntoResponse for ApiError {
-    fn into_response(self) -> Response {
-        let error = api::ApiError { code: self.code.to_owned(), message: self.message };
-        let mut response = (self.status, Json(api::ErrorBody { error })).into_response();
+    /// The answer in the shape of the OCI distribution specification, for everything below `/v2`.
+    pub fn into_oci_response(self) -> Response {
+        let code = match self.status {
+            StatusCode::UNAUTHORIZED => "UNAUTHORIZED",
+            StatusCode::FORBIDDEN => "DENIED",
+            StatusCode::TOO_MANY_REQUESTS => "TOOMANYREQUESTS",
+            StatusCode::NOT_FOUND => "NAME_UNKNOWN",
+            _ => "UNSUPPORTED",
+        };
+        let body = json!({ "errors": [{ "code": code, "message": self.message }] });
+        // Registry clients send the password only after a Basic challenge; a page must not see one, or the browser
+        // would ask its user.
+        self.with_headers("Basic realm=\"taskd\"", Json(body))
+    }
+
+    fn with_headers(&self, challenge: &'static str, body: impl IntoResponse) -> Response {
+        let mut response = (self.status, body).into_response();
         if self.status == StatusCode::UNAUTHORIZED {
-            let challenge = http::HeaderValue::from_static("Basic realm=\"taskd\", charset=\"UTF-8\"");
-            response.headers_mut().insert(header::WWW_AUTHENTICATE, challenge);
+            response.headers_mut().insert(header::WWW_AUTHENTICATE, HeaderValue::from_static(challenge));
+        }
+        if matches!(self.status, StatusCode::TOO_MANY_REQUESTS | StatusCode::SERVICE_UNAVAILABLE) {
+            response.headers_mut().insert(header::RETRY_AFTER, HeaderValue::from_static("5"));
         }
         response
     }
 }
 
-/// A request body as JSON. Refusals name the field.
-pub struct JsonBody<T>(pub T);
-
-impl<S: Send + Sync, T: DeserializeOwned> FromRequest<S> for JsonBody<T> {
-    type Rejection = ApiError;
-
-    async fn from_request(request: Request, state: &S) -> Result<Self, ApiError> {
-        let content_type = request.headers().get(header::CONTENT_TYPE).and_then(|value| value.to_str().ok());
-        let media_type = content_type.unwrap_or_default().split(';').next().unwrap_or_default().trim();
-        if !media_type.eq_ignore_ascii_case("application/json") {
-            let message = "the Content-Type must be application/json";
-            return Err(ApiError::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "unsupported_media_type", message));
-        }
-        let body = Bytes::from_request(request, state).await.map_err(|rejection| body_refusal(rejection.status()))?;
-        parse_json(&body).map(Self)
+impl IntoResponse for ApiError {
+    fn into_response(self) -> Response {
+        let error = api::ApiError { code: self.code.to_owned(), message: self.message.clone() };
+        self.with_headers("Bearer realm=\"taskd\"", Json(api::ErrorBody { error }))
     }
 }
 
-/// The answer to a body that could not be read.
-fn body_refusal(status: StatusCode) -> ApiError {
-    match status {
-        StatusCode::PAYLOAD_TOO_LARGE => {
-            ApiError::new(status, "too_large", "the body is larger than this route allows")
-        }
-        _ => ApiError::invalid("the body ended early"),
+impl From<StoreError> for ApiError {
+    fn from(error: StoreError) -> Self {
+        Self::internal(&error)
     }
 }
 
-/// Parses JSON whose fields are all known; says where it does not fit.
-pub fn parse_json<T: DeserializeOwned>(body: &[u8]) -> Result<T, ApiError> {
-    serde_json::from_slice(body)
-        .map_err(|error| ApiError::invalid(format!("the body is not what is expected: {error}")))
+impl From<ActionError> for ApiError {
+    fn from(error: ActionError) -> Self {
+        let status = match error {
+            ActionError::Store(_) => return Self::internal(&error),
+            ActionError::Invalid { .. } | ActionError::InvalidIdempotencyKey => StatusCode::BAD_REQUEST,
+            ActionError::TokenRefused => StatusCode::UNAUTHORIZED,
+            ActionError::TokenForOther { .. } => StatusCode::FORBIDDEN,
+            ActionError::RobotNotFound(_) | ActionError::DeploymentNotFound(_) => StatusCode::NOT_FOUND,
+            ActionError::NoRobotsMatch(_)
+            | ActionError::IdempotencyKeyReused(_)
+            | ActionError::MacKnown { .. }
+            | ActionError::NameTaken(_)
+            | ActionError::DeploymentCancelled(_)
+            | ActionError::Diverged(_) => StatusCode::CONFLICT,
+        };
+        Self::new(status, error.code(), error.to_string())
+    }
+}
+
+impl From<ReportError> for ApiError {
+    fn from(error: ReportError) -> Self {
+        match error {
+            ReportError::RobotNotFound(_) => Self::not_found(error.to_string()),
+            ReportError::Busy | ReportError::NotStored => Self::unavailable(error.to_string()),
+        }
+    }
 }

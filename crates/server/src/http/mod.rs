@@ -1,7 +1,227 @@
 //! The HTTP edge: one table of routes, each with who may call it, in front of handlers that look up, act and reply.
 //! It never holds SQL and never decides what an order means.
 
+pub mod attempts;
 pub mod auth;
+mod deployments;
 pub mod drain;
+mod enroll;
 pub mod error;
+pub mod events;
+pub mod extract;
+mod health;
+pub mod listener;
 pub mod oci;
+mod packages;
+mod robots;
+pub mod session;
+mod tasks;
+mod views;
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::Router;
+use axum::extract::{DefaultBodyLimit, FromRef, Request};
+use axum::handler::Handler;
+use axum::middleware;
+use axum::response::{IntoResponse, Response};
+use axum::routing::{MethodFilter, MethodRouter, any, on};
+use http::{HeaderValue, Method, StatusCode, header};
+use task_proto::api::MqttEndpoint;
+use task_proto::envelope::PublicKey;
+use tokio_util::sync::CancellationToken;
+
+use crate::actions::Actions;
+use crate::blobs::Blobs;
+use crate::broker::Broker;
+use crate::changes::Changes;
+use crate::clock::Clock;
+use crate::presence::Presence;
+use crate::report_writer::ReportWriter;
+use crate::store::Store;
+use auth::{Access, Gate, guard};
+use error::ApiError;
+
+/// What handlers work with. Clones share everything.
+#[derive(Clone)]
+pub struct App {
+    /// The time.
+    pub clock: Clock,
+    /// The database.
+    pub store: Store,
+    /// The orders.
+    pub actions: Actions,
+    /// Notices of what has changed.
+    pub changes: Changes,
+    /// Where reports go.
+    pub reports: ReportWriter,
+    /// Who is there.
+    pub presence: Arc<Presence>,
+    /// The MQTT broker.
+    pub broker: Broker,
+    /// The packages' bytes.
+    pub blobs: Blobs,
+    /// Who is signed in at the page.
+    pub sessions: Arc<session::Sessions>,
+    /// Failed authentications.
+    pub attempts: Arc<attempts::FailedAttempts>,
+    /// The event stream's source.
+    pub events: events::EventFeed,
+    /// The key that verifies desired states.
+    pub key: PublicKey,
+    /// Where robots reach MQTT.
+    pub mqtt: MqttEndpoint,
+    /// The data directory, which must be writable.
+    pub data: PathBuf,
+    /// Cancelled when the server stops.
+    pub stop: CancellationToken,
+}
+
+impl FromRef<App> for oci::Registry {
+    fn from_ref(app: &App) -> Self {
+        Self { store: app.store.clone(), blobs: app.blobs.clone(), clock: app.clock.clone() }
+    }
+}
+
+/// The largest body of most requests.
+const SMALL_BODY_BYTES: usize = 64 * 1024;
+/// The largest selector is 64 KiB; an order has one.
+const ORDER_BODY_BYTES: usize = 128 * 1024;
+/// The largest report.
+pub const REPORT_BODY_BYTES: usize = 1024 * 1024;
+/// How long a request may take, from its head to its answer.
+const DEADLINE: Duration = Duration::from_secs(30);
+
+/// One route: what it answers to, who may call it, and its limits.
+pub struct Route {
+    /// The method; GET answers HEAD as well. `None`: the handler looks at the method itself.
+    pub method: Option<Method>,
+    /// The path, with `{parameters}`.
+    pub path: &'static str,
+    /// Who may call it.
+    pub access: Access,
+    body_bytes: usize,
+    deadline: Option<Duration>,
+    handler: MethodRouter<App>,
+}
+
+impl Route {
+    /// A route of the API, with a small body and the common deadline.
+    #[expect(clippy::expect_used, reason = "the table is fixed, and a test builds it")]
+    pub fn new<H, T>(method: Method, path: &'static str, access: Access, handler: H) -> Self
+    where
+        H: Handler<T, App>,
+        T: 'static,
+    {
+        let filter = MethodFilter::try_from(method.clone()).expect("a method that axum routes");
+        let (body_bytes, deadline) = (SMALL_BODY_BYTES, Some(DEADLINE));
+        Self { method: Some(method), path, access, body_bytes, deadline, handler: on(filter, handler) }
+    }
+
+    /// A route for every method, whose handler streams and bounds itself.
+    pub fn any<H, T>(path: &'static str, access: Access, handler: H) -> Self
+    where
+        H: Handler<T, App>,
+        T: 'static,
+    {
+        Self { method: None, path, access, body_bytes: usize::MAX, deadline: None, handler: any(handler) }
+    }
+
+    fn body_bytes(self, body_bytes: usize) -> Self {
+        Self { body_bytes, ..self }
+    }
+
+    /// Without a deadline, for an answer that goes on.
+    fn streaming(self) -> Self {
+        Self { deadline: None, ..self }
+    }
+}
+
+/// Every route there is, with who may call it. Nothing is served that is not here.
+pub fn routes() -> Vec<Route> {
+    use Access::{Anyone, Enrolment, Operator, OperatorOrRobot, OwnRobot};
+    let (get, post, patch, delete) = (Method::GET, Method::POST, Method::PATCH, Method::DELETE);
+    vec![
+        Route::new(get.clone(), "/healthz", Anyone, health::healthz),
+        Route::new(get.clone(), "/readyz", Anyone, health::readyz),
+        Route::new(get.clone(), "/api/v1/server", Operator, health::server),
+        Route::new(get.clone(), "/api/v1/session", Anyone, session::show),
+        Route::new(post.clone(), "/api/v1/session", Anyone, session::sign_in),
+        Route::new(delete.clone(), "/api/v1/session", Operator, session::sign_out),
+        Route::new(post.clone(), "/api/v1/enroll", Enrolment, enroll::enroll),
+        Route::new(post.clone(), "/api/v1/enrollment-tokens", Operator, enroll::create_token),
+        Route::new(get.clone(), "/api/v1/robots", Operator, robots::list),
+        Route::new(get.clone(), "/api/v1/robots/{robot}", Operator, robots::show),
+        Route::new(patch, "/api/v1/robots/{robot}", Operator, robots::edit),
+        Route::new(delete, "/api/v1/robots/{robot}", Operator, robots::remove),
+        Route::new(get.clone(), "/api/v1/robots/{robot}/desired", OwnRobot, robots::desired),
+        Route::new(post.clone(), "/api/v1/robots/{robot}/report", OwnRobot, robots::report)
+            .body_bytes(REPORT_BODY_BYTES),
+        Route::new(get.clone(), "/api/v1/packages", Operator, packages::list),
+        Route::new(get.clone(), "/api/v1/deployments", Operator, deployments::list),
+        Route::new(post.clone(), "/api/v1/deployments", Operator, deployments::create).body_bytes(ORDER_BODY_BYTES),
+        Route::new(get.clone(), "/api/v1/deployments/{deployment}", Operator, deployments::show),
+        Route::new(post.clone(), "/api/v1/deployments/{deployment}/cancel", Operator, deployments::cancel),
+        Route::new(post.clone(), "/api/v1/deployments/{deployment}/resume", Operator, deployments::resume),
+        Route::new(post.clone(), "/api/v1/tasks/{task}/start", Operator, tasks::start).body_bytes(ORDER_BODY_BYTES),
+        Route::new(post.clone(), "/api/v1/tasks/{task}/stop", Operator, tasks::stop).body_bytes(ORDER_BODY_BYTES),
+        Route::new(post, "/api/v1/tasks/{task}/remove", Operator, tasks::remove).body_bytes(ORDER_BODY_BYTES),
+        Route::new(get, "/api/v1/events", Operator, events::stream).streaming(),
+        Route::any("/v2", OperatorOrRobot, oci::version),
+        Route::any("/v2/", OperatorOrRobot, oci::version),
+        Route::any("/v2/{*path}", OperatorOrRobot, oci::dispatch),
+    ]
+}
+
+/// All routes behind their guards.
+pub fn router(app: App) -> Router {
+    let mut router = Router::new();
+    for route in routes() {
+        let gate = Gate { app: app.clone(), access: route.access, deadline: route.deadline };
+        let handler = route
+            .handler
+            .route_layer(DefaultBodyLimit::max(route.body_bytes))
+            .route_layer(middleware::from_fn_with_state(gate, guard));
+        router = router.route(route.path, handler);
+    }
+    router
+        .fallback(nothing_here)
+        .method_not_allowed_fallback(method_not_allowed)
+        .layer(middleware::map_response(harden))
+        .layer(middleware::map_request(drain::drain_unread))
+        .with_state(app)
+}
+
+async fn nothing_here() -> ApiError {
+    ApiError::not_found("there is nothing at this path")
+}
+
+async fn method_not_allowed(request: Request) -> Response {
+    let message = format!("{} is not possible at this path", request.method());
+    ApiError::new(StatusCode::METHOD_NOT_ALLOWED, "method_not_allowed", message).into_response()
+}
+
+/// Headers for browsers: the page loads nothing from elsewhere, is never framed, and answers are never sniffed.
+async fn harden(mut response: Response) -> Response {
+    const HEADERS: [(header::HeaderName, &str); 6] = [
+        (
+            header::CONTENT_SECURITY_POLICY,
+            "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; font-src 'self'; \
+             connect-src 'self'; worker-src 'self'; manifest-src 'self'; base-uri 'none'; form-action 'none'; \
+             frame-ancestors 'none'",
+        ),
+        (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
+        (header::X_FRAME_OPTIONS, "DENY"),
+        (header::REFERRER_POLICY, "no-referrer"),
+        (header::HeaderName::from_static("cross-origin-opener-policy"), "same-origin"),
+        (header::HeaderName::from_static("cross-origin-resource-policy"), "same-origin"),
+    ];
+    let headers = response.headers_mut();
+    for (name, value) in HEADERS {
+        headers.insert(name, HeaderValue::from_static(value));
+    }
+    headers.entry(header::CACHE_CONTROL).or_insert(HeaderValue::from_static("no-store"));
+    response
+}

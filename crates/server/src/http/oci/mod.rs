@@ -76,7 +76,7 @@ fn endpoint(path: &str) -> Option<(&str, Endpoint<'_>)> {
 }
 
 /// `GET /v2/`: tells that this is a registry, and whether the caller's token is good.
-async fn version(request: Request) -> Answer {
+pub(super) async fn version(request: Request) -> Answer {
     match request.extensions().get::<Caller>() {
         Some(Caller::Operator { .. } | Caller::Robot(_)) => {}
         _ => return Err(OciError::unauthorized()),
@@ -89,7 +89,7 @@ async fn version(request: Request) -> Answer {
     Ok((headers, axum::Json(serde_json::json!({}))).into_response())
 }
 
-async fn dispatch(State(registry): State<Registry>, Path(path): Path<String>, request: Request) -> Answer {
+pub(super) async fn dispatch(State(registry): State<Registry>, Path(path): Path<String>, request: Request) -> Answer {
     let (parts, body) = request.into_parts();
     let caller = parts.extensions.get::<Caller>().cloned();
     let (name, endpoint) = match &caller {

@@ -1,0 +1,188 @@
+//! The server's directory: made on the first start, locked while a server runs, home of the signing key, the first
+//! operator's token and the addresses that are bound. It never touches the database or the blobs in it.
+
+use std::fs::{DirBuilder, File, OpenOptions, TryLockError};
+use std::io::{self, Write as _};
+use std::os::unix::fs::{DirBuilderExt as _, OpenOptionsExt as _};
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use task_proto::Digest;
+use task_proto::envelope::SigningKey;
+use task_proto::token::{Token, TokenKind};
+
+const LOCK: &str = "taskd.lock";
+const SIGNING_KEY: &str = "signing.key";
+const OPERATOR_TOKEN: &str = "operator.token";
+const ADDRESSES: &str = "addresses.json";
+
+/// A directory that is ours until this is dropped.
+#[derive(Debug)]
+pub struct DataDirectory {
+    path: PathBuf,
+    _lock: File,
+}
+
+/// What is bound, for programs on the same machine: the content of `addresses.json`, which exists while a server runs.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Addresses {
+    /// Where HTTP is reached, `host:port`.
+    pub http: String,
+    /// Where MQTT is reached, `host:port`.
+    pub mqtt: String,
+}
+
+/// Why the directory can't be used.
+#[derive(Debug, thiserror::Error)]
+pub enum DataError {
+    /// Another server runs on it.
+    #[error("{} is in use: another taskd serves from it", path.display())]
+    InUse {
+        /// The directory.
+        path: PathBuf,
+    },
+    /// A file or the directory itself can't be made or read.
+    #[error("{} can't be used", path.display())]
+    Io {
+        /// Which.
+        path: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+    /// A file holds something else than it should.
+    #[error("{} does not hold {expected}; put the right file back, or move it away to get a new one", path.display())]
+    Content {
+        /// Which.
+        path: PathBuf,
+        /// What should be in it.
+        expected: &'static str,
+    },
+}
+
+impl DataDirectory {
+    /// Makes the directory if it is missing, and locks it.
+    pub fn open(path: &Path) -> Result<Self, DataError> {
+        let io_error = |path: PathBuf| move |source| DataError::Io { path, source };
+        DirBuilder::new().recursive(true).mode(0o700).create(path).map_err(io_error(path.to_owned()))?;
+        let lock_path = path.join(LOCK);
+        let lock = OpenOptions::new().create(true).truncate(false).write(true).mode(0o600).open(&lock_path);
+        let lock = lock.map_err(io_error(lock_path.clone()))?;
+        match lock.try_lock() {
+            Ok(()) => Ok(Self { path: path.to_owned(), _lock: lock }),
+            Err(TryLockError::WouldBlock) => Err(DataError::InUse { path: path.to_owned() }),
+            Err(TryLockError::Error(source)) => Err(DataError::Io { path: lock_path, source }),
+        }
+    }
+
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The path of the operator's token.
+    pub fn operator_token_path(&self) -> PathBuf {
+        self.path.join(OPERATOR_TOKEN)
+    }
+
+    /// The key that signs desired states, made on the first start. Robots pin it, so it is never replaced by itself.
+    pub fn signing_key(&self) -> Result<SigningKey, DataError> {
+        let path = self.path.join(SIGNING_KEY);
+        let text = self.read_or_make(&path, || {
+            let seed = SigningKey::random().to_bytes();
+            // A digest's text form is as good as any for 32 bytes, and its parser is at hand.
+            Digest::from_bytes(seed).hex()
+        })?;
+        let seed: Result<Digest, _> = format!("sha256:{}", text.trim()).parse();
+        match seed {
+            Ok(seed) => Ok(SigningKey::from_bytes(seed.to_bytes())),
+            Err(_) => Err(DataError::Content { path, expected: "a signing key" }),
+        }
+    }
+
+    /// The token of the first operator, made on the first start.
+    pub fn operator_token(&self) -> Result<Token, DataError> {
+        let path = self.operator_token_path();
+        let text = self.read_or_make(&path, || Token::random(TokenKind::Operator).reveal())?;
+        match text.trim().parse::<Token>() {
+            Ok(token) if token.kind() == TokenKind::Operator => Ok(token),
+            _ => Err(DataError::Content { path, expected: "an operator's token" }),
+        }
+    }
+
+    /// Tells programs on this machine where the server listens.
+    pub fn publish(&self, addresses: &Addresses) -> Result<(), DataError> {
+        let path = self.path.join(ADDRESSES);
+        let text = serde_json::to_string(addresses)
+            .map_err(|error| DataError::Io { path: path.clone(), source: error.into() })?;
+        self.write_new(&path, &format!("{text}\n")).map_err(|source| DataError::Io { path, source })
+    }
+
+    /// Nobody listens any more.
+    pub fn unpublish(&self) {
+        // At worst someone finds the old addresses and nobody behind them.
+        let _ = std::fs::remove_file(self.path.join(ADDRESSES));
+    }
+
+    fn read_or_make(&self, path: &Path, make: impl FnOnce() -> String) -> Result<String, DataError> {
+        let io_error = |source| DataError::Io { path: path.to_owned(), source };
+        match std::fs::read_to_string(path) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {
+                let text = make();
+                self.write_new(path, &format!("{text}\n")).map_err(io_error)?;
+                Ok(text)
+            }
+            other => other.map_err(io_error),
+        }
+    }
+
+    /// Writes a file of mode 0600 that is there whole or not at all, also after a power cut.
+    fn write_new(&self, path: &Path, text: &str) -> io::Result<()> {
+        let partial = path.with_extension("new");
+        // What a crash left behind would keep its mode.
+        if let Err(error) = std::fs::remove_file(&partial)
+            && error.kind() != io::ErrorKind::NotFound
+        {
+            return Err(error);
+        }
+        let mut file = OpenOptions::new().create_new(true).write(true).mode(0o600).open(&partial)?;
+        file.write_all(text.as_bytes())?;
+        file.sync_all()?;
+        std::fs::rename(&partial, path)?;
+        File::open(&self.path)?.sync_all()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::os::unix::fs::PermissionsExt as _;
+
+    fn mode(path: &Path) -> u32 {
+        std::fs::metadata(path).expect("exists").permissions().mode() & 0o777
+    }
+
+    #[test]
+    fn secrets_are_made_once_and_only_for_their_owner() {
+        let parent = tempfile::tempdir().expect("temp dir");
+        let path = parent.path().join("deep/data");
+        let data = DataDirectory::open(&path).expect("opens");
+        assert_eq!(mode(&path), 0o700);
+        let (key, token) = (data.signing_key().expect("made"), data.operator_token().expect("made"));
+        assert_eq!(mode(&path.join(SIGNING_KEY)), 0o600);
+        assert_eq!(mode(&data.operator_token_path()), 0o600);
+        assert_eq!(data.signing_key().expect("read").to_bytes(), key.to_bytes());
+        assert_eq!(data.operator_token().expect("read"), token);
+        std::fs::write(path.join(SIGNING_KEY), "nonsense").expect("written");
+        let message = data.signing_key().err().expect("refused").to_string();
+        assert!(message.contains("signing.key does not hold a signing key"), "{message}");
+    }
+
+    #[test]
+    fn a_second_server_is_refused_until_the_first_is_gone() {
+        let directory = tempfile::tempdir().expect("temp dir");
+        let first = DataDirectory::open(directory.path()).expect("opens");
+        assert!(matches!(DataDirectory::open(directory.path()), Err(DataError::InUse { .. })));
+        drop(first);
+        assert!(DataDirectory::open(directory.path()).is_ok());
+    }
+}

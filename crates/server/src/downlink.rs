@@ -1,0 +1,93 @@
+//! Tells robots of their desired state: the whole signed document where it fits into a message, else only its
+//! generation. A robot that can't be reached is no error, for both sides compare again when it connects.
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use futures_util::StreamExt as _;
+use task_proto::RobotId;
+use task_proto::desired::{Doorbell, MAX_PUSHED_ENVELOPE_BYTES};
+use tokio_util::sync::CancellationToken;
+
+use crate::actions::{ActionError, Actions, Desired};
+use crate::broker::Broker;
+use crate::changes::Changes;
+use crate::clock::Clock;
+use crate::presence::Presence;
+
+/// States read and signed at the same time. It bounds what an order for thousands of robots takes from everybody else.
+const AT_ONCE: usize = 8;
+
+/// What ringing needs.
+pub struct Downlink {
+    /// Where desired states come from.
+    pub actions: Actions,
+    /// Who delivers them.
+    pub broker: Broker,
+    /// Who is there.
+    pub presence: Arc<Presence>,
+    /// The time.
+    pub clock: Clock,
+}
+
+impl Downlink {
+    /// Rings whoever `changes` names, until `stop`.
+    pub async fn run(self, changes: Changes, stop: CancellationToken) {
+        let ringing = async {
+            loop {
+                let robots = futures_util::stream::iter(changes.take_rings().await);
+                robots.for_each_concurrent(AT_ONCE, |robot| self.ring(robot)).await;
+            }
+        };
+        // Cut off half-way, the rest is rung on its next connect.
+        tokio::select! {
+            () = stop.cancelled() => {}
+            () = ringing => {}
+        }
+    }
+
+    async fn ring(&self, robot: RobotId) {
+        let now_ms = self.clock.now_ms();
+        let is_connected = self.presence.get(&robot, now_ms).is_some_and(|sighting| sighting.connection.is_some());
+        if !is_connected || self.presence.is_duplicate(&robot, now_ms) {
+            return;
+        }
+        match self.actions.desired(&robot).await {
+            Ok(desired) => match payload(&desired) {
+                // It may have left meanwhile.
+                Ok(payload) => drop(self.broker.ring(&robot, payload)),
+                Err(error) => tracing::error!(%robot, %error, "a desired state could not be written"),
+            },
+            Err(ActionError::Diverged(_) | ActionError::RobotNotFound(_)) => {}
+            Err(error) => tracing::warn!(%robot, %error, "a desired state could not be read; the robot asks again"),
+        }
+    }
+}
+
+fn payload(desired: &Desired) -> Result<Bytes, serde_json::Error> {
+    let whole = serde_json::to_vec(&Doorbell::State(desired.envelope.clone()))?;
+    if whole.len() <= MAX_PUSHED_ENVELOPE_BYTES {
+        return Ok(whole.into());
+    }
+    serde_json::to_vec(&Doorbell::Notice { generation: desired.generation }).map(Bytes::from)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use task_proto::Generation;
+    use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
+
+    #[test]
+    fn what_does_not_fit_into_a_message_is_only_announced() {
+        let key = SigningKey::from_bytes([7; 32]);
+        let desired = |bytes: usize| Desired {
+            generation: Generation(12),
+            envelope: Envelope::seal(DESIRED_STATE_TYPE, &vec![b' '; bytes], &key),
+        };
+        let parsed = |desired: &Desired| serde_json::from_slice::<Doorbell>(&payload(desired).expect("json"));
+        assert!(matches!(parsed(&desired(40_000)).expect("json"), Doorbell::State(_)));
+        let notice = parsed(&desired(MAX_PUSHED_ENVELOPE_BYTES)).expect("json");
+        assert_eq!(notice, Doorbell::Notice { generation: Generation(12) });
+    }
+}

@@ -1,0 +1,44 @@
+//! Who may come in over MQTT: the broker's question, answered from the database for each connection, so that a token
+//! that was revoked a moment ago no longer opens anything.
+
+use futures_util::FutureExt as _;
+use futures_util::future::BoxFuture;
+use task_proto::token::Token;
+
+use crate::broker::{Gatekeeper, Login, Principal, Refusal};
+use crate::clock::Clock;
+use crate::store::{Store, TokenHolder};
+
+/// Answers by the tokens in the database.
+pub struct StoreGatekeeper {
+    /// The database.
+    pub store: Store,
+    /// The time.
+    pub clock: Clock,
+}
+
+impl StoreGatekeeper {
+    async fn decide(&self, login: Login) -> Result<Principal, Refusal> {
+        let password = login.password.as_deref().ok_or(Refusal::BadCredentials)?;
+        let token: Token = password.parse().map_err(|_| Refusal::BadCredentials)?;
+        let holder = self.store.token_holder(&token, self.clock.now_ms()).await.map_err(|error| {
+            tracing::warn!(%error, "a login over MQTT could not be checked");
+            Refusal::Unavailable
+        })?;
+        match holder {
+            Some(TokenHolder::Robot(robot)) => {
+                let is_itself = login.client_id == robot.as_str() && login.user_name.as_deref() == Some(robot.as_str());
+                if is_itself { Ok(Principal::Robot(robot)) } else { Err(Refusal::NotAuthorised) }
+            }
+            Some(TokenHolder::Operator) => Ok(Principal::Operator),
+            Some(TokenHolder::Enrolment) => Err(Refusal::NotAuthorised),
+            None => Err(Refusal::BadCredentials),
+        }
+    }
+}
+
+impl Gatekeeper for StoreGatekeeper {
+    fn admit(&self, login: Login) -> BoxFuture<'_, Result<Principal, Refusal>> {
+        self.decide(login).boxed()
+    }
+}

@@ -1,0 +1,63 @@
+//! Failed authentications, counted by address in windows of a minute. A token that is good always gets in; only the
+//! answers to wrong ones change. Memory is bounded: beyond the most addresses, all others share one count.
+
+use std::collections::HashMap;
+use std::net::IpAddr;
+use std::sync::{Mutex, PoisonError};
+
+const WINDOW_MS: u64 = 60_000;
+/// Failures from one address in a window that are answered in the ordinary way. A NAT may hide a fleet, so it is high.
+const MOST_FAILURES: u32 = 1_000;
+const MOST_ADDRESSES: usize = 4_096;
+/// Whose count addresses share that came too late for their own.
+const EVERYBODY_ELSE: IpAddr = IpAddr::V4(std::net::Ipv4Addr::UNSPECIFIED);
+
+/// The counts.
+#[derive(Debug, Default)]
+pub struct FailedAttempts(Mutex<Window>);
+
+#[derive(Debug, Default)]
+struct Window {
+    began_ms: u64,
+    failures: HashMap<IpAddr, u32>,
+}
+
+impl FailedAttempts {
+    /// Counts a failure from `address`. Returns whether there have been too many.
+    pub fn record(&self, address: IpAddr, now_ms: u64) -> bool {
+        let mut window = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if now_ms.saturating_sub(window.began_ms) >= WINDOW_MS {
+            *window = Window { began_ms: now_ms, failures: HashMap::new() };
+        }
+        let is_full = window.failures.len() >= MOST_ADDRESSES && !window.failures.contains_key(&address);
+        let count = window.failures.entry(if is_full { EVERYBODY_ELSE } else { address }).or_default();
+        *count = count.saturating_add(1);
+        *count > MOST_FAILURES
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn too_many_failures_are_over_after_a_minute_and_concern_one_address() {
+        let attempts = FailedAttempts::default();
+        let (one, other) = (IpAddr::from([10, 0, 0, 1]), IpAddr::from([10, 0, 0, 2]));
+        for _ in 0..MOST_FAILURES {
+            assert!(!attempts.record(one, 1_000_000));
+        }
+        assert!(attempts.record(one, 1_000_001));
+        assert!(!attempts.record(other, 1_000_001));
+        assert!(!attempts.record(one, 1_000_000 + WINDOW_MS));
+    }
+
+    #[test]
+    fn many_addresses_take_no_more_memory() {
+        let attempts = FailedAttempts::default();
+        for n in 0..2 * MOST_ADDRESSES as u32 {
+            attempts.record(IpAddr::from(n.to_be_bytes()), 1_000_000);
+        }
+        assert!(attempts.0.lock().expect("whole").failures.len() <= MOST_ADDRESSES + 1);
+    }
+}

@@ -1,0 +1,40 @@
+//! Enrolment: tokens for robots to come, and the robots that come with them.
+
+use axum::Json;
+use axum::extract::State;
+use http::StatusCode;
+use task_proto::api::{CreateEnrollmentToken, EnrollRequest, EnrollResponse, EnrollmentToken};
+
+use super::App;
+use super::auth::Caller;
+use super::error::ApiError;
+use super::extract::{JsonBody, TolerantJson};
+
+/// `POST /enroll`: registers the robot that holds the token.
+pub(super) async fn enroll(
+    State(app): State<App>,
+    caller: Caller,
+    TolerantJson(request): TolerantJson<EnrollRequest>,
+) -> Result<(StatusCode, Json<EnrollResponse>), ApiError> {
+    let Caller::Enrolment(token) = caller else {
+        return Err(ApiError::forbidden("an enrolment token is needed"));
+    };
+    let enrolled = app.actions.enroll(&token, &request).await?;
+    // A robot that registers again has new tokens; whoever is connected with an old one has to go.
+    app.broker.disconnect(&enrolled.robot_id);
+    let answer = EnrollResponse {
+        robot_id: enrolled.robot_id,
+        name: enrolled.name,
+        token: enrolled.token.reveal(),
+        mqtt: app.mqtt.clone(),
+    };
+    Ok((StatusCode::CREATED, Json(answer)))
+}
+
+/// `POST /enrollment-tokens`: makes a token.
+pub(super) async fn create_token(
+    State(app): State<App>,
+    JsonBody(order): JsonBody<CreateEnrollmentToken>,
+) -> Result<(StatusCode, Json<EnrollmentToken>), ApiError> {
+    Ok((StatusCode::CREATED, Json(app.actions.create_enrollment_token(&order).await?)))
+}

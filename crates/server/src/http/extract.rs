@@ -1,0 +1,144 @@
+//! What handlers take out of a request: JSON bodies, path and query parameters, the idempotency key. Whatever does not
+//! parse is refused here in the API's error shape, naming the field.
+
+use std::collections::BTreeMap;
+use std::fmt::Display;
+use std::str::FromStr;
+
+use axum::extract::{FromRequest, FromRequestParts, RawPathParams, Request};
+use bytes::Bytes;
+use http::request::Parts;
+use http::{HeaderValue, StatusCode, header};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use super::error::ApiError;
+use crate::actions::IdempotencyKey;
+
+/// A JSON body from an operator. A field that this version does not know is refused: it would be an order half done.
+pub struct JsonBody<T>(pub T);
+
+/// A JSON body from an agent, which may be newer than this server: unknown fields are passed over.
+pub struct TolerantJson<T>(pub T);
+
+impl<S: Send + Sync, T: DeserializeOwned + Serialize> FromRequest<S> for JsonBody<T> {
+    type Rejection = ApiError;
+
+    async fn from_request(request: Request, state: &S) -> Result<Self, ApiError> {
+        let body = json_bytes(request, state).await?;
+        let value: T = parse_json(&body)?;
+        refuse_unknown_fields(&body, &value)?;
+        Ok(Self(value))
+    }
+}
+
+impl<S: Send + Sync, T: DeserializeOwned> FromRequest<S> for TolerantJson<T> {
+    type Rejection = ApiError;
+
+    async fn from_request(request: Request, state: &S) -> Result<Self, ApiError> {
+        parse_json(&json_bytes(request, state).await?).map(Self)
+    }
+}
+
+async fn json_bytes<S: Send + Sync>(request: Request, state: &S) -> Result<Bytes, ApiError> {
+    let content_type = request.headers().get(header::CONTENT_TYPE).and_then(|value| value.to_str().ok());
+    let media_type = content_type.unwrap_or_default().split(';').next().unwrap_or_default().trim();
+    if !media_type.eq_ignore_ascii_case("application/json") {
+        let message = "Content-Type: expected application/json";
+        return Err(ApiError::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "unsupported_media_type", message));
+    }
+    Bytes::from_request(request, state).await.map_err(|rejection| match rejection.status() {
+        StatusCode::PAYLOAD_TOO_LARGE => {
+            ApiError::new(StatusCode::PAYLOAD_TOO_LARGE, "too_large", "the body is larger than this route allows")
+        }
+        _ => ApiError::invalid("the body ended before it was complete"),
+    })
+}
+
+/// Parses JSON; an error names the field by its path.
+pub fn parse_json<T: DeserializeOwned>(body: &[u8]) -> Result<T, ApiError> {
+    let mut parser = serde_json::Deserializer::from_slice(body);
+    let value = serde_path_to_error::deserialize(&mut parser).map_err(|error| {
+        let path = error.path().to_string();
+        let place = if path == "." { "the body".to_owned() } else { path };
+        ApiError::invalid(format!("{place}: {}", error.into_inner()))
+    })?;
+    parser.end().map_err(|error| ApiError::invalid(format!("the body: {error}")))?;
+    Ok(value)
+}
+
+/// A field is known if the value, written out again, has it.
+fn refuse_unknown_fields<T: Serialize>(body: &[u8], value: &T) -> Result<(), ApiError> {
+    let given: BTreeMap<String, serde::de::IgnoredAny> = parse_json(body)?;
+    let known = serde_json::to_value(value).map_err(|error| ApiError::internal(&error))?;
+    match given.keys().find(|key| known.get(key.as_str()).is_none()) {
+        Some(unknown) => {
+            let shown: String = unknown.chars().take(80).collect();
+            Err(ApiError::invalid(format!("{shown}: there is no such field")))
+        }
+        None => Ok(()),
+    }
+}
+
+/// The path's one parameter, parsed. What does not parse names nothing that exists.
+pub struct PathParam<T>(pub T);
+
+impl<S: Send + Sync, T: FromStr<Err: Display>> FromRequestParts<S> for PathParam<T> {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, ApiError> {
+        let missing = || ApiError::not_found("there is nothing at this path");
+        let params = RawPathParams::from_request_parts(parts, state).await.map_err(|_| missing())?;
+        let (_, text) = params.iter().next().ok_or_else(missing)?;
+        text.parse().map(Self).map_err(|error: T::Err| ApiError::not_found(error.to_string()))
+    }
+}
+
+/// The query's parameters. Only the names in the handler's struct are known; others are refused.
+pub struct QueryParams<T>(pub T);
+
+impl<S: Send + Sync, T: DeserializeOwned> FromRequestParts<S> for QueryParams<T> {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, _state: &S) -> Result<Self, ApiError> {
+        axum::extract::Query::<T>::try_from_uri(&parts.uri)
+            .map(|query| Self(query.0))
+            .map_err(|rejection| ApiError::invalid(format!("the query: {}", rejection.body_text())))
+    }
+}
+
+/// The key that makes an order safe to repeat.
+pub fn idempotency_key(value: Option<&HeaderValue>) -> Result<IdempotencyKey, ApiError> {
+    let value = value.ok_or_else(|| ApiError::invalid("Idempotency-Key: an order needs this header"))?;
+    Ok(value.to_str().unwrap_or_default().parse()?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use task_proto::api::CreateDeployment;
+
+    #[test]
+    fn a_body_that_does_not_fit_names_the_field() {
+        let digest = task_proto::Digest::of(b"x");
+        let body = |rest: &str| format!(r#"{{"package": "talker", "manifest": "{digest}", "selector": "*"{rest}}}"#);
+        let cases = [
+            ("{".to_owned(), "the body: EOF"),
+            ("[]".to_owned(), "the body: "),
+            (r#"{"package": "talker"}"#.to_owned(), "the body: missing field `manifest`"),
+            (body(r#", "batch": "two""#), "batch: invalid type"),
+            (body(r#", "batch": -1"#), "batch: invalid value"),
+            (body("} x"), "the body: trailing"),
+            (r#"{"package": "No!"}"#.to_owned(), "package: \"No!\" is not a valid package name"),
+        ];
+        for (text, expected) in cases {
+            let error = parse_json::<CreateDeployment>(text.as_bytes()).err().expect(expected);
+            assert!(error.message.starts_with(expected), "{} / {expected}", error.message);
+        }
+        let misspelt = body(r#", "selektor": "*""#);
+        let order: CreateDeployment = parse_json(misspelt.as_bytes()).expect("parses");
+        let error = refuse_unknown_fields(misspelt.as_bytes(), &order).expect_err("refused");
+        assert_eq!(error.message, "selektor: there is no such field");
+        assert!(refuse_unknown_fields(body(r#", "dry_run": true"#).as_bytes(), &order).is_ok());
+    }
+}

@@ -1,0 +1,146 @@
+//! Signing in at the page: an operator's token is exchanged for a cookie that scripts can't read. Sessions are kept in
+//! memory only, so a restart of the server signs everybody out.
+
+use std::collections::HashMap;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use axum::Json;
+use axum::extract::State;
+use axum::response::{IntoResponse, Response};
+use http::{HeaderMap, StatusCode, header};
+use task_proto::Digest;
+use task_proto::api::{SessionView, SignIn};
+use task_proto::token::{Token, TokenKind};
+
+use super::App;
+use super::auth::require_same_origin;
+use super::error::ApiError;
+use super::extract::JsonBody;
+use crate::store::TokenHolder;
+
+/// The cookie's name.
+const COOKIE: &str = "taskd_session";
+/// How long a session lasts.
+const LIFETIME_MS: u64 = 12 * 60 * 60 * 1000;
+/// Sessions at a time; one more ends the oldest.
+const MOST_SESSIONS: usize = 1_024;
+
+/// Who is signed in. A session is found by the SHA-256 of its id.
+#[derive(Debug, Default)]
+pub struct Sessions(Mutex<HashMap<Digest, Session>>);
+
+/// One signed-in page.
+#[derive(Debug, Clone)]
+pub struct Session {
+    /// The token it was begun with: a session ends when its token does.
+    pub token: Token,
+    /// When it ends by itself.
+    pub expires_at_ms: u64,
+}
+
+impl Sessions {
+    /// Begins a session and gives the cookie's value.
+    fn begin(&self, token: Token, now_ms: u64) -> String {
+        let id = format!("{:032x}{:032x}", rand::random::<u128>(), rand::random::<u128>());
+        let mut sessions = self.lock();
+        sessions.retain(|_, session| session.expires_at_ms > now_ms);
+        if sessions.len() >= MOST_SESSIONS {
+            let oldest = sessions.iter().min_by_key(|(_, session)| session.expires_at_ms).map(|(key, _)| *key);
+            oldest.map(|key| sessions.remove(&key));
+        }
+        sessions.insert(Digest::of(id.as_bytes()), Session { token, expires_at_ms: now_ms + LIFETIME_MS });
+        id
+    }
+
+    /// The session of a request's cookie, if it has one that lives.
+    pub fn find(&self, headers: &HeaderMap, now_ms: u64) -> Option<Session> {
+        let key = Digest::of(cookie(headers)?.as_bytes());
+        self.lock().get(&key).filter(|session| session.expires_at_ms > now_ms).cloned()
+    }
+
+    fn end(&self, headers: &HeaderMap) {
+        if let Some(id) = cookie(headers) {
+            self.lock().remove(&Digest::of(id.as_bytes()));
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, HashMap<Digest, Session>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+fn cookie(headers: &HeaderMap) -> Option<&str> {
+    let lines = headers.get_all(header::COOKIE).iter().filter_map(|value| value.to_str().ok());
+    let mut pairs = lines.flat_map(|line| line.split(';')).filter_map(|pair| pair.trim().split_once('='));
+    pairs.find(|(name, _)| *name == COOKIE).map(|(_, value)| value)
+}
+
+fn set_cookie(value: &str, max_age_s: u64) -> [(header::HeaderName, String); 1] {
+    let attributes = "HttpOnly; SameSite=Strict; Path=/";
+    [(header::SET_COOKIE, format!("{COOKIE}={value}; {attributes}; Max-Age={max_age_s}"))]
+}
+
+/// `POST /session`: signs in.
+pub(super) async fn sign_in(
+    State(app): State<App>,
+    headers: HeaderMap,
+    JsonBody(request): JsonBody<SignIn>,
+) -> Result<Response, ApiError> {
+    // A foreign page must not sign its visitor in as someone else. Programs send no Origin and are not concerned.
+    if headers.contains_key(header::ORIGIN) {
+        require_same_origin(&headers)?;
+    }
+    let refused = || ApiError::unauthorized("token: it is unknown, expired or revoked, or not an operator's");
+    let token: Token = request.token.parse().map_err(|error| ApiError::unauthorized(format!("token: {error}")))?;
+    let now_ms = app.clock.now_ms();
+    if token.kind() != TokenKind::Operator
+        || app.store.token_holder(&token, now_ms).await? != Some(TokenHolder::Operator)
+    {
+        return Err(refused());
+    }
+    let id = app.sessions.begin(token, now_ms);
+    let view = SessionView { expires_at_ms: Some(now_ms + LIFETIME_MS) };
+    Ok((set_cookie(&id, LIFETIME_MS / 1000), Json(view)).into_response())
+}
+
+/// `GET /session`: tells until when the caller is signed in.
+pub(super) async fn show(State(app): State<App>, headers: HeaderMap) -> Json<SessionView> {
+    let session = app.sessions.find(&headers, app.clock.now_ms());
+    Json(SessionView { expires_at_ms: session.map(|session| session.expires_at_ms) })
+}
+
+/// `DELETE /session`: signs out.
+pub(super) async fn sign_out(State(app): State<App>, headers: HeaderMap) -> Response {
+    app.sessions.end(&headers);
+    (StatusCode::NO_CONTENT, set_cookie("", 0)).into_response()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn with_cookie(text: String) -> HeaderMap {
+        HeaderMap::from_iter([(header::COOKIE, text.parse().expect("a header"))])
+    }
+
+    #[test]
+    fn a_session_is_found_until_it_expires_or_ends() {
+        let sessions = Sessions::default();
+        let id = sessions.begin(Token::random(TokenKind::Operator), 1_000);
+        let headers = with_cookie(format!("theme=dark; {COOKIE}={id}"));
+        assert!(sessions.find(&headers, 1_001).is_some());
+        assert!(sessions.find(&headers, 1_000 + LIFETIME_MS).is_none());
+        assert!(sessions.find(&with_cookie(format!("{COOKIE}=guess")), 1_001).is_none());
+        sessions.end(&headers);
+        assert!(sessions.find(&headers, 1_001).is_none());
+    }
+
+    #[test]
+    fn sessions_are_bounded() {
+        let sessions = Sessions::default();
+        for now_ms in 0..2 * MOST_SESSIONS as u64 {
+            sessions.begin(Token::random(TokenKind::Operator), now_ms);
+        }
+        assert_eq!(sessions.lock().len(), MOST_SESSIONS);
+    }
+}

@@ -1,0 +1,33 @@
+//! Views as the operator sees them: the store's rows, completed with what only presence knows.
+
+use task_proto::api::{DeploymentView, MatchedRobot, RobotView};
+use task_proto::report::Condition;
+
+use crate::presence::Presence;
+
+/// Adds where a robot is and what is wrong with its identity.
+pub fn complete_robot(view: &mut RobotView, presence: &Presence, now_ms: u64) {
+    let Some(sighting) = presence.get(&view.id, now_ms) else { return };
+    view.online = sighting.online;
+    view.address = Some(sighting.address.to_string());
+    view.last_seen_ms = view.last_seen_ms.max(Some(sighting.last_seen_ms));
+    if sighting.duplicate {
+        let text = "two agents use this robot's identity and keep displacing each other; enrol one of them again";
+        let condition = Condition { code: "duplicate_identity".to_owned(), text: text.to_owned() };
+        view.conditions.insert(0, condition);
+    }
+}
+
+/// Says which robots of a deployment are there.
+pub fn complete_deployment(view: &mut DeploymentView, presence: &Presence, now_ms: u64) {
+    for assignment in view.assignments.iter_mut().flatten() {
+        assignment.online = presence.is_online(&assignment.robot, now_ms);
+    }
+}
+
+/// Says which of the robots are there.
+pub fn complete_matched(robots: &mut [MatchedRobot], presence: &Presence, now_ms: u64) {
+    for robot in robots {
+        robot.online = presence.is_online(&robot.id, now_ms);
+    }
+}

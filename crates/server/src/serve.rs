@@ -1,0 +1,282 @@
+//! The running server: puts the parts together, starts them, and stops them in an order that loses nothing. It decides
+//! nothing that a part could decide.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use task_proto::api::MqttEndpoint;
+use tokio::net::TcpListener;
+use tokio::task::JoinHandle;
+use tokio::time::{Interval, MissedTickBehavior};
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
+
+use crate::actions::{ActionSettings, Actions};
+use crate::blobs::{BlobError, BlobSettings, Blobs};
+use crate::broker::{Broker, BrokerConfig, BrokerError, Health, Limits};
+use crate::changes::{Change, Changes};
+use crate::clock::Clock;
+use crate::collector;
+use crate::config::Config;
+use crate::data_directory::{Addresses, DataDirectory, DataError};
+use crate::downlink::Downlink;
+use crate::gatekeeper::StoreGatekeeper;
+use crate::http::events::{EventFeed, EventSource};
+use crate::http::{App, listener};
+use crate::presence::Presence;
+use crate::report_writer::ReportWriter;
+use crate::store::{Store, StoreError, sqlite_url};
+use crate::uplink::Uplink;
+
+/// How long requests under way may take to end; the whole stop is to take less than ten seconds.
+const REQUEST_PATIENCE: Duration = Duration::from_secs(5);
+/// Likewise MQTT sessions, at the same time.
+const SESSION_PATIENCE: Duration = Duration::from_secs(5);
+/// Then the reports that have been handed in.
+const WRITER_PATIENCE: Duration = Duration::from_secs(3);
+/// And last the database's connections.
+const DATABASE_PATIENCE: Duration = Duration::from_secs(1);
+/// How often the server looks for assignments that have expired.
+const EXPIRY_INTERVAL: Duration = Duration::from_secs(30);
+/// How often it looks for robots that have fallen silent.
+const SILENCE_INTERVAL: Duration = Duration::from_secs(5);
+
+/// Why the server did not start.
+#[derive(Debug, thiserror::Error)]
+pub enum ServeError {
+    /// The data directory can't be used.
+    #[error(transparent)]
+    Data(#[from] DataError),
+    /// The database can't be used.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// The blob store can't be used.
+    #[error("the blob store can't be opened")]
+    Blobs(#[from] BlobError),
+    /// MQTT can't be served.
+    #[error(transparent)]
+    Broker(#[from] BrokerError),
+    /// HTTP can't be served.
+    #[error("cannot listen for HTTP on {address}")]
+    Listen {
+        /// The configured address.
+        address: SocketAddr,
+        /// Why.
+        source: std::io::Error,
+    },
+}
+
+/// A server that runs until it is stopped. Dropped without [`Server::stop`], its tasks end with the runtime.
+pub struct Server {
+    data: DataDirectory,
+    addresses: Addresses,
+    store: Store,
+    broker: Broker,
+    stop: CancellationToken,
+    tasks: TaskTracker,
+    http: JoinHandle<()>,
+    reports: JoinHandle<()>,
+}
+
+impl Server {
+    /// Starts everything. When it returns, both listeners accept and their addresses are published.
+    pub async fn start(config: Config, clock: Clock) -> Result<Self, ServeError> {
+        let data = DataDirectory::open(&config.data)?;
+        let key = data.signing_key()?;
+        let public_key = key.public_key();
+        let store =
+            Store::open(&config.database.clone().unwrap_or_else(|| sqlite_url(&data.path().join("taskd.sqlite"))))
+                .await?;
+        register_operator(&store, &data, &clock).await?;
+        let blobs = Blobs::open(data.path(), blob_settings(&config))?;
+        let http = TcpListener::bind(config.http).await;
+        let http = http.map_err(|source| ServeError::Listen { address: config.http, source })?;
+        let http_address = http.local_addr().map_err(|source| ServeError::Listen { address: config.http, source })?;
+
+        let changes = Changes::new();
+        let presence = Arc::new(Presence::new(milliseconds(config.presence_timeout)));
+        let actions = Actions::new(store.clone(), clock.clone(), changes.clone(), key, action_settings(&config));
+        let (writer, reports) = ReportWriter::start(store.clone(), clock.clone(), changes.clone());
+        let uplink = Uplink::new(writer.clone(), presence.clone(), changes.clone(), clock.clone());
+        let gatekeeper = StoreGatekeeper { store: store.clone(), clock: clock.clone() };
+        let broker = Broker::start(broker_config(&config), Arc::new(gatekeeper), Arc::new(uplink)).await?;
+
+        let (stop, tasks) = (CancellationToken::new(), TaskTracker::new());
+        let app = App {
+            clock,
+            store: store.clone(),
+            actions,
+            changes,
+            reports: writer,
+            presence,
+            broker: broker.clone(),
+            blobs,
+            sessions: Arc::default(),
+            attempts: Arc::default(),
+            events: EventFeed::new(),
+            key: public_key,
+            mqtt: mqtt_endpoint(&config, broker.local_addr()),
+            data: data.path().to_owned(),
+            stop: stop.clone(),
+        };
+        start_tasks(&tasks, &app, config.blob_grace);
+        let router = crate::http::router(app);
+        let http = listener::serve(http, router, config.max_http_connections, stop.clone(), REQUEST_PATIENCE);
+        let addresses =
+            Addresses { http: reachable(http_address).to_string(), mqtt: reachable(broker.local_addr()).to_string() };
+        data.publish(&addresses)?;
+        Ok(Self { data, addresses, store, broker, stop, tasks, http: tokio::spawn(http), reports })
+    }
+
+    /// Where it listens.
+    pub fn addresses(&self) -> &Addresses {
+        &self.addresses
+    }
+
+    /// Its directory.
+    pub fn data(&self) -> &DataDirectory {
+        &self.data
+    }
+
+    /// Waits until the broker can't be helped any more; says what was seen.
+    pub async fn broken(&self) -> String {
+        let mut health = self.broker.health();
+        loop {
+            if let Health::Failed(seen) = &*health.borrow_and_update() {
+                return seen.clone();
+            }
+            if health.changed().await.is_err() {
+                return "the broker's watchdog has ended".to_owned();
+            }
+        }
+    }
+
+    /// Stops within ten seconds: listeners close, requests and sessions end, what was handed in is stored.
+    pub async fn stop(self) {
+        self.stop.cancel();
+        let ((), http) = tokio::join!(self.broker.shutdown(SESSION_PATIENCE), self.http);
+        if http.is_err() {
+            tracing::error!("the HTTP listener had failed");
+        }
+        // The writer ends when nobody can hand in reports any more: the broker's inbox and the routes were the last.
+        drop(self.broker);
+        self.tasks.close();
+        let drained = async {
+            self.tasks.wait().await;
+            self.reports.await
+        };
+        if tokio::time::timeout(WRITER_PATIENCE, drained).await.is_err() {
+            tracing::warn!("not every report was stored in time; robots send them again");
+        }
+        if tokio::time::timeout(DATABASE_PATIENCE, self.store.close()).await.is_err() {
+            tracing::warn!("the database did not close in time");
+        }
+        self.data.unpublish();
+    }
+}
+
+/// What runs beside the listeners.
+fn start_tasks(tasks: &TaskTracker, app: &App, blob_grace: Duration) {
+    let downlink = Downlink {
+        actions: app.actions.clone(),
+        broker: app.broker.clone(),
+        presence: app.presence.clone(),
+        clock: app.clock.clone(),
+    };
+    tasks.spawn(downlink.run(app.changes.clone(), app.stop.clone()));
+    let source = EventSource { store: app.store.clone(), presence: app.presence.clone(), clock: app.clock.clone() };
+    tasks.spawn(app.events.clone().run(source, app.changes.clone(), app.stop.clone()));
+    let (store, blobs, clock, stop) = (app.store.clone(), app.blobs.clone(), app.clock.clone(), app.stop.clone());
+    tasks.spawn(collector::run(store, blobs, clock, blob_grace, stop));
+    tasks.spawn(expire_assignments(app.clone()));
+    tasks.spawn(notice_silence(app.clone()));
+}
+
+async fn expire_assignments(app: App) {
+    let mut ticks = ticks(EXPIRY_INTERVAL);
+    while next_tick(&mut ticks, &app.stop).await {
+        if let Err(error) = app.actions.expire().await {
+            tracing::error!(%error, "assignments could not be looked through for expired ones");
+        }
+    }
+}
+
+async fn notice_silence(app: App) {
+    let mut ticks = ticks(SILENCE_INTERVAL);
+    let mut since_ms = app.clock.now_ms();
+    while next_tick(&mut ticks, &app.stop).await {
+        let now_ms = app.clock.now_ms();
+        for robot in app.presence.fell_silent(since_ms, now_ms) {
+            app.changes.announce(Change::Robot(robot));
+        }
+        since_ms = now_ms;
+    }
+}
+
+fn ticks(interval: Duration) -> Interval {
+    let mut ticks = tokio::time::interval(interval);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    ticks
+}
+
+/// Waits for the next tick; false when it is time to stop.
+async fn next_tick(ticks: &mut Interval, stop: &CancellationToken) -> bool {
+    tokio::select! {
+        () = stop.cancelled() => false,
+        _ = ticks.tick() => true,
+    }
+}
+
+/// Makes sure that the token in the directory opens this database, which may be new or restored.
+async fn register_operator(store: &Store, data: &DataDirectory, clock: &Clock) -> Result<(), ServeError> {
+    let token = data.operator_token()?;
+    let now_ms = clock.now_ms();
+    if store.token_holder(&token, now_ms).await?.is_some() {
+        return Ok(());
+    }
+    match store.create_operator_token(&token, now_ms).await {
+        Err(error) if error.is_unique_violation() => {
+            tracing::warn!("the token in {} was revoked and stays so", data.operator_token_path().display());
+            Ok(())
+        }
+        other => Ok(other?),
+    }
+}
+
+fn milliseconds(time: Duration) -> u64 {
+    u64::try_from(time.as_millis()).unwrap_or(u64::MAX)
+}
+
+fn action_settings(config: &Config) -> ActionSettings {
+    ActionSettings {
+        assignment_lifetime_ms: milliseconds(config.assignment_expiry),
+        desired_lifetime_ms: milliseconds(config.desired_lifetime),
+        ..ActionSettings::default()
+    }
+}
+
+fn blob_settings(config: &Config) -> BlobSettings {
+    BlobSettings { reading: config.blob_read, max_blob_bytes: config.max_blob_bytes, ..BlobSettings::default() }
+}
+
+fn broker_config(config: &Config) -> BrokerConfig {
+    let limits = Limits { max_connections: config.max_mqtt_connections, ..Limits::default() };
+    BrokerConfig { listen: config.mqtt, prefix: config.topic_prefix.clone(), limits }
+}
+
+fn mqtt_endpoint(config: &Config, bound: SocketAddr) -> MqttEndpoint {
+    MqttEndpoint {
+        host: config.public_mqtt_host.clone(),
+        port: config.public_mqtt_port.unwrap_or(bound.port()),
+        prefix: config.topic_prefix.clone(),
+    }
+}
+
+/// An address that works from this machine: "all interfaces" is none that one could connect to.
+fn reachable(mut bound: SocketAddr) -> SocketAddr {
+    if bound.ip().is_unspecified() {
+        bound.set_ip(if bound.is_ipv4() { [127, 0, 0, 1].into() } else { std::net::Ipv6Addr::LOCALHOST.into() });
+    }
+    bound
+}

@@ -1,0 +1,143 @@
+//! What robots say over MQTT: reports go to the writer, connections to presence. The broker has proven who speaks; what
+//! is said is checked here. It never answers by itself: robots that are behind are put on the list of those to ring.
+
+use std::collections::HashMap;
+use std::net::SocketAddr;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use futures_util::FutureExt as _;
+use futures_util::future::BoxFuture;
+use serde::de::DeserializeOwned;
+use task_proto::RobotId;
+use task_proto::report::{Report, Status};
+use task_proto::topic::RobotTopic;
+
+use crate::broker::{Inbox, NotStored, RobotMessage};
+use crate::changes::{Change, Changes};
+use crate::clock::Clock;
+use crate::presence::Presence;
+use crate::report_writer::{ReportError, ReportWriter};
+
+/// The largest report and status that are read.
+const MAX_REPORT_BYTES: usize = 1024 * 1024;
+const MAX_STATUS_BYTES: usize = 4 * 1024;
+/// A robot that is behind is rung again no sooner, or one that refuses its state would be rung for each report.
+const RING_AGAIN_MS: u64 = 5_000;
+
+/// Receives what the broker takes in.
+pub struct Uplink {
+    reports: ReportWriter,
+    presence: Arc<Presence>,
+    changes: Changes,
+    clock: Clock,
+    /// When connected robots were last rung for being behind; an entry ends with the connection.
+    reminded_ms: Mutex<HashMap<RobotId, u64>>,
+}
+
+impl Uplink {
+    /// An uplink that feeds these.
+    pub fn new(reports: ReportWriter, presence: Arc<Presence>, changes: Changes, clock: Clock) -> Self {
+        Self { reports, presence, changes, clock, reminded_ms: Mutex::default() }
+    }
+
+    async fn take_report(&self, message: &RobotMessage) -> Result<(), NotStored> {
+        let Some(report) = parsed::<Report>(message, MAX_REPORT_BYTES) else { return Ok(()) };
+        if report.robot_id != message.robot {
+            tracing::warn!(robot = %message.robot, claimed = %report.robot_id, "a report in another robot's name is dropped");
+            return Ok(());
+        }
+        self.saw_instance(message, &report.instance);
+        let observed = report.observed_generation;
+        match self.reports.submit(report).await {
+            Ok(reply) => {
+                if reply.generation > observed {
+                    self.remind(&message.robot);
+                }
+                Ok(())
+            }
+            // It was removed a moment ago; sending again would not help.
+            Err(ReportError::RobotNotFound(_)) => Ok(()),
+            Err(error) => {
+                tracing::warn!(robot = %message.robot, %error, "a report was not stored; the robot sends it again");
+                Err(NotStored)
+            }
+        }
+    }
+
+    fn take_status(&self, message: &RobotMessage) {
+        let Some(status) = parsed::<Status>(message, MAX_STATUS_BYTES) else { return };
+        // Going offline is noticed by the connection's end, which can't be forged or late.
+        if status.online {
+            self.saw_instance(message, &status.instance);
+        }
+    }
+
+    fn saw_instance(&self, message: &RobotMessage, instance: &task_proto::InstanceId) {
+        let now_ms = self.clock.now_ms();
+        let was_duplicate = self.presence.is_duplicate(&message.robot, now_ms);
+        if self.presence.instance_seen(&message.robot, message.peer, instance, now_ms) != was_duplicate {
+            self.changes.announce(Change::Robot(message.robot.clone()));
+        }
+    }
+
+    fn remind(&self, robot: &RobotId) {
+        let now_ms = self.clock.now_ms();
+        let mut reminded_ms = self.reminded_ms.lock().unwrap_or_else(PoisonError::into_inner);
+        if reminded_ms.get(robot).is_some_and(|at_ms| now_ms.saturating_sub(*at_ms) < RING_AGAIN_MS) {
+            return;
+        }
+        reminded_ms.insert(robot.clone(), now_ms);
+        self.changes.ring([robot.clone()]);
+    }
+}
+
+impl Inbox for Uplink {
+    fn receive(&self, message: RobotMessage) -> BoxFuture<'_, Result<(), NotStored>> {
+        async move {
+            match message.topic {
+                RobotTopic::Report => return self.take_report(&message).await,
+                RobotTopic::Status => self.take_status(&message),
+                // Nothing asks questions yet, so there are no replies to expect.
+                _ => {}
+            }
+            Ok(())
+        }
+        .boxed()
+    }
+
+    fn connected(&self, robot: &RobotId, peer: SocketAddr, connection: u64) {
+        self.presence.connected(robot, peer, connection, self.clock.now_ms());
+        self.changes.announce(Change::Robot(robot.clone()));
+        self.changes.ring([robot.clone()]);
+    }
+
+    fn disconnected(&self, robot: &RobotId, connection: u64) {
+        self.presence.disconnected(robot, connection, self.clock.now_ms());
+        self.reminded_ms.lock().unwrap_or_else(PoisonError::into_inner).remove(robot);
+        self.changes.announce(Change::Robot(robot.clone()));
+    }
+}
+
+/// A robot was heard over HTTP; if it was away, that is news.
+pub fn heard(presence: &Presence, changes: &Changes, robot: &RobotId, peer: SocketAddr, now_ms: u64) {
+    let was_online = presence.is_online(robot, now_ms);
+    presence.seen(robot, peer, now_ms);
+    if !was_online {
+        changes.announce(Change::Robot(robot.clone()));
+    }
+}
+
+fn parsed<T: DeserializeOwned>(message: &RobotMessage, most_bytes: usize) -> Option<T> {
+    let (robot, topic) = (&message.robot, message.topic.as_str());
+    if message.payload.len() > most_bytes {
+        tracing::warn!(%robot, topic, bytes = message.payload.len(), "a message is too large and is dropped");
+        return None;
+    }
+    match serde_json::from_slice(&message.payload) {
+        Ok(value) => Some(value),
+        Err(error) => {
+            tracing::warn!(%robot, topic, %error, "a message can't be read and is dropped");
+            None
+        }
+    }
+}

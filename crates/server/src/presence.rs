@@ -23,7 +23,7 @@ pub struct Presence {
 /// What is known of one robot.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Sighting {
-    /// Connected over MQTT, or heard within the window.
+    /// Connected over MQTT, or heard over HTTP within the window.
     pub online: bool,
     /// Where it was last heard from.
     pub address: SocketAddr,
@@ -41,6 +41,8 @@ struct Sightings {
     address: SocketAddr,
     connection: Option<Connection>,
     last_seen_ms: u64,
+    /// When it was last heard over HTTP. The end of a connection takes it back: who hangs up is away until it asks.
+    polled_ms: Option<u64>,
     instances: InstanceHistory,
 }
 
@@ -71,13 +73,14 @@ impl Presence {
             && sightings.connection.is_some_and(|known| known.number == connection)
         {
             sightings.connection = None;
+            sightings.polled_ms = None;
             sightings.last_seen_ms = sightings.last_seen_ms.max(now_ms);
         }
     }
 
-    /// The robot was heard: a poll over HTTP, a report by either way.
+    /// The robot was heard over HTTP.
     pub fn seen(&self, robot: &RobotId, address: SocketAddr, now_ms: u64) {
-        heard(&mut self.robots(), robot, address, now_ms);
+        heard(&mut self.robots(), robot, address, now_ms).polled_ms = Some(now_ms);
     }
 
     /// The robot named its instance. Returns whether it is a duplicate identity now.
@@ -103,8 +106,8 @@ impl Presence {
     pub fn fell_silent(&self, since_ms: u64, now_ms: u64) -> Vec<RobotId> {
         let robots = self.robots();
         let fell = robots.iter().filter(|(_, sightings)| {
-            let ends_ms = sightings.last_seen_ms.saturating_add(self.window_ms);
-            sightings.connection.is_none() && (since_ms..now_ms).contains(&ends_ms)
+            let ends_ms = sightings.polled_ms.map(|polled_ms| polled_ms.saturating_add(self.window_ms));
+            sightings.connection.is_none() && ends_ms.is_some_and(|ends_ms| since_ms < ends_ms && ends_ms <= now_ms)
         });
         fell.map(|(robot, _)| robot.clone()).collect()
     }
@@ -138,6 +141,7 @@ fn heard<'a>(
         address,
         connection: None,
         last_seen_ms: now_ms,
+        polled_ms: None,
         instances: InstanceHistory::default(),
     });
     sightings.address = address;
@@ -160,7 +164,8 @@ fn make_room(robots: &mut HashMap<RobotId, Sightings>) {
 impl Sightings {
     fn view(&self, window_ms: u64, now_ms: u64) -> Sighting {
         Sighting {
-            online: self.connection.is_some() || now_ms.saturating_sub(self.last_seen_ms) < window_ms,
+            online: self.connection.is_some()
+                || self.polled_ms.is_some_and(|polled_ms| now_ms.saturating_sub(polled_ms) < window_ms),
             address: self.address,
             connected_since_ms: self.connection.map(|connection| connection.since_ms),
             connection: self.connection.map(|connection| connection.number),
@@ -284,10 +289,23 @@ mod tests {
         assert!(sighting.online);
         assert_eq!((sighting.connection, sighting.connected_since_ms), (Some(7), Some(2000)));
         presence.disconnected(&robot, 7, 100_000);
+        assert!(!presence.is_online(&robot, 100_000), "who hangs up is away at once");
+        presence.seen(&robot, address(), 100_001);
         assert!(presence.is_online(&robot, 100_500));
-        assert!(!presence.is_online(&robot, 101_000));
         presence.forget(&robot);
         assert_eq!(presence.get(&robot, 100_000), None);
+    }
+
+    #[test]
+    fn silence_is_noticed_once_and_only_of_robots_that_poll() {
+        let presence = Presence::new(1000);
+        let (polls, connected) = (RobotId::random(), RobotId::random());
+        presence.seen(&polls, address(), 500);
+        presence.seen(&connected, address(), 500);
+        presence.connected(&connected, address(), 1, 600);
+        assert!(presence.fell_silent(0, 1499).is_empty());
+        assert_eq!(presence.fell_silent(1499, 1500), [polls]);
+        assert!(presence.fell_silent(1500, 9000).is_empty());
     }
 
     #[test]

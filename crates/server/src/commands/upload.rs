@@ -45,7 +45,7 @@ pub(super) async fn upload(client: &Client, packed: &Packed) -> Result<(), Comma
     put_manifest(client, packed).await?;
     let package = &packed.package;
     match sent {
-        0 => say(&format!("{} {}: the server has it already, no blob transferred", package.name, package.version)),
+        0 => say(&format!("{} {}: nothing to upload, the server has it already", package.name, package.version)),
         _ => say(&format!(
             "{} {}: {sent} blobs transferred ({})",
             package.name,

@@ -28,10 +28,14 @@ pub(super) struct Source {
 /// Reads and checks `dir`.
 pub(super) fn read(dir: &Path) -> Result<Source, PackageError> {
     let invalid = |problems| PackageError::Invalid { dir: dir.to_owned(), problems };
-    let metadata = fs::metadata(dir)
-        .map_err(|source| PackageError::Io { what: format!("can't read {}", dir.display()), source })?;
-    if !metadata.is_dir() {
-        return Err(invalid(vec![Problem { file: ".".to_owned(), reason: "is not a directory".to_owned() }]));
+    let not_a_directory = |reason: &str| invalid(vec![Problem { file: ".".to_owned(), reason: reason.to_owned() }]);
+    match fs::metadata(dir) {
+        Ok(metadata) if metadata.is_dir() => {}
+        Ok(_) => return Err(not_a_directory("is not a directory")),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => {
+            return Err(not_a_directory("there is no such directory"));
+        }
+        Err(source) => return Err(PackageError::Io { what: format!("can't read {}", dir.display()), source }),
     }
     let mut problems = Vec::new();
     let toml = read_text(dir, task_toml::FILE, &mut problems)?;

@@ -23,6 +23,17 @@ pub enum Change {
     Package(TaskName),
 }
 
+/// What a write has changed, collected on the way and announced after its commit.
+#[derive(Debug, Default)]
+pub struct Consequences {
+    /// Robots that have changed as the operator sees them.
+    pub robots: BTreeSet<RobotId>,
+    /// Robots whose desired state is new.
+    pub rings: BTreeSet<RobotId>,
+    /// Deployments that are new or have changed.
+    pub deployments: BTreeSet<DeploymentId>,
+}
+
 /// Where changes are announced. Clones announce to the same listeners.
 #[derive(Debug, Clone)]
 pub struct Changes {
@@ -51,6 +62,17 @@ impl Changes {
     /// Tells all listeners; nobody listening is fine.
     pub fn announce(&self, change: Change) {
         let _ = self.notices.send(change);
+    }
+
+    /// Announces all that a write has changed. To be called after its commit.
+    pub fn publish(&self, consequences: Consequences) {
+        for robot in consequences.robots.union(&consequences.rings) {
+            self.announce(Change::Robot(robot.clone()));
+        }
+        for deployment in consequences.deployments {
+            self.announce(Change::Deployment(deployment));
+        }
+        self.ring(consequences.rings);
     }
 
     /// Asks that `robots` be told of their new desired state.

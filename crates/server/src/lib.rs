@@ -1,6 +1,7 @@
 //! The server half: everything `taskd` does. Imports run downward only; see ARCHITECTURE.md.
 
 pub mod actions;
+pub mod advance;
 pub mod blobs;
 pub mod broker;
 pub mod changes;
@@ -9,12 +10,14 @@ pub mod collector;
 pub mod commands;
 pub mod config;
 pub mod data_directory;
+pub mod deployment;
 pub mod downlink;
 pub mod gatekeeper;
 pub mod http;
 pub mod package;
 pub mod presence;
 pub mod report_writer;
+pub mod rollout;
 pub mod serve;
 pub mod store;
 pub mod uplink;

@@ -1,9 +1,19 @@
 //! Orders about deployments: create, cancel, resume, and the server's own: expire.
 
-use task_proto::DeploymentId;
-use task_proto::api::{CreateDeployment, PackageView};
+use std::collections::BTreeSet;
 
-use super::{ActionError, Actions, IdempotencyKey};
+use task_proto::api::{CreateDeployment, PackageView};
+use task_proto::report::Phase;
+use task_proto::{DeploymentId, RobotId};
+
+use super::robots::lifetime_ms;
+use super::{ActionError, Actions, DAY_MS, IdempotencyKey};
+use crate::advance::advance;
+use crate::changes::Consequences;
+use crate::store::{NewDeployment, Revocable, Write};
+
+/// How long an idempotency key is remembered.
+const KEY_LIFETIME_MS: u64 = 30 * DAY_MS;
 
 impl Actions {
     /// Orders `package`, which the caller has looked up for `order`, on the robots that match now. The same key with the
@@ -14,21 +24,107 @@ impl Actions {
         order: &CreateDeployment,
         package: &PackageView,
     ) -> Result<DeploymentId, ActionError> {
-        todo!()
+        let request = format!("Create {}", serde_json::to_string(order).expect("an order always has a JSON form"));
+        let now_ms = self.clock.now_ms();
+        let lifetime_ms = match order.expires_in_s {
+            Some(seconds) => lifetime_ms("expires_in_s", seconds)?,
+            None => self.settings.assignment_lifetime_ms,
+        };
+        if order.batch == Some(0) {
+            return Err(ActionError::Invalid { key: "batch", reason: "expected at least 1 robot".to_owned() });
+        }
+        let mut write = self.store.begin().await?;
+        if let Some(answer) = self.answered_before(&mut write, key, &request).await? {
+            return Ok(answer);
+        }
+        let robots = write.matching_robots(&order.selector).await?;
+        if robots.is_empty() {
+            return Err(ActionError::NoRobotsMatch(order.selector.to_string()));
+        }
+        let robots: Vec<RobotId> = robots.into_iter().map(|robot| robot.id).collect();
+        let (id, task) = (DeploymentId::random(), &package.package.name);
+        let expires_at_ms = now_ms + lifetime_ms;
+        let kind = package.manifest.run.kind;
+        let new = NewDeployment { id: &id, package: &package.package, kind, order, expires_at_ms };
+        write.insert_deployment(&new, now_ms).await?;
+        let mut touched = write.assign(&id, task, &robots, expires_at_ms, now_ms).await?;
+        touched.insert(id.clone());
+        let mut consequences = Consequences { deployments: touched.clone(), ..Consequences::default() };
+        advance(&mut write, touched, now_ms, &mut consequences).await?;
+        self.remember_answer(&mut write, key, &request, &id, now_ms).await?;
+        write.commit().await?;
+        self.changes.publish(consequences);
+        Ok(id)
     }
 
     /// Takes a deployment back: what it replaced is desired again. Doing it twice is harmless.
     pub async fn cancel_deployment(&self, id: &DeploymentId) -> Result<(), ActionError> {
-        todo!()
+        let now_ms = self.clock.now_ms();
+        let mut write = self.store.begin().await?;
+        let status = write.deployment_status(id).await?;
+        if status.ok_or_else(|| ActionError::DeploymentNotFound(id.clone()))?.cancelled {
+            return Ok(());
+        }
+        let robots: Vec<RobotId> = write.revocable(id).await?.into_iter().map(|row| row.robot).collect();
+        write.adopt_diverged(&robots, now_ms).await?;
+        write.mark_cancelled(id, now_ms).await?;
+        let taken = write.revocable(id).await?;
+        let mut consequences = take_back(&mut write, &taken, Phase::Cancelled, now_ms).await?;
+        write.skip_as_previous(id).await?;
+        consequences.deployments.insert(id.clone());
+        write.commit().await?;
+        self.changes.publish(consequences);
+        Ok(())
     }
 
     /// Lets a paused deployment go on; the failures so far are forgiven.
     pub async fn resume_deployment(&self, id: &DeploymentId) -> Result<(), ActionError> {
-        todo!()
+        let now_ms = self.clock.now_ms();
+        let mut write = self.store.begin().await?;
+        let status = write.deployment_status(id).await?;
+        if status.ok_or_else(|| ActionError::DeploymentNotFound(id.clone()))?.cancelled {
+            return Err(ActionError::DeploymentCancelled(id.clone()));
+        }
+        let Some((rollout, tally)) = write.rollout(id).await?.filter(|(rollout, _)| rollout.paused) else {
+            return Ok(());
+        };
+        write.resume(id, rollout.forgiven.max(tally.failed)).await?;
+        let touched = BTreeSet::from([id.clone()]);
+        let mut consequences = Consequences { deployments: touched.clone(), ..Consequences::default() };
+        advance(&mut write, touched, now_ms, &mut consequences).await?;
+        write.commit().await?;
+        self.changes.publish(consequences);
+        Ok(())
     }
 
     /// Ends what was not done in time and forgets old idempotency keys. To be called about once a minute.
     pub async fn expire(&self) -> Result<(), ActionError> {
-        todo!()
+        let now_ms = self.clock.now_ms();
+        let mut write = self.store.begin().await?;
+        write.forget_orders(now_ms.saturating_sub(KEY_LIFETIME_MS)).await?;
+        let overdue = write.overdue(now_ms).await?;
+        let consequences = take_back(&mut write, &overdue, Phase::Expired, now_ms).await?;
+        write.commit().await?;
+        self.changes.publish(consequences);
+        Ok(())
     }
+}
+
+/// Ends `taken` in `phase`, puts back what it had replaced, and moves on the rollouts this touches.
+async fn take_back(
+    write: &mut Write,
+    taken: &[Revocable],
+    phase: Phase,
+    now_ms: u64,
+) -> Result<Consequences, ActionError> {
+    let taken_back = write.take_back(taken, phase, now_ms).await?;
+    let touched: BTreeSet<DeploymentId> =
+        taken.iter().flat_map(|row| row.previous.iter().chain([&row.deployment])).cloned().collect();
+    let mut consequences = Consequences {
+        robots: taken.iter().map(|row| row.robot.clone()).collect(),
+        rings: taken_back.into_iter().collect(),
+        deployments: touched.clone(),
+    };
+    advance(write, touched, now_ms, &mut consequences).await?;
+    Ok(consequences)
 }

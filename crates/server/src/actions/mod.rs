@@ -10,12 +10,14 @@ use std::fmt;
 use std::str::FromStr;
 use std::sync::Arc;
 
+use serde::Serialize;
+use serde::de::DeserializeOwned;
 use task_proto::envelope::SigningKey;
-use task_proto::{DeploymentId, MacAddress, RobotId, RobotName};
+use task_proto::{DeploymentId, Digest, MacAddress, RobotId, RobotName};
 
 use crate::changes::Changes;
 use crate::clock::Clock;
-use crate::store::{Store, StoreError};
+use crate::store::{PastOrder, Store, StoreError, Write};
 
 pub use crate::store::TaskOrder;
 pub use desired::Desired;
@@ -61,6 +63,35 @@ impl Actions {
     /// Orders that go to `store` and are announced to `changes`; desired states are signed with `key`.
     pub fn new(store: Store, clock: Clock, changes: Changes, key: SigningKey, settings: ActionSettings) -> Self {
         Self { store, clock, changes, key: Arc::new(key), settings, envelopes: Arc::default() }
+    }
+
+    /// What was answered when `key` came with this `request` before; an error if it came with another.
+    async fn answered_before<T: DeserializeOwned>(
+        &self,
+        write: &mut Write,
+        key: &IdempotencyKey,
+        request: &str,
+    ) -> Result<Option<T>, ActionError> {
+        let Some(past) = write.past_order(&key.0).await? else { return Ok(None) };
+        if past.request != Digest::of(request.as_bytes()).to_string() {
+            return Err(ActionError::IdempotencyKeyReused(key.to_string()));
+        }
+        let answer = serde_json::from_str(&past.answer);
+        Ok(Some(answer.map_err(|_| StoreError::Unreadable { column: "orders.answer" })?))
+    }
+
+    /// Remembers the answer to `request`, so that a retry gets the same.
+    async fn remember_answer<T: Serialize>(
+        &self,
+        write: &mut Write,
+        key: &IdempotencyKey,
+        request: &str,
+        answer: &T,
+        now_ms: u64,
+    ) -> Result<(), ActionError> {
+        let answer = serde_json::to_string(answer).expect("an answer always has a JSON form");
+        let order = PastOrder { request: Digest::of(request.as_bytes()).to_string(), answer };
+        Ok(write.remember_order(&key.0, &order, now_ms).await?)
     }
 }
 

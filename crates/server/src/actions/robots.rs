@@ -1,11 +1,18 @@
 //! Robots come, are edited and go; and the tokens they come with.
 
 use task_proto::api::{CreateEnrollmentToken, EditRobot, EnrollRequest, EnrollmentToken, MatchedRobot};
+use task_proto::id::Labels;
 use task_proto::selector::Selector;
-use task_proto::token::Token;
-use task_proto::{RobotId, RobotName};
+use task_proto::token::{Token, TokenKind};
+use task_proto::{MacAddress, RobotId, RobotName};
 
-use super::{ActionError, Actions};
+use super::{ActionError, Actions, MAX_LIFETIME_MS};
+use crate::advance::advance;
+use crate::changes::{Change, Consequences};
+use crate::store::{EnrolmentTerms, KnownRobot, StoreError, Write};
+
+/// The most labels a robot may have.
+const MAX_LABELS: usize = 64;
 
 /// A robot that has just registered.
 #[derive(Debug)]
@@ -19,28 +26,171 @@ pub struct Enrolled {
 }
 
 impl Actions {
-    /// Registers a robot that holds the enrolment token `token`.
+    /// Registers a robot that holds the enrolment token `token`. A robot that is known by its MAC may register again with
+    /// a token made for it: it keeps its id, name and labels, and its old token ends.
     pub async fn enroll(&self, token: &Token, request: &EnrollRequest) -> Result<Enrolled, ActionError> {
-        todo!()
+        check_labels(&request.labels)?;
+        let now_ms = self.clock.now_ms();
+        let mut write = self.store.begin().await?;
+        let terms = write.enrolment_terms(token, now_ms).await?.ok_or(ActionError::TokenRefused)?;
+        let robot = match write.robot_by_mac(&request.mac).await? {
+            Some(known) if terms.robot.as_ref() == Some(&known.id) => {
+                write.forget_report(&known.id).await?;
+                known
+            }
+            Some(known) => return Err(ActionError::MacKnown { mac: known.mac, name: known.name }),
+            None => register(&mut write, terms, request, now_ms).await?,
+        };
+        write.use_enrolment_token(token).await?;
+        let robot_token = Token::random(TokenKind::Robot);
+        write.replace_robot_token(&robot_token, &robot.id, now_ms).await?;
+        write.commit().await?;
+        self.changes.announce(Change::Robot(robot.id.clone()));
+        Ok(Enrolled { robot_id: robot.id, name: robot.name, token: robot_token })
     }
 
     /// Makes an enrolment token.
     pub async fn create_enrollment_token(&self, order: &CreateEnrollmentToken) -> Result<EnrollmentToken, ActionError> {
-        todo!()
+        check_labels(&order.labels)?;
+        if order.uses == Some(0) {
+            return Err(ActionError::Invalid { key: "uses", reason: "a token needs at least one use".to_owned() });
+        }
+        let now_ms = self.clock.now_ms();
+        let lifetime_ms = match order.ttl_s {
+            Some(ttl_s) => lifetime_ms("ttl_s", ttl_s)?,
+            None => self.settings.enrolment_token_lifetime_ms,
+        };
+        let mut write = self.store.begin().await?;
+        let robot = match &order.robot {
+            Some(robot) => Some(known_robot(&mut write, robot).await?.id),
+            None => None,
+        };
+        let expires_at_ms = now_ms + lifetime_ms;
+        let terms = EnrolmentTerms { robot, labels: order.labels.clone(), uses_left: order.uses, expires_at_ms };
+        let token = Token::random_enrolment(self.key.public_key());
+        write.create_enrolment_token(&token, &terms, now_ms).await?;
+        write.commit().await?;
+        Ok(EnrollmentToken { id: token.id(), token: token.reveal(), expires_at_ms })
     }
 
     /// Changes a robot's name or labels.
     pub async fn edit_robot(&self, robot: &RobotId, edit: &EditRobot) -> Result<(), ActionError> {
-        todo!()
+        let mut write = self.store.begin().await?;
+        let mut known = known_robot(&mut write, robot.as_str()).await?;
+        if let Some(labels) = &edit.labels {
+            check_labels(labels)?;
+            known.labels = labels.clone();
+        }
+        if let Some(name) = edit.name.as_ref().filter(|name| **name != known.name) {
+            check_name(&mut write, name).await?;
+            known.name = name.clone();
+        }
+        write.update_robot(&known).await?;
+        write.commit().await?;
+        self.changes.announce(Change::Robot(known.id));
+        Ok(())
     }
 
     /// Removes a robot: its tokens end now, its MAC and name are free, its id is never used again.
     pub async fn remove_robot(&self, robot: &RobotId) -> Result<(), ActionError> {
-        todo!()
+        let now_ms = self.clock.now_ms();
+        let mut write = self.store.begin().await?;
+        known_robot(&mut write, robot.as_str()).await?;
+        let touched = write.end_all_of_robot(robot, now_ms).await?;
+        write.revoke_tokens(robot, None, now_ms).await?;
+        write.remove_robot(robot, now_ms).await?;
+        let mut consequences = Consequences { deployments: touched.clone(), ..Consequences::default() };
+        advance(&mut write, touched, now_ms, &mut consequences).await?;
+        write.commit().await?;
+        self.envelopes.forget(robot);
+        self.changes.announce(Change::RobotRemoved(robot.clone()));
+        self.changes.publish(consequences);
+        Ok(())
     }
 
     /// The robots a selector means now, sorted by name; an error if nobody. `online` is left false.
     pub async fn matching_robots(&self, selector: &Selector) -> Result<Vec<MatchedRobot>, ActionError> {
-        todo!()
+        let robots = self.store.matching_robots(selector).await?;
+        if robots.is_empty() {
+            return Err(ActionError::NoRobotsMatch(selector.to_string()));
+        }
+        Ok(robots.into_iter().map(matched).collect())
     }
+}
+
+/// A robot as the answer to an order lists it.
+pub(super) fn matched(robot: KnownRobot) -> MatchedRobot {
+    MatchedRobot { id: robot.id, name: robot.name, online: false }
+}
+
+/// A lifetime that a request gives in seconds under `key`.
+pub(super) fn lifetime_ms(key: &'static str, seconds: u64) -> Result<u64, ActionError> {
+    match seconds.checked_mul(1000) {
+        Some(ms @ 1..=MAX_LIFETIME_MS) => Ok(ms),
+        _ => Err(ActionError::Invalid { key, reason: "expected 1 second to 10 years".to_owned() }),
+    }
+}
+
+/// Registers a robot that is not known yet.
+async fn register(
+    write: &mut Write,
+    terms: EnrolmentTerms,
+    request: &EnrollRequest,
+    now_ms: u64,
+) -> Result<KnownRobot, ActionError> {
+    if let Some(other) = &terms.robot {
+        let other = known_robot(write, other.as_str()).await.map_err(|error| match error {
+            // Its robot is gone, so the token is good for nothing.
+            ActionError::RobotNotFound(_) => ActionError::TokenRefused,
+            error => error,
+        })?;
+        return Err(ActionError::TokenForOther { name: other.name, mac: other.mac });
+    }
+    let id = RobotId::random();
+    let name = match &request.name {
+        Some(name) => {
+            check_name(write, name).await?;
+            name.clone()
+        }
+        None => default_name(write, &request.mac, &id).await?,
+    };
+    // What the operator put on the token wins over what the robot says of itself.
+    let mut labels = request.labels.clone();
+    labels.extend(terms.labels);
+    check_labels(&labels)?;
+    let robot = KnownRobot { id, name, mac: request.mac, labels };
+    write.insert_robot(&robot, now_ms).await?;
+    Ok(robot)
+}
+
+async fn default_name(write: &mut Write, mac: &MacAddress, id: &RobotId) -> Result<RobotName, StoreError> {
+    let name = |text: String| text.parse::<RobotName>().expect("made of letters and digits");
+    let by_mac = name(format!("robot-{}", mac.to_string().replace(':', "")));
+    let is_free = write.known_robot(by_mac.as_str()).await?.is_none();
+    Ok(if is_free { by_mac } else { name(format!("robot-{id}")) })
+}
+
+/// A name must be free, and must not look like an id, or a selector could mean two robots by it.
+async fn check_name(write: &mut Write, name: &RobotName) -> Result<(), ActionError> {
+    if name.as_str().parse::<RobotId>().is_ok() {
+        let reason = format!("{name:?} has the form of a robot id", name = name.as_str());
+        return Err(ActionError::Invalid { key: "name", reason });
+    }
+    match write.known_robot(name.as_str()).await? {
+        Some(_) => Err(ActionError::NameTaken(name.clone())),
+        None => Ok(()),
+    }
+}
+
+fn check_labels(labels: &Labels) -> Result<(), ActionError> {
+    if labels.len() <= MAX_LABELS {
+        return Ok(());
+    }
+    Err(ActionError::Invalid { key: "labels", reason: format!("at most {MAX_LABELS}, not {}", labels.len()) })
+}
+
+/// The robot with this id or name, or the error that there is none.
+async fn known_robot(write: &mut Write, id_or_name: &str) -> Result<KnownRobot, ActionError> {
+    let robot = write.known_robot(id_or_name).await?;
+    robot.ok_or_else(|| ActionError::RobotNotFound(id_or_name.chars().take(80).collect()))
 }

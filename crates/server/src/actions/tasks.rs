@@ -1,10 +1,16 @@
 //! Orders on tasks that robots have: start, stop, remove.
 
-use task_proto::TaskName;
+use std::collections::{BTreeSet, HashSet};
+
 use task_proto::api::MatchedRobot;
 use task_proto::selector::Selector;
+use task_proto::{RobotId, TaskName};
 
+use super::robots::matched;
 use super::{ActionError, Actions, IdempotencyKey, TaskOrder};
+use crate::advance::advance;
+use crate::changes::Consequences;
+use crate::store::KnownRobot;
 
 impl Actions {
     /// Orders `task` started, stopped or removed on the robots that match and have it. The same key gives the same
@@ -16,15 +22,55 @@ impl Actions {
         task: &TaskName,
         selector: &Selector,
     ) -> Result<Vec<MatchedRobot>, ActionError> {
-        todo!()
+        let request = format!("{order:?} {task} {selector}");
+        let now_ms = self.clock.now_ms();
+        let mut write = self.store.begin().await?;
+        if let Some(answer) = self.answered_before(&mut write, key, &request).await? {
+            return Ok(answer);
+        }
+        let mut robots = write.matching_robots(selector).await?;
+        let ids: Vec<RobotId> = robots.iter().map(|robot| robot.id.clone()).collect();
+        write.adopt_diverged(&ids, now_ms).await?;
+        keep_those_with_task(&mut robots, write.robots_with_task(task).await?, selector)?;
+        let ids: Vec<RobotId> = robots.iter().map(|robot| robot.id.clone()).collect();
+        let expires_at_ms = now_ms + self.settings.assignment_lifetime_ms;
+        let changed = write.order_on_task(order, task, &ids, expires_at_ms, now_ms).await?;
+        let mut touched = BTreeSet::new();
+        let mut consequences = Consequences::default();
+        for (deployment, robot) in changed {
+            touched.insert(deployment);
+            consequences.rings.insert(robot);
+        }
+        if order == TaskOrder::Remove {
+            touched.extend(write.drop_waiting(Some(task), &ids, now_ms).await?);
+        }
+        consequences.deployments.extend(touched.iter().cloned());
+        advance(&mut write, touched, now_ms, &mut consequences).await?;
+        let answer: Vec<MatchedRobot> = robots.into_iter().map(matched).collect();
+        self.remember_answer(&mut write, key, &request, &answer, now_ms).await?;
+        write.commit().await?;
+        self.changes.publish(consequences);
+        Ok(answer)
     }
 
-    /// Whom [`Actions::order_task`] would mean.
+    /// Whom [`Actions::order_task`] would mean; an error if nobody.
     pub async fn robots_with_task(
         &self,
         task: &TaskName,
         selector: &Selector,
     ) -> Result<Vec<MatchedRobot>, ActionError> {
-        todo!()
+        let mut robots = self.store.matching_robots(selector).await?;
+        keep_those_with_task(&mut robots, self.store.robots_with_task(task).await?, selector)?;
+        Ok(robots.into_iter().map(matched).collect())
     }
+}
+
+fn keep_those_with_task(
+    robots: &mut Vec<KnownRobot>,
+    with_task: Vec<RobotId>,
+    selector: &Selector,
+) -> Result<(), ActionError> {
+    let with_task: HashSet<RobotId> = with_task.into_iter().collect();
+    robots.retain(|robot| with_task.contains(&robot.id));
+    if robots.is_empty() { Err(ActionError::NoRobotsMatch(selector.to_string())) } else { Ok(()) }
 }

@@ -88,6 +88,7 @@ CREATE INDEX assignments_waiting ON assignments (deployment_id, place) WHERE rel
 CREATE INDEX assignments_expiring ON assignments (expires_at_ms) WHERE ended = 0;
 CREATE INDEX assignments_by_phase ON assignments (deployment_id, released, phase);
 CREATE INDEX assignments_superseded ON assignments (superseded_by, deployment_id) WHERE superseded_by IS NOT NULL;
+CREATE INDEX assignments_previous ON assignments (previous, robot_id) WHERE previous IS NOT NULL;
 
 -- Answers already given, by the key the operator's order came with.
 CREATE TABLE orders (

@@ -1,4 +1,15 @@
-//! Assignments: each deployment's part for each robot, and which of them is desired.
+//! Assignments: each deployment's part for each robot, and which of them is desired. Every change is a few statements over
+//! sets of rows, whatever the number of robots. Whoever changes what is desired of a robot raises its generation in the
+//! same write.
+
+use std::collections::BTreeSet;
+
+use sqlx::{AssertSqlSafe, Row as _};
+use task_proto::report::Phase;
+use task_proto::{DeploymentId, RobotId, TaskName};
+
+use super::rows::{groups, id, stored, values};
+use super::{StoreError, Write};
 
 /// What may be ordered about a task that a robot has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -9,4 +20,342 @@ pub enum TaskOrder {
     Stop,
     /// Take it off the robot.
     Remove,
+}
+
+/// A batch that has begun.
+#[derive(Debug, Default)]
+pub struct Released {
+    /// Whose desired state is new.
+    pub robots: Vec<RobotId>,
+    /// Deployments whose place was taken on some of them.
+    pub superseded: BTreeSet<DeploymentId>,
+}
+
+/// An assignment that is to be taken back.
+#[derive(Debug, Clone)]
+pub struct Revocable {
+    /// The deployment.
+    pub deployment: DeploymentId,
+    /// The robot.
+    pub robot: RobotId,
+    /// What it took the place of, and is desired again.
+    pub previous: Option<DeploymentId>,
+    desired: bool,
+}
+
+/// Columns of a list of assignments in a statement.
+const PAIR: &[&str] = &["TEXT", "TEXT"];
+
+impl Write {
+    /// Gives each of `robots`, in this order, its part of a new deployment. Nothing is released yet; older parts of the
+    /// same task that wait for their batch give way, and their deployments are returned.
+    pub async fn assign(
+        &mut self,
+        deployment: &DeploymentId,
+        task: &TaskName,
+        robots: &[RobotId],
+        expires_at_ms: u64,
+        now_ms: u64,
+    ) -> Result<BTreeSet<DeploymentId>, StoreError> {
+        let mut place = 0;
+        for group in groups(robots) {
+            let sql = format!(
+                "WITH v (robot_id, place) AS ({})
+                 INSERT INTO assignments (deployment_id, robot_id, task, place, expires_at_ms, updated_at_ms)
+                 SELECT CAST($1 AS TEXT), v.robot_id, CAST($2 AS TEXT), v.place, CAST($3 AS BIGINT), CAST($4 AS BIGINT)
+                 FROM v",
+                values(5, group.len(), &["TEXT", "BIGINT"])
+            );
+            let mut query = sqlx::query(AssertSqlSafe(sql))
+                .bind(deployment.as_str())
+                .bind(task.as_str())
+                .bind(stored(expires_at_ms))
+                .bind(stored(now_ms));
+            for robot in group {
+                query = query.bind(robot.as_str()).bind(place);
+                place += 1;
+            }
+            query.execute(self.connection()).await?;
+        }
+        let superseded = sqlx::query_scalar(
+            "UPDATE assignments SET phase = 'superseded', ended = 1, superseded_by = $1, updated_at_ms = $3
+             WHERE task = $2 AND released = 0 AND ended = 0 AND deployment_id <> $1
+               AND robot_id IN (SELECT robot_id FROM assignments WHERE deployment_id = $1)
+             RETURNING deployment_id",
+        )
+        .bind(deployment.as_str())
+        .bind(task.as_str())
+        .bind(stored(now_ms))
+        .fetch_all(self.connection())
+        .await?;
+        deployments(superseded)
+    }
+
+    /// Begins the next batch of at most `count` robots: what they had of the task gives way.
+    pub async fn release(
+        &mut self,
+        deployment: &DeploymentId,
+        count: u64,
+        now_ms: u64,
+    ) -> Result<Released, StoreError> {
+        let batch: Vec<(String, i64)> = sqlx::query_as(
+            "SELECT robot_id, place FROM assignments WHERE deployment_id = $1 AND released = 0 AND ended = 0
+             ORDER BY place LIMIT $2",
+        )
+        .bind(deployment.as_str())
+        .bind(stored(count))
+        .fetch_all(self.connection())
+        .await?;
+        let Some(&(_, last)) = batch.last() else { return Ok(Released::default()) };
+        let robots = batch.iter().map(|(robot, _)| id("assignments.robot_id", robot)).collect::<Result<Vec<_>, _>>()?;
+        self.adopt_diverged(&robots, now_ms).await?;
+        sqlx::query(
+            "UPDATE assignments SET previous = (
+                 SELECT old.deployment_id FROM assignments old
+                 WHERE old.robot_id = assignments.robot_id AND old.task = assignments.task AND old.desired = 1)
+             WHERE deployment_id = $1 AND released = 0 AND ended = 0 AND place <= $2",
+        )
+        .bind(deployment.as_str())
+        .bind(last)
+        .execute(self.connection())
+        .await?;
+        let superseded = sqlx::query_scalar(
+            "UPDATE assignments SET desired = 0, superseded_by = $1, ended = 1, progress = NULL, updated_at_ms = $3,
+                 phase = CASE ended WHEN 1 THEN phase ELSE 'superseded' END
+             WHERE desired = 1 AND task = (SELECT task FROM deployments WHERE id = $1) AND robot_id IN (
+                 SELECT robot_id FROM assignments
+                 WHERE deployment_id = $1 AND released = 0 AND ended = 0 AND place <= $2)
+             RETURNING deployment_id",
+        )
+        .bind(deployment.as_str())
+        .bind(last)
+        .bind(stored(now_ms))
+        .fetch_all(self.connection())
+        .await?;
+        sqlx::query(
+            "UPDATE assignments SET released = 1, desired = 1, updated_at_ms = $3
+             WHERE deployment_id = $1 AND released = 0 AND ended = 0 AND place <= $2",
+        )
+        .bind(deployment.as_str())
+        .bind(last)
+        .bind(stored(now_ms))
+        .execute(self.connection())
+        .await?;
+        self.raise_generations(&robots).await?;
+        Ok(Released { robots, superseded: deployments(superseded)? })
+    }
+
+    /// What a cancel takes back: all that has not ended, and what ended badly but is still what its robot should have.
+    pub async fn revocable(&mut self, deployment: &DeploymentId) -> Result<Vec<Revocable>, StoreError> {
+        let rows = sqlx::query(
+            "SELECT deployment_id, robot_id, desired, previous FROM assignments
+             WHERE deployment_id = $1 AND (ended = 0 OR (desired = 1 AND phase NOT IN ('succeeded', 'stopped')))
+             ORDER BY place",
+        )
+        .bind(deployment.as_str())
+        .fetch_all(self.connection())
+        .await?;
+        rows.into_iter().map(revocable).collect()
+    }
+
+    /// What was not done in time. Diverged robots are left alone.
+    pub async fn overdue(&mut self, now_ms: u64) -> Result<Vec<Revocable>, StoreError> {
+        let rows = sqlx::query(
+            "SELECT a.deployment_id, a.robot_id, a.desired, a.previous FROM assignments a
+             JOIN robots r ON r.id = a.robot_id
+             WHERE a.ended = 0 AND a.expires_at_ms <= $1 AND r.observed_generation <= r.generation",
+        )
+        .bind(stored(now_ms))
+        .fetch_all(self.connection())
+        .await?;
+        rows.into_iter().map(revocable).collect()
+    }
+
+    /// Takes assignments back, those that have not ended in `phase`, and makes desired again what they had replaced.
+    /// Returns the robots whose desired state is new.
+    pub async fn take_back(
+        &mut self,
+        taken: &[Revocable],
+        phase: Phase,
+        now_ms: u64,
+    ) -> Result<Vec<RobotId>, StoreError> {
+        let end = "SET desired = 0, ended = 1, progress = NULL, updated_at_ms = $1,
+                       phase = CASE ended WHEN 1 THEN phase ELSE CAST($2 AS TEXT) END";
+        self.set_pairs(end, phase, now_ms, taken.iter().map(|row| (&row.deployment, &row.robot))).await?;
+        // Where the replaced one stands is what the robot's next report says; $2 is what it is until then.
+        let revive = "SET desired = 1, superseded_by = NULL, removed_generation = NULL, updated_at_ms = $1,
+                          ended = CASE phase WHEN 'superseded' THEN 0 ELSE ended END,
+                          phase = CASE phase WHEN 'superseded' THEN CAST($2 AS TEXT) ELSE phase END";
+        let previous =
+            taken.iter().filter(|row| row.desired).filter_map(|row| Some((row.previous.as_ref()?, &row.robot)));
+        self.set_pairs(revive, Phase::Assigned, now_ms, previous).await?;
+        let robots: BTreeSet<RobotId> = taken.iter().filter(|row| row.desired).map(|row| row.robot.clone()).collect();
+        let robots: Vec<RobotId> = robots.into_iter().collect();
+        self.raise_generations(&robots).await?;
+        Ok(robots)
+    }
+
+    /// Runs `UPDATE assignments` with `set`, whose $1 is the time and $2 a phase, on the given rows.
+    async fn set_pairs<'a>(
+        &mut self,
+        set: &str,
+        phase: Phase,
+        now_ms: u64,
+        pairs: impl Iterator<Item = (&'a DeploymentId, &'a RobotId)>,
+    ) -> Result<(), StoreError> {
+        let pairs: Vec<_> = pairs.collect();
+        for group in groups(&pairs) {
+            let sql = format!(
+                "WITH v (deployment_id, robot_id) AS ({}) UPDATE assignments {set} FROM v
+                 WHERE assignments.deployment_id = v.deployment_id AND assignments.robot_id = v.robot_id",
+                values(3, group.len(), PAIR)
+            );
+            let mut query = sqlx::query(AssertSqlSafe(sql)).bind(stored(now_ms)).bind(phase.as_str());
+            for (deployment, robot) in group {
+                query = query.bind(deployment.as_str()).bind(robot.as_str());
+            }
+            query.execute(self.connection()).await?;
+        }
+        Ok(())
+    }
+
+    /// After `deployment` was cancelled, no later cancel may put it back: whoever replaced it puts back what it had
+    /// replaced itself.
+    pub async fn skip_as_previous(&mut self, deployment: &DeploymentId) -> Result<(), StoreError> {
+        sqlx::query(
+            "UPDATE assignments SET previous = (
+                 SELECT skipped.previous FROM assignments skipped
+                 WHERE skipped.deployment_id = $1 AND skipped.robot_id = assignments.robot_id)
+             WHERE previous = $1",
+        )
+        .bind(deployment.as_str())
+        .execute(self.connection())
+        .await?;
+        Ok(())
+    }
+
+    /// Carries out an order on `task` where it changes anything on `robots`. Returns the assignments it changed.
+    pub async fn order_on_task(
+        &mut self,
+        order: TaskOrder,
+        task: &TaskName,
+        robots: &[RobotId],
+        expires_at_ms: u64,
+        now_ms: u64,
+    ) -> Result<Vec<(DeploymentId, RobotId)>, StoreError> {
+        let set = match order {
+            TaskOrder::Start => {
+                "SET wanted = 'running', run = run + 1, phase = 'assigned', ended = 0, progress = NULL, failure = NULL,
+                     attempts = 0, expires_at_ms = $2, updated_at_ms = $3 FROM v
+                 WHERE desired = 1 AND (wanted = 'stopped' OR ended = 1)"
+            }
+            TaskOrder::Stop => {
+                "SET wanted = 'stopped', expires_at_ms = CASE WHEN expires_at_ms IS NULL THEN NULL ELSE $2 END,
+                     updated_at_ms = $3 FROM v
+                 WHERE desired = 1 AND wanted = 'running'"
+            }
+            TaskOrder::Remove => {
+                "SET desired = 0, wanted = 'stopped', updated_at_ms = $3,
+                     expires_at_ms = CASE WHEN expires_at_ms IS NULL THEN NULL ELSE $2 END,
+                     removed_generation = (SELECT generation + 1 FROM robots WHERE robots.id = assignments.robot_id)
+                 FROM v WHERE desired = 1"
+            }
+        };
+        let mut changed: Vec<(DeploymentId, RobotId)> = Vec::new();
+        for group in groups(robots) {
+            let sql = format!(
+                "WITH v (id) AS ({}) UPDATE assignments {set} AND assignments.robot_id = v.id AND task = $1
+                 RETURNING assignments.deployment_id, assignments.robot_id",
+                values(4, group.len(), &["TEXT"])
+            );
+            let mut query =
+                sqlx::query_as(AssertSqlSafe(sql)).bind(task.as_str()).bind(stored(expires_at_ms)).bind(stored(now_ms));
+            for robot in group {
+                query = query.bind(robot.as_str());
+            }
+            let rows: Vec<(String, String)> = query.fetch_all(self.connection()).await?;
+            for (deployment, robot) in rows {
+                changed.push((id("assignments.deployment_id", &deployment)?, id("assignments.robot_id", &robot)?));
+            }
+        }
+        let robots: Vec<RobotId> = changed.iter().map(|(_, robot)| robot.clone()).collect();
+        self.raise_generations(&robots).await?;
+        Ok(changed)
+    }
+
+    /// Ends the parts that wait for their batch on `robots`, of `task` or of all: what is removed must not come back with
+    /// a later batch. Returns their deployments.
+    pub async fn drop_waiting(
+        &mut self,
+        task: Option<&TaskName>,
+        robots: &[RobotId],
+        now_ms: u64,
+    ) -> Result<BTreeSet<DeploymentId>, StoreError> {
+        let mut dropped = Vec::new();
+        for group in groups(robots) {
+            let sql = format!(
+                "WITH v (id) AS ({}) UPDATE assignments SET phase = 'cancelled', ended = 1, updated_at_ms = $2 FROM v
+                 WHERE released = 0 AND ended = 0 AND robot_id = v.id AND (task = $1 OR $1 = '')
+                 RETURNING deployment_id",
+                values(3, group.len(), &["TEXT"])
+            );
+            let mut query = sqlx::query_scalar(AssertSqlSafe(sql))
+                .bind(task.map_or("", TaskName::as_str).to_owned())
+                .bind(stored(now_ms));
+            for robot in group {
+                query = query.bind(robot.as_str());
+            }
+            dropped.append(&mut query.fetch_all(self.connection()).await?);
+        }
+        deployments(dropped)
+    }
+
+    /// Ends everything that is ordered of a robot which is being removed. Returns the deployments concerned.
+    pub async fn end_all_of_robot(
+        &mut self,
+        robot: &RobotId,
+        now_ms: u64,
+    ) -> Result<BTreeSet<DeploymentId>, StoreError> {
+        let ended = sqlx::query_scalar(
+            "UPDATE assignments SET desired = 0, ended = 1, updated_at_ms = $2,
+                 phase = CASE ended WHEN 1 THEN phase ELSE 'cancelled' END
+             WHERE robot_id = $1 AND (ended = 0 OR desired = 1)
+             RETURNING deployment_id",
+        )
+        .bind(robot.as_str())
+        .bind(stored(now_ms))
+        .fetch_all(self.connection())
+        .await?;
+        deployments(ended)
+    }
+
+    async fn raise_generations(&mut self, robots: &[RobotId]) -> Result<(), StoreError> {
+        for group in groups(robots) {
+            let sql = format!(
+                "WITH v (id) AS ({}) UPDATE robots SET generation = generation + 1 FROM v WHERE robots.id = v.id",
+                values(1, group.len(), &["TEXT"])
+            );
+            let mut query = sqlx::query(AssertSqlSafe(sql));
+            for robot in group {
+                query = query.bind(robot.as_str());
+            }
+            query.execute(self.connection()).await?;
+        }
+        Ok(())
+    }
+}
+
+fn revocable(row: sqlx::any::AnyRow) -> Result<Revocable, StoreError> {
+    let previous: Option<String> = row.try_get("previous")?;
+    Ok(Revocable {
+        deployment: id("assignments.deployment_id", row.try_get("deployment_id")?)?,
+        robot: id("assignments.robot_id", row.try_get("robot_id")?)?,
+        desired: row.try_get::<i64, _>("desired")? == 1,
+        previous: previous.map(|previous| id("assignments.previous", &previous)).transpose()?,
+    })
+}
+
+fn deployments(rows: Vec<String>) -> Result<BTreeSet<DeploymentId>, StoreError> {
+    let distinct: BTreeSet<String> = rows.into_iter().collect();
+    distinct.iter().map(|row| id("assignments.deployment_id", row)).collect()
 }

@@ -3,6 +3,7 @@
 
 #![expect(clippy::disallowed_methods, reason = "SQL is at home here")]
 
+mod adoption;
 mod assignments;
 mod deployments;
 mod migrate;
@@ -19,9 +20,13 @@ use std::time::Duration;
 use sqlx::any::{Any, AnyPoolOptions};
 use sqlx::{AnyConnection, AnyPool, Transaction};
 
-pub use assignments::TaskOrder;
+pub use assignments::{Released, Revocable, TaskOrder};
+pub use deployments::{DeploymentStatus, NewDeployment};
+pub use orders::PastOrder;
 pub use packages::{NewManifest, PutManifest, Reference, StoredManifest};
-pub use tokens::TokenHolder;
+pub use reports::{OpenAssignment, ReportedRobot};
+pub use robots::{DesiredTasks, KnownRobot};
+pub use tokens::{EnrolmentTerms, TokenHolder};
 
 /// Connections that read at the same time.
 const READERS: u32 = 4;

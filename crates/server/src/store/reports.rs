@@ -1,1 +1,165 @@
-//! Reports: a batch read and written at a time.
+//! Reports: what is known about a batch of robots, read at once, and what they said, written at once.
+
+use sqlx::{AssertSqlSafe, Row as _};
+use task_proto::id::Labels;
+use task_proto::manifest::TaskKind;
+use task_proto::report::{Phase, Report};
+use task_proto::{DeploymentId, Generation, RobotId, RobotName};
+
+use super::rows::{from_json, from_optional_json, from_word, groups, id, json, number, stored, values};
+use super::{StoreError, Write};
+use crate::deployment::Standing;
+
+/// The highest generation a robot is believed. Beyond it a made-up one would leave no room above it.
+const MAX_GENERATION: Generation = Generation(1 << 53);
+
+/// A robot that has reported, as it is stored.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ReportedRobot {
+    /// Its identity.
+    pub id: RobotId,
+    /// Its name here.
+    pub name: RobotName,
+    /// Its labels here.
+    pub labels: Labels,
+    /// The generation it should have.
+    pub generation: Generation,
+    /// Start and number of its last report.
+    pub last_report: (u64, u64),
+}
+
+/// A released assignment that has not ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct OpenAssignment {
+    /// The order.
+    pub deployment: DeploymentId,
+    /// The robot.
+    pub robot: RobotId,
+    /// Service or job.
+    pub kind: TaskKind,
+    /// The generation in which it was taken out of the desired state.
+    pub removed: Option<Generation>,
+    /// Where it stands.
+    pub standing: Standing,
+}
+
+impl Write {
+    /// Those of `robots` that are registered.
+    pub async fn reported_robots(&mut self, robots: &[RobotId]) -> Result<Vec<ReportedRobot>, StoreError> {
+        let mut found = Vec::with_capacity(robots.len());
+        for group in groups(robots) {
+            let sql = format!(
+                "WITH v (id) AS ({})
+                 SELECT r.id, r.name, r.labels, r.generation, r.report_start, r.report_seq
+                 FROM v JOIN robots r ON r.id = v.id WHERE r.removed_at_ms IS NULL",
+                values(1, group.len(), &["TEXT"])
+            );
+            let mut query = sqlx::query(AssertSqlSafe(sql));
+            for robot in group {
+                query = query.bind(robot.as_str());
+            }
+            for row in query.fetch_all(self.connection()).await? {
+                found.push(ReportedRobot {
+                    id: id("robots.id", row.try_get("id")?)?,
+                    name: id("robots.name", row.try_get("name")?)?,
+                    labels: from_json("robots.labels", row.try_get("labels")?)?,
+                    generation: Generation(number(row.try_get("generation")?)),
+                    last_report: (number(row.try_get("report_start")?), number(row.try_get("report_seq")?)),
+                });
+            }
+        }
+        Ok(found)
+    }
+
+    /// The released assignments of `robots` that have not ended.
+    pub async fn open_assignments(&mut self, robots: &[RobotId]) -> Result<Vec<OpenAssignment>, StoreError> {
+        let mut found = Vec::with_capacity(robots.len());
+        for group in groups(robots) {
+            let sql = format!(
+                "WITH v (id) AS ({})
+                 SELECT a.deployment_id, a.robot_id, d.kind, a.run, a.phase, a.progress, a.failure, a.attempts,
+                     a.removed_generation
+                 FROM v JOIN assignments a ON a.robot_id = v.id JOIN deployments d ON d.id = a.deployment_id
+                 WHERE a.ended = 0 AND a.released = 1",
+                values(1, group.len(), &["TEXT"])
+            );
+            let mut query = sqlx::query(AssertSqlSafe(sql));
+            for robot in group {
+                query = query.bind(robot.as_str());
+            }
+            for row in query.fetch_all(self.connection()).await? {
+                found.push(open_assignment(&row)?);
+            }
+        }
+        Ok(found)
+    }
+
+    /// Stores reports, at most one of each robot.
+    pub async fn store_reports(&mut self, reports: &[&Report], now_ms: u64) -> Result<(), StoreError> {
+        for group in groups(reports) {
+            let sql = format!(
+                "WITH v (id, start, seq, observed, report) AS ({})
+                 UPDATE robots SET report_start = v.start, report_seq = v.seq, observed_generation = v.observed,
+                     report = v.report, last_seen_ms = $1
+                 FROM v WHERE robots.id = v.id",
+                values(2, group.len(), &["TEXT", "BIGINT", "BIGINT", "BIGINT", "TEXT"])
+            );
+            let mut query = sqlx::query(AssertSqlSafe(sql)).bind(stored(now_ms));
+            for report in group {
+                query = query
+                    .bind(report.robot_id.as_str())
+                    .bind(stored(report.start))
+                    .bind(stored(report.seq))
+                    .bind(stored(report.observed_generation.min(MAX_GENERATION).0))
+                    .bind(json(report));
+            }
+            query.execute(self.connection()).await?;
+        }
+        Ok(())
+    }
+
+    /// Stores where assignments stand now. One that has run or ended does not expire any more.
+    pub async fn store_standings(&mut self, assignments: &[OpenAssignment], now_ms: u64) -> Result<(), StoreError> {
+        for group in groups(assignments) {
+            let sql = format!(
+                "WITH v (deployment_id, robot_id, phase, ended, progress, failure, attempts, reached) AS ({})
+                 UPDATE assignments SET phase = v.phase, ended = v.ended, progress = v.progress, failure = v.failure,
+                     attempts = v.attempts, updated_at_ms = $1,
+                     expires_at_ms = CASE v.reached WHEN 1 THEN NULL ELSE expires_at_ms END
+                 FROM v WHERE assignments.deployment_id = v.deployment_id AND assignments.robot_id = v.robot_id",
+                values(2, group.len(), &["TEXT", "TEXT", "TEXT", "BIGINT", "TEXT", "TEXT", "BIGINT", "BIGINT"])
+            );
+            let mut query = sqlx::query(AssertSqlSafe(sql)).bind(stored(now_ms));
+            for OpenAssignment { deployment, robot, standing, .. } in group {
+                let ended = standing.phase.is_final();
+                query = query
+                    .bind(deployment.as_str())
+                    .bind(robot.as_str())
+                    .bind(standing.phase.as_str())
+                    .bind(i64::from(ended))
+                    .bind(standing.progress.as_ref().map(json))
+                    .bind(standing.failure.as_ref().map(json))
+                    .bind(i64::from(standing.attempts))
+                    .bind(i64::from(ended || standing.phase == Phase::Running));
+            }
+            query.execute(self.connection()).await?;
+        }
+        Ok(())
+    }
+}
+
+fn open_assignment(row: &sqlx::any::AnyRow) -> Result<OpenAssignment, StoreError> {
+    Ok(OpenAssignment {
+        deployment: id("assignments.deployment_id", row.try_get("deployment_id")?)?,
+        robot: id("assignments.robot_id", row.try_get("robot_id")?)?,
+        kind: from_word("deployments.kind", row.try_get("kind")?)?,
+        removed: row.try_get::<Option<i64>, _>("removed_generation")?.map(|stored| Generation(number(stored))),
+        standing: Standing {
+            run: number(row.try_get("run")?),
+            phase: Phase::from_text(row.try_get("phase")?),
+            progress: from_optional_json("assignments.progress", row.try_get("progress")?)?,
+            failure: from_optional_json("assignments.failure", row.try_get("failure")?)?,
+            attempts: u32::try_from(row.try_get::<i64, _>("attempts")?).unwrap_or(u32::MAX),
+        },
+    })
+}

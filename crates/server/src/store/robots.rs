@@ -1,28 +1,329 @@
 //! Robots: who they are, and how the operator sees them.
 
-use task_proto::api::RobotView;
-use task_proto::{Digest, RobotId};
+use std::collections::HashMap;
 
-use super::{Store, StoreError};
+use sqlx::{AssertSqlSafe, Row as _};
+use task_proto::api::{RobotTask, RobotView};
+use task_proto::desired::{DesiredTask, PackageRef};
+use task_proto::id::Labels;
+use task_proto::report::{Condition, Phase, Report};
+use task_proto::selector::Selector;
+use task_proto::{Digest, Generation, MacAddress, RobotId, RobotName, TaskName};
+
+use super::rows::{from_json, from_optional_json, from_word, groups, id, json, number, stored, values};
+use super::{Store, StoreError, Write};
+
+/// Who a robot is.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct KnownRobot {
+    /// Its identity.
+    pub id: RobotId,
+    /// Its name.
+    pub name: RobotName,
+    /// The MAC it was registered by.
+    pub mac: MacAddress,
+    /// Its labels.
+    pub labels: Labels,
+}
+
+/// What a robot should have, read at one moment.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct DesiredTasks {
+    /// The number of this state.
+    pub generation: Generation,
+    /// The generation the robot last reported.
+    pub observed_generation: Generation,
+    /// Its tasks, sorted by name.
+    pub tasks: Vec<DesiredTask>,
+}
+
+const KNOWN: &str = "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL";
 
 impl Store {
     /// All robots, sorted by name. `online` and `address` are left empty: only presence knows them.
     pub async fn robots(&self) -> Result<Vec<RobotView>, StoreError> {
-        todo!()
+        let robots = sqlx::query(ROBOT_ROWS).fetch_all(&self.reads).await?;
+        let tasks = sqlx::query(TASK_ROWS).fetch_all(&self.reads).await?;
+        robot_views(robots, tasks)
+    }
+
+    /// Those of `robots` that are registered, likewise.
+    pub async fn robots_among(&self, robots: &[RobotId]) -> Result<Vec<RobotView>, StoreError> {
+        let mut views = Vec::with_capacity(robots.len());
+        for group in groups(robots) {
+            let ids = values(1, group.len(), &["TEXT"]);
+            let mut robots = sqlx::query(AssertSqlSafe(format!("{ROBOT_ROWS} AND r.id IN ({ids})")));
+            let mut tasks = sqlx::query(AssertSqlSafe(format!("{TASK_ROWS} AND a.robot_id IN ({ids})")));
+            for robot in group {
+                robots = robots.bind(robot.as_str());
+                tasks = tasks.bind(robot.as_str());
+            }
+            views.extend(robot_views(robots.fetch_all(&self.reads).await?, tasks.fetch_all(&self.reads).await?)?);
+        }
+        views.sort_by(|one: &RobotView, other| one.name.cmp(&other.name));
+        Ok(views)
     }
 
     /// One robot; `None` if there is none or it was removed.
     pub async fn robot(&self, robot: &RobotId) -> Result<Option<RobotView>, StoreError> {
-        todo!()
+        Ok(self.robots_among(std::slice::from_ref(robot)).await?.pop())
     }
 
     /// The robot with this id or name.
     pub async fn find_robot(&self, id_or_name: &str) -> Result<Option<RobotId>, StoreError> {
-        todo!()
+        let found: Option<String> =
+            sqlx::query_scalar("SELECT id FROM robots WHERE removed_at_ms IS NULL AND (id = $1 OR name = $1)")
+                .bind(id_or_name)
+                .fetch_optional(&self.reads)
+                .await?;
+        found.map(|found| id("robots.id", &found)).transpose()
+    }
+
+    /// The robots that `selector` means now, sorted by name.
+    pub async fn matching_robots(&self, selector: &Selector) -> Result<Vec<KnownRobot>, StoreError> {
+        matching(sqlx::query(KNOWN).fetch_all(&self.reads).await?, selector)
+    }
+
+    /// The robots that should have `task`.
+    pub async fn robots_with_task(&self, task: &TaskName) -> Result<Vec<RobotId>, StoreError> {
+        let rows: Vec<String> = sqlx::query_scalar(WITH_TASK).bind(task.as_str()).fetch_all(&self.reads).await?;
+        rows.iter().map(|row| id("assignments.robot_id", row)).collect()
+    }
+
+    /// The generation `robot` should have and the one it last reported; `None` if there is no such robot.
+    pub async fn generations(&self, robot: &RobotId) -> Result<Option<(Generation, Generation)>, StoreError> {
+        let row: Option<(i64, i64)> = sqlx::query_as(
+            "SELECT generation, observed_generation FROM robots WHERE id = $1 AND removed_at_ms IS NULL",
+        )
+        .bind(robot.as_str())
+        .fetch_optional(&self.reads)
+        .await?;
+        Ok(row.map(|(generation, observed)| (Generation(number(generation)), Generation(number(observed)))))
+    }
+
+    /// What `robot` should have; `None` if there is no such robot.
+    pub async fn desired_tasks(&self, robot: &RobotId) -> Result<Option<DesiredTasks>, StoreError> {
+        // One statement, so that generation and tasks belong together.
+        let rows = sqlx::query(
+            "SELECT r.generation, r.observed_generation, a.task, a.deployment_id, a.wanted, a.run, d.package, d.delivery
+             FROM robots r
+             LEFT JOIN assignments a ON a.robot_id = r.id AND a.desired = 1
+             LEFT JOIN deployments d ON d.id = a.deployment_id
+             WHERE r.id = $1 AND r.removed_at_ms IS NULL ORDER BY a.task",
+        )
+        .bind(robot.as_str())
+        .fetch_all(&self.reads)
+        .await?;
+        let Some(first) = rows.first() else { return Ok(None) };
+        let generation = Generation(number(first.try_get("generation")?));
+        let observed_generation = Generation(number(first.try_get("observed_generation")?));
+        let tasks = rows.iter().map(desired_task).filter_map(Result::transpose).collect::<Result<_, _>>()?;
+        Ok(Some(DesiredTasks { generation, observed_generation, tasks }))
     }
 
     /// Whether `digest` belongs to a package that `robot` should have.
     pub async fn may_fetch(&self, robot: &RobotId, digest: &Digest) -> Result<bool, StoreError> {
-        todo!()
+        let packages: Vec<String> = sqlx::query_scalar(
+            "SELECT d.package FROM assignments a JOIN deployments d ON d.id = a.deployment_id
+             WHERE a.robot_id = $1 AND a.desired = 1",
+        )
+        .bind(robot.as_str())
+        .fetch_all(&self.reads)
+        .await?;
+        for package in packages {
+            let package: PackageRef = from_json("deployments.package", &package)?;
+            if [package.manifest, package.config, package.content].iter().any(|blob| blob.digest == *digest) {
+                return Ok(true);
+            }
+        }
+        Ok(false)
     }
+}
+
+impl Write {
+    /// The robots that `selector` means now, sorted by name.
+    pub async fn matching_robots(&mut self, selector: &Selector) -> Result<Vec<KnownRobot>, StoreError> {
+        matching(sqlx::query(KNOWN).fetch_all(self.connection()).await?, selector)
+    }
+
+    /// The robots that should have `task`.
+    pub async fn robots_with_task(&mut self, task: &TaskName) -> Result<Vec<RobotId>, StoreError> {
+        let rows: Vec<String> = sqlx::query_scalar(WITH_TASK).bind(task.as_str()).fetch_all(self.connection()).await?;
+        rows.iter().map(|row| id("assignments.robot_id", row)).collect()
+    }
+
+    /// The robot registered by `mac`.
+    pub async fn robot_by_mac(&mut self, mac: &MacAddress) -> Result<Option<KnownRobot>, StoreError> {
+        let row = sqlx::query("SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL AND mac = $1")
+            .bind(mac.to_string())
+            .fetch_optional(self.connection())
+            .await?;
+        row.map(|row| known_robot(&row)).transpose()
+    }
+
+    /// The robot with this id or name.
+    pub async fn known_robot(&mut self, id_or_name: &str) -> Result<Option<KnownRobot>, StoreError> {
+        let row = sqlx::query(
+            "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL AND (id = $1 OR name = $1)",
+        )
+        .bind(id_or_name)
+        .fetch_optional(self.connection())
+        .await?;
+        row.map(|row| known_robot(&row)).transpose()
+    }
+
+    /// Registers a robot.
+    pub async fn insert_robot(&mut self, robot: &KnownRobot, now_ms: u64) -> Result<(), StoreError> {
+        sqlx::query("INSERT INTO robots (id, name, mac, labels, enrolled_at_ms) VALUES ($1, $2, $3, $4, $5)")
+            .bind(robot.id.as_str())
+            .bind(robot.name.as_str())
+            .bind(robot.mac.to_string())
+            .bind(json(&robot.labels))
+            .bind(stored(now_ms))
+            .execute(self.connection())
+            .await?;
+        Ok(())
+    }
+
+    /// Stores a robot's name and labels.
+    pub async fn update_robot(&mut self, robot: &KnownRobot) -> Result<(), StoreError> {
+        sqlx::query("UPDATE robots SET name = $2, labels = $3 WHERE id = $1")
+            .bind(robot.id.as_str())
+            .bind(robot.name.as_str())
+            .bind(json(&robot.labels))
+            .execute(self.connection())
+            .await?;
+        Ok(())
+    }
+
+    /// Forgets what a robot has reported: it registers again, perhaps with an empty disk, and counts from 1.
+    pub async fn forget_report(&mut self, robot: &RobotId) -> Result<(), StoreError> {
+        sqlx::query(
+            "UPDATE robots SET report_start = 0, report_seq = 0, observed_generation = 0, report = NULL WHERE id = $1",
+        )
+        .bind(robot.as_str())
+        .execute(self.connection())
+        .await?;
+        Ok(())
+    }
+
+    /// Marks a robot as removed: its MAC and name are free, its id is not.
+    pub async fn remove_robot(&mut self, robot: &RobotId, now_ms: u64) -> Result<(), StoreError> {
+        sqlx::query("UPDATE robots SET removed_at_ms = $2, report = NULL WHERE id = $1")
+            .bind(robot.as_str())
+            .bind(stored(now_ms))
+            .execute(self.connection())
+            .await?;
+        Ok(())
+    }
+}
+
+const WITH_TASK: &str = "SELECT robot_id FROM assignments WHERE task = $1 AND desired = 1";
+
+const ROBOT_ROWS: &str = "SELECT r.id, r.name, r.mac, r.labels, r.enrolled_at_ms, r.generation, r.observed_generation,
+         r.report, r.last_seen_ms
+     FROM robots r WHERE r.removed_at_ms IS NULL";
+
+/// What each robot should have, and what it is still getting rid of.
+const TASK_ROWS: &str = "SELECT a.robot_id, a.task, a.deployment_id, a.wanted, a.run, a.phase, a.progress, a.failure,
+         d.version
+     FROM assignments a JOIN deployments d ON d.id = a.deployment_id
+     WHERE (a.desired = 1 OR (a.ended = 0 AND a.released = 1))";
+
+fn matching(rows: Vec<sqlx::any::AnyRow>, selector: &Selector) -> Result<Vec<KnownRobot>, StoreError> {
+    let mut robots = rows.iter().map(known_robot).collect::<Result<Vec<_>, _>>()?;
+    robots.retain(|robot| selector.matches(&robot.id, &robot.name, &robot.labels));
+    robots.sort_by(|one, other| one.name.cmp(&other.name));
+    Ok(robots)
+}
+
+fn known_robot(row: &sqlx::any::AnyRow) -> Result<KnownRobot, StoreError> {
+    Ok(KnownRobot {
+        id: id("robots.id", row.try_get("id")?)?,
+        name: id("robots.name", row.try_get("name")?)?,
+        mac: id("robots.mac", row.try_get("mac")?)?,
+        labels: from_json("robots.labels", row.try_get("labels")?)?,
+    })
+}
+
+fn desired_task(row: &sqlx::any::AnyRow) -> Result<Option<DesiredTask>, StoreError> {
+    let Some(task) = row.try_get::<Option<String>, _>("task")? else { return Ok(None) };
+    Ok(Some(DesiredTask {
+        task: id("assignments.task", &task)?,
+        deployment: id("assignments.deployment_id", row.try_get("deployment_id")?)?,
+        package: from_json("deployments.package", row.try_get("package")?)?,
+        wanted: from_word("assignments.wanted", row.try_get("wanted")?)?,
+        run: number(row.try_get("run")?),
+        delivery: from_word("deployments.delivery", row.try_get("delivery")?)?,
+    }))
+}
+
+fn robot_views(robots: Vec<sqlx::any::AnyRow>, tasks: Vec<sqlx::any::AnyRow>) -> Result<Vec<RobotView>, StoreError> {
+    let mut tasks_of: HashMap<String, Vec<RobotTask>> = HashMap::new();
+    for row in &tasks {
+        tasks_of.entry(row.try_get("robot_id")?).or_default().push(robot_task(row)?);
+    }
+    let mut views = Vec::with_capacity(robots.len());
+    for row in &robots {
+        let id: String = row.try_get("id")?;
+        views.push(robot_view(row, tasks_of.remove(&id).unwrap_or_default())?);
+    }
+    views.sort_by(|one, other| one.name.cmp(&other.name));
+    Ok(views)
+}
+
+fn robot_view(row: &sqlx::any::AnyRow, mut tasks: Vec<RobotTask>) -> Result<RobotView, StoreError> {
+    let report: Option<Report> = from_optional_json("robots.report", row.try_get("report")?)?;
+    let generation = Generation(number(row.try_get("generation")?));
+    let observed_generation = Generation(number(row.try_get("observed_generation")?));
+    let mut conditions = Vec::new();
+    if observed_generation > generation {
+        let text = format!(
+            "it reports generation {observed_generation}, the server knows {generation}; left alone until its next order"
+        );
+        conditions.push(Condition { code: "diverged".to_owned(), text });
+    }
+    let (mut host, mut reported) = (None, Vec::new());
+    if let Some(report) = report {
+        conditions.extend(report.conditions);
+        host = Some(report.host);
+        reported = report.tasks;
+    }
+    tasks.sort_by(|one, other| one.task.cmp(&other.task));
+    for task in &mut tasks {
+        if let Some(said) = reported.iter_mut().find(|said| said.task == task.task) {
+            task.active = said.active.take();
+            task.restarts = if said.deployment == task.deployment { said.restarts } else { 0 };
+        }
+    }
+    Ok(RobotView {
+        id: id("robots.id", row.try_get("id")?)?,
+        name: id("robots.name", row.try_get("name")?)?,
+        mac: id("robots.mac", row.try_get("mac")?)?,
+        labels: from_json("robots.labels", row.try_get("labels")?)?,
+        online: false,
+        address: None,
+        last_seen_ms: row.try_get::<Option<i64>, _>("last_seen_ms")?.map(number),
+        enrolled_at_ms: number(row.try_get("enrolled_at_ms")?),
+        generation,
+        observed_generation,
+        conditions,
+        host,
+        tasks,
+    })
+}
+
+fn robot_task(row: &sqlx::any::AnyRow) -> Result<RobotTask, StoreError> {
+    Ok(RobotTask {
+        task: id("assignments.task", row.try_get("task")?)?,
+        version: id("deployments.version", row.try_get("version")?)?,
+        deployment: id("assignments.deployment_id", row.try_get("deployment_id")?)?,
+        wanted: from_word("assignments.wanted", row.try_get("wanted")?)?,
+        run: number(row.try_get("run")?),
+        phase: Phase::from_text(row.try_get("phase")?),
+        progress: from_optional_json("assignments.progress", row.try_get("progress")?)?,
+        failure: from_optional_json("assignments.failure", row.try_get("failure")?)?,
+        active: None,
+        restarts: 0,
+    })
 }

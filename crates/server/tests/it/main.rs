@@ -1,4 +1,7 @@
 //! Integration tests of the server, all in one binary.
 
+mod database;
+mod fleet;
 mod mqtt;
 mod mqtt_harness;
+mod story;

@@ -1,0 +1,36 @@
+//! Moves rollouts on, inside the write that may have settled something: carries out what [`crate::rollout`] decides.
+
+use std::collections::BTreeSet;
+
+use task_proto::DeploymentId;
+
+use crate::changes::Consequences;
+use crate::rollout::{Move, next_move};
+use crate::store::{StoreError, Write};
+
+/// Begins the next batch of each of `touched` that is due, or pauses it. A batch that takes another deployment's place on
+/// some robot may settle that one's batch, so that one is looked at as well.
+pub async fn advance(
+    write: &mut Write,
+    touched: BTreeSet<DeploymentId>,
+    now_ms: u64,
+    consequences: &mut Consequences,
+) -> Result<(), StoreError> {
+    let mut waiting = touched;
+    // Ends, because each turn but the last of a deployment releases an assignment, and none is ever taken back.
+    while let Some(deployment) = waiting.pop_first() {
+        let Some((rollout, tally)) = write.rollout(&deployment).await? else { continue };
+        match next_move(&rollout, &tally) {
+            Move::Wait => continue,
+            Move::Pause => write.pause(&deployment).await?,
+            Move::Release(count) => {
+                let released = write.release(&deployment, count, now_ms).await?;
+                consequences.deployments.extend(released.superseded.iter().cloned());
+                consequences.rings.extend(released.robots);
+                waiting.extend(released.superseded);
+            }
+        }
+        consequences.deployments.insert(deployment);
+    }
+    Ok(())
+}

@@ -1,0 +1,164 @@
+//! What may become of an assignment and of a deployment as a whole. Functions of values; nothing is read or stored here.
+//!
+//! ```text
+//!             report            report             report
+//! assigned ──────────► … ──────────────► running ──────────► succeeded | failed | stopped | unmet | rolled_back
+//!    │                 │                    │
+//!    └─────────────────┴────────────────────┴── an order or the clock ──► superseded | cancelled | expired
+//! ```
+//! A robot's word moves an assignment only forward out of a phase that is not final, and only within the run that was
+//! asked for; only an order begins a new run.
+
+use task_proto::Generation;
+use task_proto::api::{DeploymentState, PhaseCount};
+use task_proto::manifest::TaskKind;
+use task_proto::report::{Failure, Phase, Progress, TaskReport};
+
+/// Where one assignment stands.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Standing {
+    /// How often it was asked to start.
+    pub run: u64,
+    /// The phase of that run.
+    pub phase: Phase,
+    /// How far the phase has come.
+    pub progress: Option<Progress>,
+    /// Why it failed.
+    pub failure: Option<Failure>,
+    /// Tries of the phase.
+    pub attempts: u32,
+}
+
+impl Standing {
+    /// Where it stands once the robot has said `report`; `None` if that changes nothing.
+    pub fn after(&self, report: &TaskReport) -> Option<Self> {
+        if self.phase.is_final() || report.run != self.run || !is_robots_word(report.phase) {
+            return None;
+        }
+        let next = Self {
+            run: self.run,
+            phase: report.phase,
+            progress: report.progress,
+            // Made anew, because a robot's text is not yet free of control characters.
+            failure: report.failure.clone().map(|failure| Failure::new(failure.code, failure.text)),
+            attempts: report.attempts,
+        };
+        (next != *self).then_some(next)
+    }
+
+    /// Where it stands once a robot that accepted `observed` no longer lists it, if it was taken out of the desired state
+    /// in generation `removed`: it has been stopped.
+    pub fn after_absence(&self, removed: Option<Generation>, observed: Generation) -> Option<Self> {
+        let gone = !self.phase.is_final() && removed.is_some_and(|removed| observed >= removed);
+        gone.then(|| Self { phase: Phase::Stopped, progress: None, failure: None, ..self.clone() })
+    }
+}
+
+/// Whether the phase is one that a robot may report; the others only the server sets.
+fn is_robots_word(phase: Phase) -> bool {
+    !matches!(phase, Phase::Superseded | Phase::Cancelled | Phase::Expired | Phase::Unknown)
+}
+
+/// Whether `phase`, in which an order for a `kind` has settled, counts against the rollout. What an operator ended does
+/// not.
+pub fn is_failure(phase: Phase, kind: TaskKind) -> bool {
+    phase.is_settled(kind)
+        && !phase.is_success(kind)
+        && !matches!(phase, Phase::Superseded | Phase::Cancelled | Phase::Stopped)
+}
+
+/// Where a deployment stands as a whole.
+pub fn state(kind: TaskKind, cancelled: bool, paused: bool, counts: &[PhaseCount]) -> DeploymentState {
+    if cancelled {
+        DeploymentState::Cancelled
+    } else if counts.iter().all(|count| count.phase.is_settled(kind)) {
+        DeploymentState::Settled
+    } else if paused {
+        DeploymentState::Paused
+    } else {
+        DeploymentState::Active
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use task_proto::desired::{BlobRef, PackageRef, Wanted};
+    use task_proto::report::FailureCode;
+    use task_proto::{DeploymentId, Digest};
+
+    use super::*;
+
+    fn standing(run: u64, phase: Phase) -> Standing {
+        Standing { run, phase, progress: None, failure: None, attempts: 0 }
+    }
+
+    fn report(run: u64, phase: Phase) -> TaskReport {
+        let blob = BlobRef { digest: Digest::of(b""), size: 0 };
+        TaskReport {
+            task: "talker".parse().expect("valid"),
+            deployment: DeploymentId::random(),
+            package: PackageRef {
+                name: "talker".parse().expect("valid"),
+                version: "1".parse().expect("valid"),
+                manifest: blob,
+                config: blob,
+                content: blob,
+            },
+            wanted: Wanted::Running,
+            run,
+            kind: None,
+            phase,
+            phase_ms: 0,
+            progress: None,
+            attempts: 0,
+            restarts: 0,
+            failure: None,
+            active: None,
+        }
+    }
+
+    fn any_phase() -> impl Strategy<Value = Phase> {
+        proptest::sample::select(Phase::ALL.to_vec())
+    }
+
+    proptest! {
+        #[test]
+        fn a_final_phase_is_never_left_by_a_report(from in any_phase(), to in any_phase(), run in 1u64..4, said in 1u64..4) {
+            let next = standing(run, from).after(&report(said, to));
+            if from.is_final() || run != said {
+                prop_assert_eq!(next, None);
+            } else if let Some(next) = next {
+                prop_assert_eq!(next.phase, to);
+                prop_assert!(is_robots_word(to));
+            }
+        }
+
+        #[test]
+        fn absence_stops_only_what_was_removed(from in any_phase(), removed in proptest::option::of(0u64..5), observed in 0u64..5) {
+            let next = standing(1, from).after_absence(removed.map(Generation), Generation(observed));
+            let gone = !from.is_final() && removed.is_some_and(|removed| removed <= observed);
+            prop_assert_eq!(next.map(|next| next.phase), gone.then_some(Phase::Stopped));
+        }
+    }
+
+    #[test]
+    fn a_failure_from_a_robot_is_cleaned() {
+        let mut said = report(1, Phase::Failed);
+        said.failure = Some(Failure { code: FailureCode::BUILD_FAILED, text: "a\u{1b}[31mb".to_owned() });
+        let failure = standing(1, Phase::Building).after(&said).and_then(|next| next.failure).expect("failed");
+        assert_eq!(failure.text, "a [31mb");
+    }
+
+    #[test]
+    fn the_whole_settles_with_its_last_part() {
+        let count = |phase, count| PhaseCount { phase, count };
+        let open = [count(Phase::Running, 3), count(Phase::Assigned, 1)];
+        let done = [count(Phase::Running, 3), count(Phase::Failed, 1)];
+        assert_eq!(state(TaskKind::Service, false, false, &open), DeploymentState::Active);
+        assert_eq!(state(TaskKind::Service, false, true, &open), DeploymentState::Paused);
+        assert_eq!(state(TaskKind::Service, false, true, &done), DeploymentState::Settled);
+        assert_eq!(state(TaskKind::Job, false, false, &done), DeploymentState::Active);
+        assert_eq!(state(TaskKind::Service, true, false, &open), DeploymentState::Cancelled);
+    }
+}

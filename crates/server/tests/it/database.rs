@@ -1,0 +1,56 @@
+//! A fresh database for each test, on SQLite and on Postgres.
+
+#![expect(clippy::disallowed_methods, reason = "making a test's database takes SQL")]
+
+use sqlx::Connection as _;
+use taskd::store::{Store, sqlite_url};
+
+/// An empty, migrated database of one test.
+pub struct TestDatabase {
+    pub store: Store,
+    /// Where it is, to open it again.
+    pub url: String,
+    /// Removed with the test.
+    _directory: Option<tempfile::TempDir>,
+}
+
+pub async fn sqlite() -> TestDatabase {
+    let directory = tempfile::tempdir().expect("temporary directory");
+    let url = sqlite_url(&directory.path().join("taskd.db"));
+    TestDatabase { store: Store::open(&url).await.expect("opens"), url, _directory: Some(directory) }
+}
+
+pub async fn postgres() -> TestDatabase {
+    let Ok(server) = std::env::var("TASKD_TEST_POSTGRES") else {
+        panic!(
+            "TASKD_TEST_POSTGRES is not set: run ./scripts/test, which starts a Postgres for the tests, or set it to the \
+             URL of a server where databases may be created, for example postgres://postgres@127.0.0.1:5432"
+        );
+    };
+    let name = format!("taskd_test_{:016x}", rand::random::<u64>());
+    sqlx::any::install_default_drivers();
+    let mut connection =
+        sqlx::AnyConnection::connect(&format!("{server}/postgres")).await.expect("the test server answers");
+    let create = sqlx::AssertSqlSafe(format!("CREATE DATABASE {name}"));
+    sqlx::query(create).execute(&mut connection).await.expect("may create databases");
+    connection.close().await.expect("closes");
+    let url = format!("{server}/{name}");
+    TestDatabase { store: Store::open(&url).await.expect("opens"), url, _directory: None }
+}
+
+/// Runs each of the async functions, which take a [`TestDatabase`], as one test on each database.
+macro_rules! on_both_databases {
+    ($($story:ident),* $(,)?) => {
+        mod sqlite {
+            $(#[tokio::test(flavor = "multi_thread")] async fn $story() {
+                super::$story(crate::database::sqlite().await).await;
+            })*
+        }
+        mod postgres {
+            $(#[tokio::test(flavor = "multi_thread")] async fn $story() {
+                super::$story(crate::database::postgres().await).await;
+            })*
+        }
+    };
+}
+pub(crate) use on_both_databases;

@@ -1,0 +1,200 @@
+//! A fleet without a network: orders and reports go straight to the store, and robots are values.
+
+use std::collections::BTreeMap;
+
+use task_proto::api::{CreateDeployment, CreateEnrollmentToken, DeploymentView, EnrollRequest, PackageView, RobotView};
+use task_proto::desired::{BlobRef, Delivery, DesiredState, DesiredTask, PackageRef};
+use task_proto::envelope::{DESIRED_STATE_TYPE, SigningKey};
+use task_proto::manifest::{TaskKind, TaskManifest};
+use task_proto::report::{HostFacts, Phase, Report, TaskReport};
+use task_proto::{DeploymentId, Digest, Generation, InstanceId, MacAddress, RobotId};
+use taskd::actions::{ActionError, ActionSettings, Actions, Enrolled, IdempotencyKey};
+use taskd::changes::Changes;
+use taskd::clock::Clock;
+use taskd::report_writer::ReportWriter;
+
+use crate::database::TestDatabase;
+
+const SEED: [u8; 32] = [7; 32];
+
+/// A server's inner half with a clock that stands still.
+pub struct Fleet {
+    pub database: TestDatabase,
+    pub actions: Actions,
+    pub writer: ReportWriter,
+    pub clock: Clock,
+    pub changes: Changes,
+}
+
+/// A robot's own view: what it has accepted and what it says.
+pub struct Robot {
+    pub id: RobotId,
+    start: u64,
+    seq: u64,
+    pub observed: Generation,
+    pub tasks: BTreeMap<String, TaskReport>,
+}
+
+impl Fleet {
+    pub fn new(database: TestDatabase) -> Self {
+        let (clock, changes) = (Clock::fixed(1_000_000), Changes::new());
+        let (writer, _) = ReportWriter::start(database.store.clone(), clock.clone(), changes.clone());
+        let key = SigningKey::from_bytes(SEED);
+        let settings = ActionSettings::default();
+        let actions = Actions::new(database.store.clone(), clock.clone(), changes.clone(), key, settings);
+        Self { database, actions, writer, clock, changes }
+    }
+
+    pub async fn enrolment_token(&self, order: CreateEnrollmentToken) -> task_proto::token::Token {
+        let made = self.actions.create_enrollment_token(&order).await.expect("a token");
+        made.token.parse().expect("a token")
+    }
+
+    pub async fn try_enroll(
+        &self,
+        token: &task_proto::token::Token,
+        mac: MacAddress,
+        name: Option<&str>,
+    ) -> Result<Enrolled, ActionError> {
+        let name = name.map(|name| name.parse().expect("a name"));
+        self.actions.enroll(token, &EnrollRequest { mac, name, labels: BTreeMap::new() }).await
+    }
+
+    /// Registers `count` robots named `r0`, `r1`, …
+    pub async fn enroll(&self, count: u32) -> Vec<Robot> {
+        let token = self.enrolment_token(CreateEnrollmentToken::default()).await;
+        let mut robots = Vec::new();
+        for number in 0..count {
+            let enrolled = self.try_enroll(&token, mac(number), Some(&format!("r{number}"))).await.expect("enrols");
+            robots.push(Robot::new(enrolled.robot_id));
+        }
+        robots
+    }
+
+    pub async fn deploy(&self, version: &str, order: impl FnOnce(&mut CreateDeployment)) -> DeploymentId {
+        let package = package(version, TaskKind::Service);
+        let mut request = order_of(&package);
+        order(&mut request);
+        self.actions.create_deployment(&random_key(), &request, &package).await.expect("ordered")
+    }
+
+    pub async fn deployment(&self, id: &DeploymentId) -> DeploymentView {
+        self.database.store.deployment(id).await.expect("reads").expect("there")
+    }
+
+    pub async fn view(&self, robot: &Robot) -> RobotView {
+        self.database.store.robot(&robot.id).await.expect("reads").expect("there")
+    }
+
+    /// The phases of a deployment's assignments, by robot name.
+    pub async fn phases(&self, id: &DeploymentId) -> Vec<Phase> {
+        let view = self.deployment(id).await;
+        view.assignments.expect("asked for").into_iter().map(|assignment| assignment.phase).collect()
+    }
+
+    pub async fn desired(&self, robot: &Robot) -> Result<DesiredState, ActionError> {
+        let desired = self.actions.desired(&robot.id).await?;
+        let key = SigningKey::from_bytes(SEED).public_key();
+        let payload = desired.envelope.open(DESIRED_STATE_TYPE, &key).expect("signed by the server");
+        Ok(serde_json::from_slice(&payload).expect("a desired state"))
+    }
+
+    /// The robot takes its desired state, brings every task into `phase`, drops what is not desired, and reports.
+    pub async fn follow(&self, robot: &mut Robot, phase: Phase) {
+        let desired = self.desired(robot).await.expect("not withheld");
+        robot.accept(&desired, phase);
+        self.report(robot).await;
+    }
+
+    pub async fn report(&self, robot: &mut Robot) -> Generation {
+        self.writer.submit(robot.next_report()).await.expect("stored").generation
+    }
+}
+
+impl Robot {
+    pub fn new(id: RobotId) -> Self {
+        Self { id, start: 1, seq: 0, observed: Generation(0), tasks: BTreeMap::new() }
+    }
+
+    pub fn accept(&mut self, desired: &DesiredState, phase: Phase) {
+        self.observed = desired.generation;
+        let entry = |task: &DesiredTask| (task.task.to_string(), task_report(task, phase));
+        self.tasks = desired.tasks.iter().map(entry).collect();
+    }
+
+    pub fn next_report(&mut self) -> Report {
+        self.seq += 1;
+        Report {
+            robot_id: self.id.clone(),
+            start: self.start,
+            instance: InstanceId::random(),
+            boot_id: "boot".to_owned(),
+            seq: self.seq,
+            observed_generation: self.observed,
+            uptime_ms: 1,
+            host: HostFacts::default(),
+            conditions: Vec::new(),
+            tasks: self.tasks.values().cloned().collect(),
+        }
+    }
+}
+
+pub fn task_report(task: &DesiredTask, phase: Phase) -> TaskReport {
+    TaskReport {
+        task: task.task.clone(),
+        deployment: task.deployment.clone(),
+        package: task.package.clone(),
+        wanted: task.wanted,
+        run: task.run,
+        kind: None,
+        phase,
+        phase_ms: 0,
+        progress: None,
+        attempts: 1,
+        restarts: 0,
+        failure: None,
+        active: None,
+    }
+}
+
+pub fn mac(number: u32) -> MacAddress {
+    let [a, b, c, d] = number.to_be_bytes();
+    MacAddress::from_octets([2, 0, a, b, c, d.wrapping_add(1)]).expect("a MAC")
+}
+
+pub fn random_key() -> IdempotencyKey {
+    format!("{:032x}", rand::random::<u128>()).parse().expect("a key")
+}
+
+pub fn package(version: &str, kind: TaskKind) -> PackageView {
+    let blob = |what: &str| BlobRef { digest: Digest::of(format!("{what} {version}").as_bytes()), size: 1 };
+    let manifest: TaskManifest = serde_json::from_value(serde_json::json!({
+        "name": "talker", "version": version, "run": { "exec": ["true"], "kind": kind },
+        "content": { "tar_digest": blob("tar").digest, "tar_size": 1, "entries": 1 },
+    }))
+    .expect("a manifest");
+    PackageView {
+        package: PackageRef {
+            name: "talker".parse().expect("a name"),
+            version: version.parse().expect("a version"),
+            manifest: blob("manifest"),
+            config: blob("config"),
+            content: blob("content"),
+        },
+        pushed_at_ms: 0,
+        manifest,
+    }
+}
+
+pub fn order_of(package: &PackageView) -> CreateDeployment {
+    CreateDeployment {
+        package: package.package.name.clone(),
+        manifest: package.package.manifest.digest,
+        selector: "*".parse().expect("a selector"),
+        delivery: Delivery::default(),
+        batch: None,
+        max_failures: None,
+        expires_in_s: None,
+        dry_run: false,
+    }
+}

@@ -1,0 +1,431 @@
+//! One story of robots, orders and reports, told on every database.
+
+use std::collections::BTreeSet;
+
+use task_proto::Generation;
+use task_proto::api::{CreateEnrollmentToken, DeploymentState, EditRobot};
+use task_proto::desired::Wanted;
+use task_proto::manifest::TaskKind;
+use task_proto::report::Phase;
+use task_proto::token::{Token, TokenKind};
+use taskd::actions::{ActionError, Actions, TaskOrder};
+use taskd::report_writer::ReportError;
+use taskd::store::{Store, TokenHolder};
+
+use crate::database::{TestDatabase, on_both_databases};
+use crate::fleet::{Fleet, Robot, mac, order_of, package, random_key};
+
+on_both_databases! {
+    enrolment_gives_identities_by_mac,
+    tokens_stand_for_their_holder_until_they_end,
+    a_removed_robot_leaves_its_mac_and_name,
+    an_order_reaches_all_that_match_and_settles,
+    an_idempotency_key_orders_once,
+    racing_operators_leave_one_winner,
+    a_newer_deployment_supersedes_and_a_cancel_puts_back,
+    a_cancel_skips_what_was_cancelled_before,
+    batches_follow_each_other_and_failures_pause,
+    what_is_not_done_in_time_expires,
+    tasks_are_stopped_started_and_removed,
+    late_reports_change_nothing,
+    reports_at_once_are_all_acknowledged,
+    a_restored_database_leaves_robots_alone_until_the_next_order,
+    a_reopened_database_knows_everything,
+}
+
+fn code<T>(result: Result<T, ActionError>) -> &'static str {
+    result.err().expect("refused").code()
+}
+
+async fn enrolment_gives_identities_by_mac(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let labels = [("site".parse().expect("key"), "lab".parse().expect("value"))].into();
+    let token = fleet.enrolment_token(CreateEnrollmentToken { uses: Some(2), labels, ..Default::default() }).await;
+    let one = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("enrols");
+    assert_eq!(code(fleet.try_enroll(&token, mac(1), Some("other")).await), "mac_known");
+    assert_eq!(code(fleet.try_enroll(&token, mac(2), Some("atlas")).await), "name_taken");
+    let two = fleet.try_enroll(&token, mac(2), None).await.expect("enrols");
+    assert_eq!(code(fleet.try_enroll(&token, mac(3), None).await), "unauthorized");
+    assert_ne!(one.robot_id, two.robot_id);
+    let views = fleet.database.store.robots().await.expect("reads");
+    assert_eq!(views.iter().map(|view| view.name.as_str()).collect::<Vec<_>>(), ["atlas", two.name.as_str()]);
+    assert!(views.iter().all(|view| view.labels.len() == 1));
+    assert_eq!(fleet.database.store.find_robot("atlas").await.expect("reads"), Some(one.robot_id.clone()));
+
+    // With a token that was made for it, a robot comes back as itself; nobody else does.
+    let bound = CreateEnrollmentToken { robot: Some("atlas".to_owned()), ..Default::default() };
+    let bound = fleet.enrolment_token(bound).await;
+    assert_eq!(code(fleet.try_enroll(&bound, mac(9), None).await), "token_for_other_robot");
+    assert_eq!(code(fleet.try_enroll(&bound, mac(2), None).await), "mac_known");
+    let again = fleet.try_enroll(&bound, mac(1), Some("renamed")).await.expect("enrols");
+    assert_eq!((again.robot_id.clone(), again.name.as_str()), (one.robot_id.clone(), "atlas"));
+    let now_ms = fleet.clock.now_ms();
+    let store = &fleet.database.store;
+    assert_eq!(store.token_holder(&one.token, now_ms).await.expect("reads"), None);
+    let holder = store.token_holder(&again.token, now_ms).await.expect("reads");
+    assert_eq!(holder, Some(TokenHolder::Robot(one.robot_id)));
+}
+
+async fn tokens_stand_for_their_holder_until_they_end(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let store = &fleet.database.store;
+    let operator = Token::random(TokenKind::Operator);
+    let now_ms = fleet.clock.now_ms();
+    assert_eq!(store.token_holder(&operator, now_ms).await.expect("reads"), None);
+    store.create_operator_token(&operator, now_ms).await.expect("stored");
+    assert_eq!(store.token_holder(&operator, now_ms).await.expect("reads"), Some(TokenHolder::Operator));
+    let enrolment = fleet.enrolment_token(CreateEnrollmentToken { ttl_s: Some(60), ..Default::default() }).await;
+    assert_eq!(store.token_holder(&enrolment, now_ms).await.expect("reads"), Some(TokenHolder::Enrolment));
+    fleet.clock.advance_ms(60_000);
+    let now_ms = fleet.clock.now_ms();
+    assert_eq!(store.token_holder(&enrolment, now_ms).await.expect("reads"), None);
+    assert_eq!(code(fleet.try_enroll(&enrolment, mac(1), None).await), "unauthorized");
+    assert_eq!(code(fleet.try_enroll(&operator, mac(1), None).await), "unauthorized");
+    for ttl_s in [0, u64::MAX] {
+        let order = CreateEnrollmentToken { ttl_s: Some(ttl_s), ..Default::default() };
+        assert_eq!(code(fleet.actions.create_enrollment_token(&order).await), "invalid_request");
+    }
+}
+
+async fn a_removed_robot_leaves_its_mac_and_name(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let token = fleet.enrolment_token(CreateEnrollmentToken::default()).await;
+    let old = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("enrols");
+    let mut robot = Robot::new(old.robot_id.clone());
+    let deployment = fleet.deploy("1", |_| ()).await;
+    fleet.actions.remove_robot(&old.robot_id).await.expect("removed");
+    assert_eq!(fleet.phases(&deployment).await, [Phase::Cancelled]);
+    assert_eq!(code(fleet.actions.remove_robot(&old.robot_id).await), "not_found");
+    assert_eq!(code(fleet.actions.desired(&old.robot_id).await), "not_found");
+    let report = fleet.writer.submit(robot.next_report()).await;
+    assert!(matches!(report, Err(ReportError::RobotNotFound(_))));
+    let now_ms = fleet.clock.now_ms();
+    assert_eq!(fleet.database.store.token_holder(&old.token, now_ms).await.expect("reads"), None);
+    let new = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("both are free");
+    assert_ne!(new.robot_id, old.robot_id);
+    // A name that a selector could take for another robot's id is refused.
+    let edit = EditRobot { name: Some(old.robot_id.as_str().parse().expect("a name")), labels: None };
+    assert_eq!(code(fleet.actions.edit_robot(&new.robot_id, &edit).await), "invalid_request");
+}
+
+async fn an_order_reaches_all_that_match_and_settles(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let mut robots = fleet.enroll(3).await;
+    let nobody = order_of(&package("1", TaskKind::Service));
+    let nobody = task_proto::api::CreateDeployment { selector: "site=mars".parse().expect("valid"), ..nobody };
+    let refused = fleet.actions.create_deployment(&random_key(), &nobody, &package("1", TaskKind::Service)).await;
+    assert_eq!(code(refused), "no_robots_match");
+    let id = fleet.deploy("1", |order| order.selector = "r0,r2".parse().expect("valid")).await;
+    let rung: BTreeSet<_> = [robots[0].id.clone(), robots[2].id.clone()].into();
+    assert_eq!(fleet.changes.take_rings().await, rung);
+    assert_eq!(fleet.phases(&id).await, [Phase::Assigned, Phase::Assigned]);
+    assert_eq!(fleet.deployment(&id).await.state, DeploymentState::Active);
+    assert!(fleet.desired(&robots[1]).await.expect("state").tasks.is_empty());
+    let content = package("1", TaskKind::Service).package.content.digest;
+    let store = fleet.database.store.clone();
+    assert!(store.may_fetch(&robots[0].id, &content).await.expect("reads"));
+    assert!(!store.may_fetch(&robots[1].id, &content).await.expect("reads"));
+    for robot in [0, 2] {
+        fleet.follow(&mut robots[robot], Phase::Running).await;
+    }
+    let view = fleet.deployment(&id).await;
+    assert_eq!(view.state, DeploymentState::Settled);
+    assert_eq!(view.counts, [task_proto::api::PhaseCount { phase: Phase::Running, count: 2 }]);
+    let robot = fleet.view(&robots[0]).await;
+    assert_eq!((robot.generation, robot.observed_generation), (Generation(1), Generation(1)));
+    assert_eq!((robot.tasks[0].phase, robot.tasks[0].run), (Phase::Running, 1));
+    assert_eq!(store.packages_in_use().await.expect("reads").len(), 1);
+    assert_eq!(store.deployments().await.expect("reads").len(), 1);
+}
+
+async fn an_idempotency_key_orders_once(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    fleet.enroll(1).await;
+    let (key, package) = (random_key(), package("1", TaskKind::Service));
+    let order = order_of(&package);
+    let first = fleet.actions.create_deployment(&key, &order, &package).await.expect("ordered");
+    let again = fleet.actions.create_deployment(&key, &order, &package).await.expect("the same");
+    assert_eq!(first, again);
+    let other = task_proto::api::CreateDeployment { batch: Some(1), ..order };
+    let refused = fleet.actions.create_deployment(&key, &other, &package).await;
+    assert_eq!(code(refused), "idempotency_key_reused");
+    let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
+    let refused = fleet.actions.order_task(&key, TaskOrder::Stop, &task, &everyone).await;
+    assert_eq!(code(refused), "idempotency_key_reused");
+    assert_eq!(fleet.database.store.deployments().await.expect("reads").len(), 1);
+}
+
+async fn racing_operators_leave_one_winner(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let robots = fleet.enroll(5).await;
+    // A second server process on the same database would be as good a rival as a second operator.
+    let rival = Store::open(&fleet.database.url).await.expect("opens");
+    let key = task_proto::envelope::SigningKey::random();
+    let rival = Actions::new(rival, fleet.clock.clone(), fleet.changes.clone(), key, Default::default());
+    let mut orders = tokio::task::JoinSet::new();
+    for round in 0..50u32 {
+        let (keys, versions) = ([random_key(), random_key()], [format!("1.{round}"), format!("2.{round}")]);
+        for retry in 0..2 {
+            for (key, version) in keys.iter().zip(&versions) {
+                let actions = if retry == 0 { fleet.actions.clone() } else { rival.clone() };
+                let (key, package) = (key.clone(), package(version, TaskKind::Service));
+                orders.spawn(async move {
+                    let id = actions.create_deployment(&key, &order_of(&package), &package).await.expect("ordered");
+                    (key.to_string(), id)
+                });
+            }
+        }
+    }
+    let answers: BTreeSet<_> = orders.join_all().await.into_iter().collect();
+    let deployments: BTreeSet<_> = answers.iter().map(|(_, id)| id).collect();
+    assert_eq!((answers.len(), deployments.len()), (100, 100));
+    let mut winners = BTreeSet::new();
+    for robot in &robots {
+        let desired = fleet.desired(robot).await.expect("state");
+        assert_eq!((desired.generation, desired.tasks.len()), (Generation(100), 1));
+        winners.insert(desired.tasks[0].deployment.clone());
+    }
+    assert_eq!(winners.len(), 1);
+    let newest = fleet.database.store.deployments().await.expect("reads").remove(0);
+    assert_eq!(Some(&newest.id), winners.first());
+    assert_eq!(newest.supersedes.len(), 1);
+}
+
+async fn a_newer_deployment_supersedes_and_a_cancel_puts_back(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let mut robots = fleet.enroll(2).await;
+    let old = fleet.deploy("1", |_| ()).await;
+    for robot in &mut robots {
+        fleet.follow(robot, Phase::Running).await;
+    }
+    let new = fleet.deploy("2", |order| order.selector = "r0".parse().expect("valid")).await;
+    assert_eq!(fleet.deployment(&new).await.supersedes, std::slice::from_ref(&old));
+    assert_eq!(fleet.phases(&old).await, [Phase::Superseded, Phase::Running]);
+    let superseded_by = fleet.deployment(&old).await.assignments.expect("there").remove(0).superseded_by;
+    assert_eq!(superseded_by, Some(new.clone()));
+    fleet.follow(&mut robots[0], Phase::Fetching).await;
+    fleet.changes.take_rings().await;
+    fleet.actions.cancel_deployment(&new).await.expect("cancelled");
+    fleet.actions.cancel_deployment(&new).await.expect("again is harmless");
+    assert_eq!(fleet.changes.take_rings().await, [robots[0].id.clone()].into());
+    assert_eq!(fleet.deployment(&new).await.state, DeploymentState::Cancelled);
+    assert_eq!(fleet.phases(&new).await, [Phase::Cancelled]);
+    let desired = fleet.desired(&robots[0]).await.expect("state");
+    assert_eq!((&desired.tasks[0].deployment, desired.tasks[0].run), (&old, 1));
+    // What the robot still says of the cancelled one is late; what it says of the old one counts.
+    fleet.report(&mut robots[0]).await;
+    assert_eq!(fleet.phases(&new).await, [Phase::Cancelled]);
+    fleet.follow(&mut robots[0], Phase::Running).await;
+    assert_eq!(fleet.phases(&old).await, [Phase::Running, Phase::Running]);
+    assert!(fleet.deployment(&new).await.supersedes.is_empty());
+    // Without anything to put back, the task goes.
+    fleet.actions.cancel_deployment(&old).await.expect("cancelled");
+    assert!(fleet.desired(&robots[1]).await.expect("state").tasks.is_empty());
+    let unknown = task_proto::DeploymentId::random();
+    assert_eq!(code(fleet.actions.cancel_deployment(&unknown).await), "not_found");
+    assert_eq!(code(fleet.actions.resume_deployment(&old).await), "deployment_cancelled");
+}
+
+async fn a_cancel_skips_what_was_cancelled_before(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let robots = fleet.enroll(1).await;
+    let one = fleet.deploy("1", |_| ()).await;
+    let two = fleet.deploy("2", |_| ()).await;
+    let three = fleet.deploy("3", |_| ()).await;
+    fleet.actions.cancel_deployment(&two).await.expect("cancelled");
+    assert_eq!(fleet.desired(&robots[0]).await.expect("state").tasks[0].deployment, three);
+    fleet.actions.cancel_deployment(&three).await.expect("cancelled");
+    assert_eq!(fleet.desired(&robots[0]).await.expect("state").tasks[0].deployment, one);
+}
+
+async fn batches_follow_each_other_and_failures_pause(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let mut robots = fleet.enroll(6).await;
+    let id = fleet
+        .deploy("1", |order| {
+            order.batch = Some(2);
+            order.max_failures = Some(1);
+        })
+        .await;
+    let released = async || {
+        let assignments = fleet.deployment(&id).await.assignments.expect("there");
+        assignments.iter().filter(|assignment| assignment.released).count()
+    };
+    assert_eq!(fleet.changes.take_rings().await.len(), 2);
+    assert_eq!(released().await, 2);
+    fleet.follow(&mut robots[0], Phase::Running).await;
+    assert_eq!(released().await, 2);
+    fleet.follow(&mut robots[1], Phase::Failed).await;
+    assert_eq!(released().await, 4);
+    assert_eq!(fleet.changes.take_rings().await, [robots[2].id.clone(), robots[3].id.clone()].into());
+    fleet.follow(&mut robots[2], Phase::Failed).await;
+    assert_eq!(fleet.deployment(&id).await.state, DeploymentState::Paused);
+    fleet.follow(&mut robots[3], Phase::Running).await;
+    assert_eq!(released().await, 4);
+    fleet.actions.resume_deployment(&id).await.expect("resumed");
+    assert_eq!(released().await, 6);
+    fleet.follow(&mut robots[4], Phase::Running).await;
+    // A removed robot is not waited for.
+    fleet.actions.remove_robot(&robots[5].id).await.expect("removed");
+    assert_eq!(fleet.deployment(&id).await.state, DeploymentState::Settled);
+
+    // A newer order also takes the place of what still waits for its batch.
+    let slow = fleet.deploy("2", |order| order.batch = Some(1)).await;
+    let fast = fleet.deploy("3", |_| ()).await;
+    assert!(fleet.phases(&slow).await.iter().all(|phase| *phase == Phase::Superseded));
+    let desired = fleet.desired(&robots[4]).await.expect("state");
+    assert_eq!(desired.tasks[0].deployment, fast);
+}
+
+async fn what_is_not_done_in_time_expires(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let mut robots = fleet.enroll(2).await;
+    let old = fleet.deploy("1", |_| ()).await;
+    for robot in &mut robots {
+        fleet.follow(robot, Phase::Running).await;
+    }
+    let new = fleet.deploy("2", |order| order.expires_in_s = Some(60)).await;
+    fleet.follow(&mut robots[0], Phase::Running).await;
+    fleet.clock.advance_ms(59_999);
+    fleet.actions.expire().await.expect("done");
+    assert_eq!(fleet.phases(&new).await, [Phase::Running, Phase::Assigned]);
+    fleet.clock.advance_ms(1);
+    fleet.actions.expire().await.expect("done");
+    assert_eq!(fleet.phases(&new).await, [Phase::Running, Phase::Expired]);
+    assert_eq!(fleet.desired(&robots[1]).await.expect("state").tasks[0].deployment, old);
+    assert_eq!(fleet.deployment(&new).await.state, DeploymentState::Settled);
+    // Seven days by default; what has run stays.
+    fleet.clock.advance_ms(8 * 24 * 3_600_000);
+    fleet.actions.expire().await.expect("done");
+    assert_eq!(fleet.phases(&new).await, [Phase::Running, Phase::Expired]);
+}
+
+async fn tasks_are_stopped_started_and_removed(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let mut robots = fleet.enroll(2).await;
+    let id = fleet.deploy("1", |order| order.selector = "r0".parse().expect("valid")).await;
+    let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
+    let order = async |order| fleet.actions.order_task(&random_key(), order, &task, &everyone).await.expect("ordered");
+    fleet.follow(&mut robots[0], Phase::Running).await;
+
+    // A start of what runs changes nothing; who has no such task is left out.
+    let meant = order(TaskOrder::Start).await;
+    assert_eq!(meant.iter().map(|robot| robot.name.as_str()).collect::<Vec<_>>(), ["r0"]);
+    assert_eq!(fleet.view(&robots[0]).await.generation, Generation(1));
+
+    order(TaskOrder::Stop).await;
+    assert_eq!(fleet.desired(&robots[0]).await.expect("state").tasks[0].wanted, Wanted::Stopped);
+    assert_eq!(fleet.phases(&id).await, [Phase::Running]);
+    fleet.follow(&mut robots[0], Phase::Stopped).await;
+    assert_eq!(fleet.phases(&id).await, [Phase::Stopped]);
+
+    order(TaskOrder::Start).await;
+    let desired = fleet.desired(&robots[0]).await.expect("state").tasks.remove(0);
+    assert_eq!((desired.wanted, desired.run), (Wanted::Running, 2));
+    assert_eq!(fleet.phases(&id).await, [Phase::Assigned]);
+    // The stop of the first run is no word on the second.
+    fleet.report(&mut robots[0]).await;
+    assert_eq!(fleet.phases(&id).await, [Phase::Assigned]);
+    fleet.follow(&mut robots[0], Phase::Running).await;
+    assert_eq!(fleet.phases(&id).await, [Phase::Running]);
+
+    order(TaskOrder::Remove).await;
+    assert!(fleet.desired(&robots[0]).await.expect("state").tasks.is_empty());
+    // It is shown until the robot says that it is gone.
+    fleet.report(&mut robots[0]).await;
+    assert_eq!(fleet.view(&robots[0]).await.tasks.len(), 1);
+    fleet.follow(&mut robots[0], Phase::Running).await;
+    assert_eq!(fleet.phases(&id).await, [Phase::Stopped]);
+    assert!(fleet.view(&robots[0]).await.tasks.is_empty());
+    let refused = fleet.actions.order_task(&random_key(), TaskOrder::Stop, &task, &everyone).await;
+    assert_eq!(code(refused), "no_robots_match");
+}
+
+async fn late_reports_change_nothing(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let mut robots = fleet.enroll(1).await;
+    let id = fleet.deploy("1", |_| ()).await;
+    let robot = &mut robots[0];
+    let desired = fleet.desired(robot).await.expect("state");
+    robot.accept(&desired, Phase::Fetching);
+    let late = robot.next_report();
+    robot.accept(&desired, Phase::Running);
+    fleet.report(robot).await;
+    assert_eq!(fleet.writer.submit(late).await.expect("acknowledged").generation, Generation(1));
+    assert_eq!(fleet.phases(&id).await, [Phase::Running]);
+    robot.accept(&desired, Phase::Failed);
+    fleet.report(robot).await;
+    robot.accept(&desired, Phase::Running);
+    fleet.report(robot).await;
+    assert_eq!(fleet.phases(&id).await, [Phase::Failed]);
+}
+
+async fn reports_at_once_are_all_acknowledged(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let mut robots = fleet.enroll(20).await;
+    let id = fleet.deploy("1", |_| ()).await;
+    let mut submissions = tokio::task::JoinSet::new();
+    for robot in &mut robots {
+        let desired = fleet.desired(robot).await.expect("state");
+        for phase in [Phase::Fetching, Phase::Unpacking, Phase::Running] {
+            robot.accept(&desired, phase);
+            let (writer, report) = (fleet.writer.clone(), robot.next_report());
+            submissions.spawn(async move { writer.submit(report).await.expect("stored") });
+        }
+    }
+    assert_eq!(submissions.join_all().await.len(), 60);
+    assert!(fleet.phases(&id).await.iter().all(|phase| *phase == Phase::Running));
+}
+
+async fn a_restored_database_leaves_robots_alone_until_the_next_order(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let mut robots = fleet.enroll(2).await;
+    // The robots know three orders that this database has never seen.
+    let before = Fleet::new(crate::database::sqlite().await);
+    let mut elsewhere = before.enroll(1).await;
+    for version in ["1", "2", "3"] {
+        before.deploy(version, |_| ()).await;
+    }
+    let mut lost = before.desired(&elsewhere[0]).await.expect("state");
+    lost.tasks[0].run = 4;
+    elsewhere.clear();
+    for robot in &mut robots {
+        robot.accept(&lost, Phase::Running);
+        fleet.report(robot).await;
+    }
+    let view = fleet.view(&robots[0]).await;
+    assert_eq!(view.conditions[0].code, "diverged");
+    assert_eq!(code(fleet.desired(&robots[0]).await), "diverged");
+    fleet.actions.expire().await.expect("done");
+    assert_eq!(fleet.view(&robots[0]).await.generation, Generation(0));
+
+    let (task, first) = ("talker".parse().expect("valid"), "r0".parse().expect("valid"));
+    fleet.actions.order_task(&random_key(), TaskOrder::Stop, &task, &first).await.expect("ordered");
+    let desired = fleet.desired(&robots[0]).await.expect("not withheld any more");
+    assert_eq!((desired.generation, desired.tasks[0].run), (Generation(4), 4));
+    assert_eq!(desired.tasks[0].package, lost.tasks[0].package);
+    assert_eq!(desired.tasks[0].wanted, Wanted::Stopped);
+    assert_eq!(code(fleet.desired(&robots[1]).await), "diverged");
+
+    let next = fleet.deploy("4", |order| order.selector = "r1".parse().expect("valid")).await;
+    let desired = fleet.desired(&robots[1]).await.expect("not withheld any more");
+    assert_eq!((desired.generation, desired.tasks.len()), (Generation(4), 1));
+    assert_eq!(desired.tasks[0].deployment, next);
+    fleet.actions.cancel_deployment(&next).await.expect("cancelled");
+    assert_eq!(fleet.desired(&robots[1]).await.expect("state").tasks[0].deployment, lost.tasks[0].deployment);
+    assert!(fleet.view(&robots[1]).await.conditions.is_empty());
+}
+
+async fn a_reopened_database_knows_everything(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let mut robots = fleet.enroll(1).await;
+    let id = fleet.deploy("1", |_| ()).await;
+    fleet.follow(&mut robots[0], Phase::Running).await;
+    let before = fleet.view(&robots[0]).await;
+    fleet.database.store.close().await;
+    let store = Store::open(&fleet.database.url).await.expect("opens again");
+    assert_eq!(store.robot(&robots[0].id).await.expect("reads"), Some(before));
+    let deployment = store.deployment_summary(&id).await.expect("reads").expect("there");
+    assert_eq!(deployment.state, DeploymentState::Settled);
+    assert_eq!(deployment.assignments, None);
+}

@@ -56,8 +56,11 @@ pub struct Robot {
 }
 
 impl Robot {
-    /// The robot whose data is in `data`.
+    /// The robot whose data is in `data`. What an agent that died left half done there is removed.
     pub fn new(data: DataDir, fetcher: Fetcher, config: &Config, mac: MacAddress) -> Self {
+        if let Err(error) = clean(&data) {
+            tracing::warn!(error = %chain(&error), "what an earlier agent left half done can't be removed");
+        }
         let mut settings: BTreeMap<String, String> =
             ROS_VARIABLES.iter().filter_map(|name| Some(((*name).to_owned(), std::env::var(name).ok()?))).collect();
         settings.extend(config.ros_domain_id.map(|id| ("ROS_DOMAIN_ID".to_owned(), id.to_string())));
@@ -259,6 +262,16 @@ impl Effects for Robot {
         let task = self.data.task(task);
         on_disk(move || task.remove()).await
     }
+}
+
+/// Removes half-done trees, and the gathered bytes of packages that are no longer ordered.
+fn clean(data: &DataDir) -> std::io::Result<()> {
+    data.clean_leftovers()?;
+    // A ledger that can't be read says nothing about what is ordered.
+    let Ok(ledger) = Ledger::peek(&data.ledger()) else { return Ok(()) };
+    let ordered = ledger.iter().flat_map(|ledger| ledger.tasks.values());
+    let wanted: Vec<Digest> = ordered.map(|record| record.order.package.content.digest).collect();
+    data.clean_parts(&wanted)
 }
 
 async fn on_disk(work: impl FnOnce() -> std::io::Result<()> + Send + 'static) -> Result<(), StepFailure> {

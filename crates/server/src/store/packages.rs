@@ -9,7 +9,7 @@ use task_proto::api::PackageView;
 use task_proto::desired::{BlobRef, PackageRef};
 use task_proto::manifest::TaskManifest;
 use task_proto::oci::Descriptor;
-use task_proto::{Digest, RepositoryName, RobotId, Tag, TaskName};
+use task_proto::{Digest, RepositoryName, Tag, TaskName};
 
 use super::{Store, StoreError, Write, rows};
 
@@ -259,24 +259,6 @@ impl Store {
                 .fetch_optional(&self.reads)
                 .await?;
         row.as_ref().map(package_view).transpose()
-    }
-
-    /// Whether the blob belongs to a package that the robot should have now.
-    pub async fn robot_may_read(&self, robot: &RobotId, digest: &Digest) -> Result<bool, StoreError> {
-        let packages: Vec<String> = sqlx::query_scalar(
-            "SELECT DISTINCT d.package FROM assignments a JOIN deployments d ON d.id = a.deployment_id
-             WHERE a.robot_id = $1 AND a.desired = 1",
-        )
-        .bind(robot.as_str())
-        .fetch_all(&self.reads)
-        .await?;
-        for package in packages {
-            let package: PackageRef = rows::from_json("deployments.package", &package)?;
-            if blobs_of(&package).iter().any(|blob| blob.digest == *digest) {
-                return Ok(true);
-            }
-        }
-        Ok(false)
     }
 
     /// Those of `candidates` that no manifest and no package in use needs. Repositories that hold one without need forget

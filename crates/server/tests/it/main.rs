@@ -4,4 +4,5 @@ mod database;
 mod fleet;
 mod mqtt;
 mod mqtt_harness;
+mod oci;
 mod story;

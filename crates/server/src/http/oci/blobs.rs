@@ -31,7 +31,7 @@ pub(super) async fn head(registry: &Registry, repository: &RepositoryName, diges
 
 /// `GET` or `HEAD` by a robot. Its packages count, whatever repository they came from and whether it still has them.
 pub(super) async fn get_for_robot(registry: &Registry, robot: &RobotId, digest: Digest, request: &Parts) -> Answer {
-    if !registry.store.robot_may_read(robot, &digest).await? {
+    if !registry.store.may_fetch(robot, &digest).await? {
         return Err(OciError::denied("the blob is not part of a package this robot should have"));
     }
     read(registry, digest, request).await

@@ -8,10 +8,8 @@ mod manifests;
 mod parsed;
 mod uploads;
 
-use axum::Router;
 use axum::extract::{Path, Request, State};
 use axum::response::{IntoResponse, Response};
-use axum::routing::any;
 use http::{HeaderMap, HeaderValue, Method, StatusCode, Uri};
 use serde::de::DeserializeOwned;
 use task_proto::{Digest, RepositoryName};
@@ -34,17 +32,8 @@ pub struct Registry {
     pub clock: Clock,
 }
 
-/// Everything below `/v2/`. The caller is taken from the request's extensions, where the guard put it; without one,
-/// nobody is let in.
-pub fn router(registry: Registry) -> Router {
-    Router::new()
-        .route("/v2", any(version))
-        .route("/v2/", any(version))
-        .route("/v2/{*path}", any(dispatch))
-        .with_state(registry)
-}
-
-type Answer = Result<Response, OciError>;
+/// How every handler here ends.
+pub type Answer = Result<Response, OciError>;
 
 /// What a path below `/v2/` names.
 #[derive(Debug, PartialEq, Eq)]
@@ -76,9 +65,9 @@ fn endpoint(path: &str) -> Option<(&str, Endpoint<'_>)> {
 }
 
 /// `GET /v2/`: tells that this is a registry, and whether the caller's token is good.
-pub(super) async fn version(request: Request) -> Answer {
+pub async fn version(request: Request) -> Answer {
     match request.extensions().get::<Caller>() {
-        Some(Caller::Operator { .. } | Caller::Robot(_)) => {}
+        Some(Caller::Operator | Caller::Robot(_)) => {}
         _ => return Err(OciError::unauthorized()),
     }
     if !matches!(*request.method(), Method::GET | Method::HEAD) {
@@ -89,11 +78,13 @@ pub(super) async fn version(request: Request) -> Answer {
     Ok((headers, axum::Json(serde_json::json!({}))).into_response())
 }
 
-pub(super) async fn dispatch(State(registry): State<Registry>, Path(path): Path<String>, request: Request) -> Answer {
+/// Everything else below `/v2/`. The caller is taken from the request's extensions, where the guard put it; without one,
+/// nobody is let in.
+pub async fn dispatch(State(registry): State<Registry>, Path(path): Path<String>, request: Request) -> Answer {
     let (parts, body) = request.into_parts();
     let caller = parts.extensions.get::<Caller>().cloned();
     let (name, endpoint) = match &caller {
-        Some(Caller::Operator { .. } | Caller::Robot(_)) => endpoint(&path).ok_or_else(OciError::no_endpoint)?,
+        Some(Caller::Operator | Caller::Robot(_)) => endpoint(&path).ok_or_else(OciError::no_endpoint)?,
         _ => return Err(OciError::unauthorized()),
     };
     let repository: RepositoryName = name.parse().map_err(|error| OciError::name_invalid(&error))?;

@@ -182,8 +182,8 @@ pub fn router(app: App) -> Router {
         let gate = Gate { app: app.clone(), access: route.access, deadline: route.deadline };
         let handler = route
             .handler
-            .route_layer(DefaultBodyLimit::max(route.body_bytes))
-            .route_layer(middleware::from_fn_with_state(gate, guard));
+            .layer(DefaultBodyLimit::max(route.body_bytes))
+            .layer(middleware::from_fn_with_state(gate, guard));
         router = router.route(route.path, handler);
     }
     router

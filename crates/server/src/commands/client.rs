@@ -16,7 +16,7 @@ use super::{CommandError, Connection, Outcome};
 /// How often a request is tried.
 const TRIES: u32 = 6;
 /// The longest pause between two tries.
-const MAX_PAUSE: Duration = Duration::from_secs(4);
+const MAX_PAUSE: Duration = Duration::from_secs(2);
 /// How long one answer may take, uploads excepted.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(60);
 /// The largest answer that is read: the list of a large fleet.

@@ -235,6 +235,11 @@ mod tests {
     use super::*;
 
     #[test]
+    fn the_command_line_is_consistent() {
+        Command::augment_subcommands(clap::Command::new("taskd")).debug_assert();
+    }
+
+    #[test]
     fn durations_have_a_number_and_a_unit() {
         assert_eq!(duration("2m"), Ok(Duration::from_secs(120)));
         assert_eq!(duration("7d"), Ok(Duration::from_secs(604_800)));

@@ -15,6 +15,7 @@ use crate::package::{self, Packed};
 
 /// What to push, where to and how.
 #[derive(Debug, Args)]
+#[group(skip)]
 pub struct Push {
     /// The package's directory, with task.toml, package.xml or both
     dir: PathBuf,

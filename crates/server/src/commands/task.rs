@@ -5,6 +5,7 @@ use task_proto::TaskName;
 use task_proto::api::{MatchedRobots, OrderTask};
 use task_proto::selector::Selector;
 
+use super::client::ClientError;
 use super::confirm::confirm;
 use super::output::say;
 use super::{CommandError, Outcome, Session};
@@ -54,7 +55,10 @@ pub(super) async fn run(session: &Session, verb: Verb, order: TaskOrder) -> Resu
     let key = idempotency_key.unwrap_or_else(super::push::random_key);
     let ask = OrderTask { selector: on.clone(), dry_run: true };
     // A dry run is no order, so it gets a key of its own.
-    let matched: MatchedRobots = session.client.order(&path, &ask, &super::push::random_key()).await?;
+    let matched: MatchedRobots = match session.client.order(&path, &ask, &super::push::random_key()).await {
+        Err(ClientError::Refused { code, .. }) if code == "no_robots_match" => MatchedRobots::default(),
+        answer => answer?,
+    };
     if matched.robots.is_empty() && !may_be_repeated {
         return Err(CommandError::Usage(format!("no robot that {on} selects has the task {task}")));
     }

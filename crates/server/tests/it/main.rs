@@ -1,5 +1,6 @@
 //! Integration tests of the server, all in one binary.
 
+mod cli;
 mod database;
 mod fleet;
 mod mqtt;

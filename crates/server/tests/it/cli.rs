@@ -1,0 +1,305 @@
+//! The operator's commands: the real binary against a real server, with robots that only report.
+
+use std::io::{BufRead as _, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Output, Stdio};
+
+use serde_json::{Value, json};
+use task_proto::api::{EnrollResponse, RobotView};
+use taskd::clock::Clock;
+use taskd::config::Config;
+use taskd::serve::Server;
+use tempfile::TempDir;
+
+/// A server and the directory its operator works in.
+struct Bench {
+    server: Option<Server>,
+    dir: TempDir,
+    http: reqwest::Client,
+}
+
+/// What a command left behind.
+struct Ran {
+    code: i32,
+    stdout: String,
+    stderr: String,
+}
+
+impl Ran {
+    fn json(&self) -> Value {
+        serde_json::from_str(&self.stdout).unwrap_or_else(|_| panic!("{}\n{}", self.stdout, self.stderr))
+    }
+
+    #[track_caller]
+    fn expect(self, code: i32, stderr: &str) -> Self {
+        assert_eq!(self.code, code, "{}\n{}", self.stdout, self.stderr);
+        assert!(self.stderr.contains(stderr), "expected {stderr:?} in {}", self.stderr);
+        self
+    }
+}
+
+impl From<Output> for Ran {
+    fn from(output: Output) -> Self {
+        Self {
+            code: output.status.code().expect("not ended by a signal"),
+            stdout: String::from_utf8(output.stdout).unwrap(),
+            stderr: String::from_utf8(output.stderr).unwrap(),
+        }
+    }
+}
+
+#[expect(clippy::disallowed_methods, reason = "the test starts the program it tests")]
+fn command(arguments: &[&str]) -> std::process::Command {
+    let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_taskd"));
+    command.args(arguments).stdin(Stdio::null());
+    for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("TASKD_")) {
+        command.env_remove(name);
+    }
+    command
+}
+
+async fn run(mut command: std::process::Command) -> Ran {
+    tokio::task::spawn_blocking(move || command.output()).await.unwrap().unwrap().into()
+}
+
+impl Bench {
+    async fn start() -> Self {
+        let _ = rustls::crypto::ring::default_provider().install_default();
+        let dir = tempfile::tempdir().unwrap();
+        let mut config = Config::with_data(dir.path().join("server"));
+        config.http = ([127, 0, 0, 1], 0).into();
+        config.mqtt = ([127, 0, 0, 1], 0).into();
+        let server = Server::start(config, Clock::system()).await.unwrap();
+        Self { server: Some(server), dir, http: reqwest::Client::new() }
+    }
+
+    /// Stops the server and starts it again where it was.
+    async fn restart(&mut self) {
+        let mut config = Config::with_data(self.data());
+        config.http = self.server().addresses().http.parse().unwrap();
+        config.mqtt = self.server().addresses().mqtt.parse().unwrap();
+        self.server.take().unwrap().stop().await;
+        self.server = Some(Server::start(config, Clock::system()).await.unwrap());
+    }
+
+    fn server(&self) -> &Server {
+        self.server.as_ref().unwrap()
+    }
+
+    fn data(&self) -> PathBuf {
+        self.dir.path().join("server")
+    }
+
+    /// Runs `taskd` as the operator of this server.
+    async fn taskd(&self, arguments: &[&str]) -> Ran {
+        let mut command = command(arguments);
+        command.env("TASKD_DATA", self.data());
+        run(command).await
+    }
+
+    /// A package of one script; `extra` is more of its task.toml.
+    fn package(&self, version: &str, extra: &str) -> String {
+        let dir = self.dir.path().join(format!("hello-{version}"));
+        std::fs::create_dir_all(&dir).unwrap();
+        let task = format!("name = \"hello\"\nversion = \"{version}\"\n[run]\nexec = [\"true\"]\n{extra}");
+        std::fs::write(dir.join("task.toml"), task).unwrap();
+        dir.to_str().unwrap().to_owned()
+    }
+
+    fn url(&self, path: &str) -> String {
+        format!("http://{}/api/v1{path}", self.server().addresses().http)
+    }
+
+    async fn enroll(&self, number: u8) -> Robot {
+        let token =
+            self.taskd(&["enroll-token", "create", "-o", "json"]).await.json()["token"].as_str().unwrap().to_owned();
+        let body = json!({ "mac": format!("02:00:00:00:00:{number:02x}"), "name": format!("robot-{number}") });
+        let answer = self.http.post(self.url("/enroll")).bearer_auth(token).json(&body).send().await.unwrap();
+        assert!(answer.status().is_success(), "{}", answer.text().await.unwrap());
+        Robot { identity: answer.json().await.unwrap(), seq: 0.into() }
+    }
+
+    /// Robot `robot` says that it has everything it was told to, and that the task of `deployment` is in `phase`.
+    async fn report(&self, robot: &Robot, deployment: &Value, phase: &str) {
+        let id = &robot.identity.robot_id;
+        let view: RobotView =
+            serde_json::from_value(self.taskd(&["robot", "info", id.as_str(), "-o", "json"]).await.json()).unwrap();
+        let seq = robot.seq.get() + 1;
+        robot.seq.set(seq);
+        let mut task = json!({
+            "task": "hello", "deployment": deployment["id"], "package": deployment["package"], "wanted": "running",
+            "run": 1, "kind": "service", "phase": phase, "phase_ms": 1,
+        });
+        if phase == "failed" {
+            task["failure"] = json!({ "code": "process_exited", "text": "exit code 3" });
+        }
+        let report = json!({
+            "robot_id": id, "start": 1, "instance": "i0123456789abcdef", "boot_id": "b", "seq": seq,
+            "observed_generation": view.generation, "uptime_ms": 1,
+            "host": { "agent_version": "1", "hostname": "h", "arch": "x86_64" }, "tasks": [task],
+        });
+        let url = self.url(&format!("/robots/{id}/report"));
+        let answer = self.http.post(url).bearer_auth(&robot.identity.token).json(&report).send().await.unwrap();
+        assert!(answer.status().is_success(), "{}", answer.text().await.unwrap());
+    }
+}
+
+struct Robot {
+    identity: EnrollResponse,
+    seq: std::cell::Cell<u64>,
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_second_push_of_the_same_tree_transfers_no_blob() {
+    let bench = Bench::start().await;
+    let package = bench.package("1", "");
+    let first = bench.taskd(&["push", &package, "-o", "json"]).await.expect(0, "2 blobs transferred");
+    let second = bench.taskd(&["push", &package, "-o", "json"]).await.expect(0, "nothing to upload");
+    assert_eq!(first.json(), second.json());
+    let packed = bench.taskd(&["pack", &package, "--json"]).await.expect(0, "");
+    assert_eq!(packed.json(), first.json());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn who_may_not_ask_is_told_apart_from_what_does_not_work() {
+    let bench = Bench::start().await;
+    let list = ["robot", "list"];
+    bench.taskd(&list).await.expect(0, "");
+    let other = task_proto::token::Token::random(task_proto::token::TokenKind::Operator).reveal();
+    bench.taskd(&["robot", "list", "--token", &other]).await.expect(4, "");
+    bench.taskd(&["robot", "list", "--token", "secret"]).await.expect(2, "not a token");
+    bench.taskd(&["robot", "list", "--server", "nonsense"]).await.expect(2, "--server");
+    bench.taskd(&["robot", "list", "--nonsense"]).await.expect(2, "--nonsense");
+    let mut without = command(&list);
+    without.env("HOME", "/nonexistent").env("XDG_DATA_HOME", "/nonexistent");
+    run(without).await.expect(2, "no operator token");
+    let nobody = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+    let nobody = format!("http://{nobody}");
+    bench.taskd(&["robot", "list", "--server", &nobody]).await.expect(1, "can't reach the server");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_is_wrong_is_said_before_anything_travels() {
+    let bench = Bench::start().await;
+    let package = bench.package("1", "");
+    bench.taskd(&["push", &package, "--to", "*"]).await.expect(2, "no robot matches");
+    let wrong = bench.package("2", "kindd = \"job\"\n[redy]\n");
+    let ran = bench
+        .taskd(&["push", &wrong])
+        .await
+        .expect(2, "task.toml: run.kindd: there is no such key (did you mean run.kind?)");
+    assert!(ran.stderr.contains("task.toml: redy: there is no such key (did you mean ready?)"), "{}", ran.stderr);
+    bench.taskd(&["push", "/nonexistent"]).await.expect(2, "there is no such directory");
+    let packages = bench
+        .http
+        .get(bench.url("/packages"))
+        .bearer_auth(std::fs::read_to_string(bench.data().join("operator.token")).unwrap().trim());
+    let packages: Value = packages.send().await.unwrap().json().await.unwrap();
+    assert_eq!(packages["packages"], json!([]));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn waiting_ends_with_the_outcome_of_all_robots() {
+    let bench = Bench::start().await;
+    let (one, two) = (bench.enroll(1).await, bench.enroll(2).await);
+    let package = bench.package("1", "");
+    let order = ["push", &package, "--to", "*", "--idempotency-key", "first", "-o", "json"];
+    let wait = [&order[..], &["--wait", "--timeout", "1s"]].concat();
+    let deployment = bench.taskd(&order).await.expect(0, "to 2 robots").json();
+    let late = bench.taskd(&wait).await.expect(5, "0 of 2 succeeded");
+    assert_eq!(late.json()["id"], deployment["id"], "the same key is the same order");
+
+    bench.report(&one, &deployment, "running").await;
+    bench.report(&two, &deployment, "failed").await;
+    let wait = [&order[..], &["--wait", "--timeout", "1m"]].concat();
+    bench.taskd(&wait).await.expect(3, "robot-2: failed (process_exited: exit code 3)");
+
+    let order = ["push", &package, "--to", "robot-1", "--idempotency-key", "second", "-o", "json"];
+    let wait = [&order[..], &["--wait", "--timeout", "1m"]].concat();
+    let deployment = bench.taskd(&order).await.expect(0, "supersedes").json();
+    bench.report(&one, &deployment, "running").await;
+    bench.taskd(&wait).await.expect(0, "1 of 1 succeeded");
+    bench.report(&one, &deployment, "failed").await;
+    bench.taskd(&wait).await.expect(1, "robot-1: failed");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn waiting_survives_a_restart_of_the_server() {
+    let mut bench = Bench::start().await;
+    let robot = bench.enroll(1).await;
+    let package = bench.package("1", "");
+    let order = ["push", &package, "--to", "*", "--idempotency-key", "k", "-o", "json"];
+    let deployment = bench.taskd(&order).await.json();
+    let mut waiting = command(&[&order[..], &["--wait", "--timeout", "1m"]].concat());
+    waiting.env("TASKD_DATA", bench.data()).stdout(Stdio::null()).stderr(Stdio::piped());
+    let mut waiting = waiting.spawn().unwrap();
+    let mut stderr = BufReader::new(waiting.stderr.take().unwrap()).lines();
+    // From here on it only waits.
+    assert!(stderr.any(|line| line.unwrap().starts_with("deployment ")));
+    bench.restart().await;
+    bench.report(&robot, &deployment, "running").await;
+    let said: Vec<String> = tokio::task::spawn_blocking(move || stderr.map(Result::unwrap).collect()).await.unwrap();
+    assert_eq!(waiting.wait().unwrap().code(), Some(0), "{said:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn many_robots_need_a_yes() {
+    let bench = Bench::start().await;
+    for number in 1..=11 {
+        bench.enroll(number).await;
+    }
+    let package = bench.package("1", "");
+    let dry = bench.taskd(&["push", &package, "--to", "*", "--dry-run", "-o", "json"]).await.expect(0, "");
+    assert_eq!(dry.json()["robots"].as_array().unwrap().len(), 11);
+    bench.taskd(&["push", &package, "--to", "*"]).await.expect(2, "give --yes");
+    bench.taskd(&["push", &package, "--to", "*", "--yes"]).await.expect(0, "to 11 robots");
+    bench.taskd(&["stop", "hello", "--on", "*"]).await.expect(2, "give --yes");
+    bench.taskd(&["stop", "hello", "--on", "robot-3"]).await.expect(0, "stop hello on 1 robots");
+    bench.taskd(&["stop", "other", "--on", "*"]).await.expect(2, "has the task other");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn robots_and_deployments_are_shown_and_removed() {
+    let bench = Bench::start().await;
+    let robot = bench.enroll(7).await;
+    let id = robot.identity.robot_id.as_str();
+    let list = bench.taskd(&["robot", "list"]).await.expect(0, "");
+    assert!(list.stdout.contains("robot-7") && list.stdout.contains("02:00:00:00:00:07"), "{}", list.stdout);
+    let deployment = bench.taskd(&["push", &bench.package("1", ""), "--to", "*", "-o", "json"]).await.json();
+    let deployment = deployment["id"].as_str().unwrap();
+    let shown = bench.taskd(&["deploy", "info", deployment]).await.expect(0, "");
+    assert!(shown.stdout.contains("robot-7") && shown.stdout.contains("assigned"), "{}", shown.stdout);
+    assert!(bench.taskd(&["deploy", "list"]).await.expect(0, "").stdout.contains(deployment));
+    let cancelled = bench.taskd(&["deploy", "cancel", deployment, "-o", "json"]).await.expect(0, "cancel");
+    assert_eq!(cancelled.json()["state"], "cancelled");
+    bench.taskd(&["deploy", "info", "d0000000000000000"]).await.expect(1, "not_found");
+    bench.taskd(&["robot", "rm", "robot-7"]).await.expect(0, id);
+    bench.taskd(&["robot", "info", "robot-7"]).await.expect(2, "no robot has the name or id robot-7");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_closed_pipe_is_no_panic() {
+    let bench = Bench::start().await;
+    let mut list = command(&["robot", "list"]);
+    list.env("TASKD_DATA", bench.data()).stdout(closed_pipe()).stderr(Stdio::piped());
+    run(list).await.expect(0, "");
+    let mut help = command(&["push", "--help"]);
+    help.stdout(closed_pipe()).stderr(Stdio::piped());
+    let help = run(help).await;
+    assert!(!help.stderr.contains("panicked"), "{}", help.stderr);
+}
+
+/// A pipe whose reader has gone.
+fn closed_pipe() -> Stdio {
+    let (reader, writer) = std::io::pipe().unwrap();
+    drop(reader);
+    writer.into()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_examples_can_be_packed() {
+    let examples = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples");
+    for name in ["talker", "plain"] {
+        run(command(&["pack", examples.join(name).to_str().unwrap()])).await.expect(0, "");
+    }
+}

@@ -1,5 +1,7 @@
 //! The operator's commands: the real binary against a real server, with robots that only report.
 
+#![expect(clippy::unwrap_used, reason = "a helper of tests may panic as they do")]
+
 use std::io::{BufRead as _, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Output, Stdio};

@@ -4,6 +4,7 @@
 use std::net::SocketAddr;
 use std::time::Duration;
 
+use axum::extract::rejection::RawPathParamsRejection;
 use axum::extract::{ConnectInfo, FromRequestParts, RawPathParams, Request, State};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
@@ -87,12 +88,13 @@ pub(super) struct Gate {
 pub(super) async fn guard(
     State(gate): State<Gate>,
     ConnectInfo(peer): ConnectInfo<SocketAddr>,
-    params: RawPathParams,
+    params: Result<RawPathParams, RawPathParamsRejection>,
     mut request: Request,
     next: Next,
 ) -> Response {
     let is_oci = request.uri().path().starts_with("/v2");
-    let own = params.iter().find(|(name, _)| *name == "robot").map(|(_, value)| value);
+    // A path that is no text names nobody; the handler says that there is no such thing.
+    let own = params.iter().flatten().find(|(name, _)| *name == "robot").map(|(_, value)| value);
     match admit(&gate, peer, own, request.method(), request.headers()).await {
         Ok(caller) => request.extensions_mut().insert(caller),
         Err(error) if is_oci => return error.into_oci_response(),

@@ -180,10 +180,13 @@ pub fn router(app: App) -> Router {
     let mut router = Router::new();
     for route in routes() {
         let gate = Gate { app: app.clone(), access: route.access, deadline: route.deadline };
-        let handler = route
-            .handler
-            .layer(DefaultBodyLimit::max(route.body_bytes))
-            .layer(middleware::from_fn_with_state(gate, guard));
+        let guard = middleware::from_fn_with_state(gate, guard);
+        let limit = DefaultBodyLimit::max(route.body_bytes);
+        let handler = match route.method {
+            // Not before what answers "method not allowed", which needs no guard.
+            Some(_) => route.handler.route_layer(limit).route_layer(guard),
+            None => route.handler.layer(limit).layer(guard),
+        };
         router = router.route(route.path, handler);
     }
     router

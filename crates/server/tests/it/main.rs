@@ -1,9 +1,13 @@
 //! Integration tests of the server, all in one binary.
 
+mod api;
+mod auth;
 mod cli;
 mod database;
 mod fleet;
+mod harness;
 mod mqtt;
 mod mqtt_harness;
 mod oci;
+mod serve;
 mod story;

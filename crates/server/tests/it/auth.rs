@@ -1,0 +1,184 @@
+//! Who may call what: every route of the table is called by every kind of caller.
+
+use reqwest::{Method, RequestBuilder, StatusCode};
+use serde_json::{Value, json};
+use task_proto::api::{EnrollmentToken, SessionView};
+use task_proto::token::{Token, TokenKind};
+use taskd::http::auth::Access;
+use taskd::http::{Route, routes};
+
+use crate::harness::{TestServer, refusal};
+
+/// Everybody who could come to a route.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Comer {
+    Nobody,
+    Nonsense,
+    Stranger,
+    Operator,
+    OperatorByPassword,
+    Enrolment,
+    ExpiredEnrolment,
+    Robot,
+    OtherRobot,
+    RemovedRobot,
+}
+
+impl Comer {
+    const ALL: [Self; 10] = [
+        Self::Nobody,
+        Self::Nonsense,
+        Self::Stranger,
+        Self::Operator,
+        Self::OperatorByPassword,
+        Self::Enrolment,
+        Self::ExpiredEnrolment,
+        Self::Robot,
+        Self::OtherRobot,
+        Self::RemovedRobot,
+    ];
+
+    /// The refusal to expect; `None` if the guard lets them in.
+    fn refused(self, access: Access) -> Option<StatusCode> {
+        use Comer::{Enrolment, ExpiredEnrolment, Nobody, Nonsense, Operator, OperatorByPassword};
+        use Comer::{OtherRobot, RemovedRobot, Robot, Stranger};
+        let is_let_in = match access {
+            Access::Anyone => true,
+            Access::Operator => matches!(self, Operator | OperatorByPassword),
+            Access::OwnRobot => self == Robot,
+            Access::Enrolment => self == Enrolment,
+            Access::OperatorOrRobot => matches!(self, Operator | OperatorByPassword | Robot | OtherRobot),
+        };
+        match self {
+            _ if is_let_in => None,
+            Nobody | Nonsense | Stranger | ExpiredEnrolment | RemovedRobot => Some(StatusCode::UNAUTHORIZED),
+            Operator | OperatorByPassword | Enrolment | Robot | OtherRobot => Some(StatusCode::FORBIDDEN),
+        }
+    }
+}
+
+/// A server with one of each.
+struct Gathering {
+    server: TestServer,
+    robot_id: String,
+    robot: String,
+    other_robot: String,
+    removed_robot: String,
+    enrolment: String,
+    expired_enrolment: String,
+}
+
+impl Gathering {
+    async fn new() -> Self {
+        let server = TestServer::start().await;
+        let (robot, other, removed) =
+            (server.enroll("atlas").await, server.enroll("boreas").await, server.enroll("ceto").await);
+        let path = format!("/api/v1/robots/{}", removed.id);
+        server.request(Method::DELETE, &path).send().await.expect("an answer");
+        let expired: EnrollmentToken = server.post("/api/v1/enrollment-tokens", &json!({ "ttl_s": 1 })).await;
+        let enrolment: EnrollmentToken = server.post("/api/v1/enrollment-tokens", &json!({})).await;
+        server.clock.advance_ms(2_000);
+        Self {
+            server,
+            robot_id: robot.id.to_string(),
+            robot: robot.token,
+            other_robot: other.token,
+            removed_robot: removed.token,
+            enrolment: enrolment.token,
+            expired_enrolment: expired.token,
+        }
+    }
+
+    fn dress(&self, request: RequestBuilder, comer: Comer) -> RequestBuilder {
+        match comer {
+            Comer::Nobody => request,
+            Comer::Nonsense => request.header("authorization", "Bearer tsko_nonsense"),
+            Comer::Stranger => request.bearer_auth(Token::random(TokenKind::Operator).reveal()),
+            Comer::Operator => request.bearer_auth(self.server.operator.reveal()),
+            Comer::OperatorByPassword => request.basic_auth("anyone", Some(self.server.operator.reveal())),
+            Comer::Enrolment => request.bearer_auth(&self.enrolment),
+            Comer::ExpiredEnrolment => request.bearer_auth(&self.expired_enrolment),
+            Comer::Robot => request.bearer_auth(&self.robot),
+            Comer::OtherRobot => request.bearer_auth(&self.other_robot),
+            Comer::RemovedRobot => request.bearer_auth(&self.removed_robot),
+        }
+    }
+
+    fn request(&self, route: &Route) -> RequestBuilder {
+        let path = route.path.replace("{robot}", &self.robot_id).replace("{*path}", "talker/tags/list");
+        let path = path.replace("{deployment}", "d0000000000000000").replace("{task}", "talker");
+        self.server.bare(route.method.clone().unwrap_or(Method::GET), &path)
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn every_route_lets_in_whom_it_names_and_nobody_else() {
+    let gathering = Gathering::new().await;
+    for route in routes() {
+        for comer in Comer::ALL {
+            // Deleting the robot would change who the later comers are.
+            let is_last_word = route.method == Some(Method::DELETE) && route.path.ends_with("{robot}");
+            if is_last_word && comer.refused(route.access).is_none() {
+                continue;
+            }
+            let response = gathering.dress(gathering.request(&route), comer).send().await.expect("an answer");
+            let (status, shown) = (response.status(), format!("{:?} {} by {comer:?}", route.method, route.path));
+            match comer.refused(route.access) {
+                Some(expected) => {
+                    assert_eq!(status, expected, "{shown}");
+                    let is_oci = route.path.starts_with("/v2");
+                    assert_eq!(
+                        response.headers().get("www-authenticate").map(|value| value.as_bytes().starts_with(b"Basic")),
+                        (status == StatusCode::UNAUTHORIZED).then_some(is_oci),
+                        "{shown}"
+                    );
+                    let body: Value = response.json().await.expect("json");
+                    assert!(body[if is_oci { "errors" } else { "error" }].is_array() == is_oci, "{shown}: {body}");
+                }
+                // Within the registry a robot sees blobs only.
+                None if route.path == "/v2/{*path}" && comer == Comer::Robot => {}
+                None if route.path == "/v2/{*path}" && comer == Comer::OtherRobot => {}
+                None if route.path == "/api/v1/session" => {}
+                None => {
+                    assert!(!matches!(status, StatusCode::UNAUTHORIZED | StatusCode::FORBIDDEN), "{shown}: {status}");
+                }
+            }
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_session_opens_what_its_token_opens_and_only_from_its_own_page() {
+    let server = TestServer::start().await;
+    let origin = server.url("");
+    let sign_in = |origin: &str, token: String| {
+        let request = server.bare(Method::POST, "/api/v1/session").header("origin", origin);
+        request.json(&json!({ "token": token }))
+    };
+    let wrong = sign_in(&origin, Token::random(TokenKind::Operator).reveal());
+    assert_eq!(refusal(wrong).await, (401, "unauthorized".to_owned()));
+    let foreign = sign_in("http://evil.example", server.operator.reveal());
+    assert_eq!(refusal(foreign).await, (403, "forbidden".to_owned()));
+    let robot = server.enroll("atlas").await;
+    assert_eq!(refusal(sign_in(&origin, robot.token)).await, (401, "unauthorized".to_owned()));
+
+    let response = sign_in(&origin, server.operator.reveal()).send().await.expect("an answer");
+    let cookie = response.headers()["set-cookie"].to_str().expect("text").to_owned();
+    assert!(cookie.contains("HttpOnly") && cookie.contains("SameSite=Strict"), "{cookie}");
+    let cookie = cookie.split(';').next().expect("a pair").to_owned();
+    let signed_in = |method, path: &str| server.bare(method, path).header("cookie", &cookie);
+    let robots = signed_in(Method::GET, "/api/v1/robots").send().await.expect("an answer");
+    assert_eq!(robots.status(), StatusCode::OK);
+    let view: SessionView =
+        signed_in(Method::GET, "/api/v1/session").send().await.expect("an answer").json().await.expect("json");
+    assert!(view.expires_at_ms.is_some());
+
+    let create = || signed_in(Method::POST, "/api/v1/enrollment-tokens").json(&json!({}));
+    assert_eq!(refusal(create()).await, (403, "forbidden".to_owned()));
+    assert_eq!(refusal(create().header("origin", "http://evil.example")).await.0, 403);
+    assert_eq!(create().header("origin", &origin).send().await.expect("an answer").status(), StatusCode::CREATED);
+
+    let out = signed_in(Method::DELETE, "/api/v1/session").header("origin", &origin).send().await.expect("an answer");
+    assert_eq!(out.status(), StatusCode::NO_CONTENT);
+    assert_eq!(refusal(signed_in(Method::GET, "/api/v1/robots")).await.0, 401);
+}

@@ -1,0 +1,229 @@
+//! A whole server in this process, on free ports and in a directory of its own, and the few things every test says to it.
+
+use std::path::Path;
+
+use reqwest::{Client, Method, RequestBuilder, Response, StatusCode};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use serde_json::{Value, json};
+use task_proto::api::{DeploymentView, EnrollResponse, EnrollmentToken, IDEMPOTENCY_KEY, RobotView};
+use task_proto::desired::{BlobRef, DesiredState, DesiredTask, PackageRef};
+use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, PublicKey};
+use task_proto::manifest::TaskKind;
+use task_proto::oci::{ImageManifest, MANIFEST_TYPE};
+use task_proto::report::{HostFacts, Phase, Report, TaskReport};
+use task_proto::token::Token;
+use task_proto::{Digest, InstanceId, RobotId};
+use taskd::clock::Clock;
+use taskd::config::Config;
+use taskd::serve::Server;
+use tempfile::TempDir;
+
+/// The moment at which every test begins.
+pub const NOW_MS: u64 = 1_800_000_000_000;
+
+/// A running server and an operator who talks to it.
+pub struct TestServer {
+    pub directory: TempDir,
+    pub server: Server,
+    pub clock: Clock,
+    pub operator: Token,
+    pub client: Client,
+}
+
+/// A registered robot, as far as the server can tell.
+pub struct TestRobot {
+    pub id: RobotId,
+    pub token: String,
+    instance: InstanceId,
+    seq: u64,
+}
+
+impl TestServer {
+    pub async fn start() -> Self {
+        Self::start_in(TempDir::new().expect("a directory"), |_| {}).await
+    }
+
+    pub async fn start_in(directory: TempDir, configure: impl FnOnce(&mut Config)) -> Self {
+        let mut config = Config::with_data(directory.path().join("data"));
+        config.http.set_port(0);
+        config.mqtt.set_port(0);
+        configure(&mut config);
+        let clock = Clock::fixed(NOW_MS);
+        let server = Server::start(config, clock.clone()).await.expect("the server starts");
+        let operator = server.data().operator_token().expect("a token");
+        // A second install is refused because the first is in place.
+        let _ = rustls::crypto::ring::default_provider().install_default();
+        Self { directory, server, clock, operator, client: Client::new() }
+    }
+
+    /// Stops it and starts another on the same directory.
+    pub async fn restart(self) -> Self {
+        let directory = self.stop().await;
+        Self::start_in(directory, |_| {}).await
+    }
+
+    /// Stops it; the directory stays.
+    pub async fn stop(self) -> TempDir {
+        self.server.stop().await;
+        self.directory
+    }
+
+    pub fn data(&self) -> &Path {
+        self.server.data().path()
+    }
+
+    pub fn url(&self, path: &str) -> String {
+        format!("http://{}{path}", self.server.addresses().http)
+    }
+
+    /// A request by nobody.
+    pub fn bare(&self, method: Method, path: &str) -> RequestBuilder {
+        self.client.request(method, self.url(path))
+    }
+
+    /// A request by the operator.
+    pub fn request(&self, method: Method, path: &str) -> RequestBuilder {
+        self.bare(method, path).bearer_auth(self.operator.reveal())
+    }
+
+    pub async fn get<T: DeserializeOwned>(&self, path: &str) -> T {
+        answer(self.request(Method::GET, path)).await
+    }
+
+    pub async fn post<T: DeserializeOwned>(&self, path: &str, body: &impl Serialize) -> T {
+        answer(self.request(Method::POST, path).json(body)).await
+    }
+
+    /// An order with its idempotency key.
+    pub fn order(&self, path: &str, key: &str, body: &Value) -> RequestBuilder {
+        self.request(Method::POST, path).header(IDEMPOTENCY_KEY, key).json(body)
+    }
+
+    pub async fn enroll(&self, name: &str) -> TestRobot {
+        let token: EnrollmentToken = self.post("/api/v1/enrollment-tokens", &json!({})).await;
+        let mac = Digest::of(name.as_bytes()).hex();
+        let mac = format!("02:{}:{}:{}:{}:{}", &mac[..2], &mac[2..4], &mac[4..6], &mac[6..8], &mac[8..10]);
+        let request = self.bare(Method::POST, "/api/v1/enroll").bearer_auth(token.token);
+        let enrolled: EnrollResponse = answer(request.json(&json!({ "mac": mac, "name": name }))).await;
+        TestRobot { id: enrolled.robot_id, token: enrolled.token, instance: InstanceId::random(), seq: 0 }
+    }
+
+    /// Pushes a package that no robot could unpack, but every robot can be told of.
+    pub async fn push(&self, name: &str, version: &str) -> PackageRef {
+        let content = format!("content of {name} {version}").into_bytes();
+        let content_ref = BlobRef { digest: Digest::of(&content), size: content.len() as u64 };
+        let config = json!({
+            "name": name,
+            "version": version,
+            "build": { "tool": "none" },
+            "run": { "exec": ["sh", "main.sh"] },
+            "content": { "tar_digest": Digest::of(b"tar"), "tar_size": 3, "entries": 1 },
+        });
+        let config = serde_json::to_vec(&config).expect("json");
+        let config_ref = BlobRef { digest: Digest::of(&config), size: config.len() as u64 };
+        for (blob, bytes) in [(config_ref, config), (content_ref, content)] {
+            let path = format!("/v2/{name}/blobs/uploads/?digest={}", blob.digest);
+            let request = self.request(Method::POST, &path).header("content-type", "application/octet-stream");
+            assert_eq!(request.body(bytes).send().await.expect("an answer").status(), StatusCode::CREATED);
+        }
+        let manifest = serde_json::to_vec(&ImageManifest::package(config_ref, content_ref)).expect("json");
+        let manifest_ref = BlobRef { digest: Digest::of(&manifest), size: manifest.len() as u64 };
+        let request = self.request(Method::PUT, &format!("/v2/{name}/manifests/{version}"));
+        let response = request.header("content-type", MANIFEST_TYPE).body(manifest).send().await.expect("an answer");
+        assert_eq!(response.status(), StatusCode::CREATED, "{}", response.text().await.unwrap_or_default());
+        PackageRef {
+            name: name.parse().expect("a name"),
+            version: version.parse().expect("a version"),
+            manifest: manifest_ref,
+            config: config_ref,
+            content: content_ref,
+        }
+    }
+
+    pub async fn deploy(&self, package: &PackageRef, selector: &str, key: &str) -> DeploymentView {
+        let body = json!({ "package": package.name, "manifest": package.manifest.digest, "selector": selector });
+        answer(self.order("/api/v1/deployments", key, &body)).await
+    }
+
+    pub async fn robot(&self, robot: &TestRobot) -> RobotView {
+        self.get(&format!("/api/v1/robots/{}", robot.id)).await
+    }
+
+    /// What the robot gets when it asks for its desired state.
+    pub async fn ask_desired(&self, robot: &TestRobot) -> Response {
+        let path = format!("/api/v1/robots/{}/desired", robot.id);
+        self.bare(Method::GET, &path).bearer_auth(&robot.token).send().await.expect("an answer")
+    }
+
+    /// The robot's desired state, its signature verified.
+    pub async fn desired(&self, robot: &TestRobot) -> DesiredState {
+        let response = self.ask_desired(robot).await;
+        assert_eq!(response.status(), StatusCode::OK, "{}", response.text().await.unwrap_or_default());
+        let envelope: Envelope = response.json().await.expect("an envelope");
+        let info: task_proto::api::ServerInfo = self.get("/api/v1/server").await;
+        open(&envelope, &info.key)
+    }
+
+    /// The robot reports that it accepted `state` and that all of its tasks stand in `phase`.
+    pub async fn report(&self, robot: &mut TestRobot, state: &DesiredState, phase: Phase) -> Response {
+        robot.seq += 1;
+        let report = Report {
+            robot_id: robot.id.clone(),
+            start: 1,
+            instance: robot.instance.clone(),
+            boot_id: "boot".to_owned(),
+            seq: robot.seq,
+            observed_generation: state.generation,
+            uptime_ms: 1_000,
+            host: HostFacts { hostname: "host".to_owned(), ..HostFacts::default() },
+            conditions: Vec::new(),
+            tasks: state.tasks.iter().map(|task| in_phase(task, phase)).collect(),
+        };
+        let path = format!("/api/v1/robots/{}/report", robot.id);
+        let request = self.bare(Method::POST, &path).bearer_auth(&robot.token);
+        request.json(&report).send().await.expect("an answer")
+    }
+}
+
+fn open(envelope: &Envelope, key: &PublicKey) -> DesiredState {
+    let payload = envelope.open(DESIRED_STATE_TYPE, key).expect("signed by this server");
+    serde_json::from_slice(&payload).expect("a desired state")
+}
+
+fn in_phase(task: &DesiredTask, phase: Phase) -> TaskReport {
+    TaskReport {
+        task: task.task.clone(),
+        deployment: task.deployment.clone(),
+        package: task.package.clone(),
+        wanted: task.wanted,
+        run: task.run,
+        kind: Some(TaskKind::Service),
+        phase,
+        phase_ms: 10,
+        progress: None,
+        attempts: 1,
+        restarts: 0,
+        failure: None,
+        active: None,
+    }
+}
+
+/// Sends it and reads a success's JSON.
+pub async fn answer<T: DeserializeOwned>(request: RequestBuilder) -> T {
+    let response = request.send().await.expect("an answer");
+    let status = response.status();
+    let text = response.text().await.expect("a body");
+    assert!(status.is_success(), "{status}: {text}");
+    serde_json::from_str(&text).unwrap_or_else(|error| panic!("{error}: {text}"))
+}
+
+/// Sends it and reads an error's status and code.
+pub async fn refusal(request: RequestBuilder) -> (u16, String) {
+    let response = request.send().await.expect("an answer");
+    let status = response.status().as_u16();
+    let text = response.text().await.expect("a body");
+    let body: task_proto::api::ErrorBody =
+        serde_json::from_str(&text).unwrap_or_else(|error| panic!("{status}, {error}: {text}"));
+    (status, body.error.code)
+}

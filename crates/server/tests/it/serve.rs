@@ -1,0 +1,151 @@
+//! Starting and stopping: what is in the directory, what survives, and what a stop waits for.
+
+use std::os::unix::fs::PermissionsExt as _;
+use std::time::Duration;
+
+use reqwest::{Method, StatusCode};
+use task_proto::api::RobotList;
+use task_proto::report::Phase;
+use taskd::clock::Clock;
+use taskd::config::Config;
+use taskd::serve::{ServeError, Server};
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::TcpStream;
+
+use crate::harness::TestServer;
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_first_start_makes_what_is_needed_and_nobody_else_reads_it() {
+    let server = TestServer::start().await;
+    let mode = |name: &str| server.data().join(name).metadata().expect(name).permissions().mode() & 0o777;
+    assert_eq!(mode(""), 0o700);
+    assert_eq!((mode("operator.token"), mode("signing.key")), (0o600, 0o600));
+    let addresses = std::fs::read(server.data().join("addresses.json")).expect("published");
+    let addresses: taskd::data_directory::Addresses = serde_json::from_slice(&addresses).expect("json");
+    assert_eq!(addresses, *server.server.addresses());
+    for path in ["/healthz", "/readyz"] {
+        let status = server.bare(Method::GET, path).send().await.expect("an answer").status();
+        assert_eq!(status, StatusCode::OK, "{path}");
+    }
+    let addresses = server.data().join("addresses.json");
+    let _directory = server.stop().await;
+    assert!(!addresses.exists());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_second_server_on_the_same_directory_is_refused() {
+    let server = TestServer::start().await;
+    let mut config = Config::with_data(server.data().to_owned());
+    config.http.set_port(0);
+    config.mqtt.set_port(0);
+    let second = Server::start(config, Clock::system()).await.err().expect("refused");
+    assert!(matches!(second, ServeError::Data(_)) && second.to_string().contains("another taskd serves from it"));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_restart_keeps_everything() {
+    let server = TestServer::start().await;
+    let mut robot = server.enroll("atlas").await;
+    let package = server.push("talker", "1.0.0").await;
+    let ordered = server.deploy(&package, "*", "key-1").await;
+    let state = server.desired(&robot).await;
+    server.report(&mut robot, &state, Phase::Running).await;
+    let operator = server.operator.clone();
+
+    let server = server.restart().await;
+    assert_eq!(server.operator, operator);
+    assert_eq!(server.desired(&robot).await.tasks, state.tasks);
+    assert_eq!(server.robot(&robot).await.tasks[0].phase, Phase::Running);
+    assert_eq!(server.deploy(&package, "*", "key-1").await.id, ordered.id);
+    let path = format!("/v2/talker/blobs/{}", package.content.digest);
+    let blob = server.bare(Method::GET, &path).bearer_auth(&robot.token).send().await.expect("an answer");
+    assert_eq!(blob.status(), StatusCode::OK);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_stop_under_load_loses_no_report_that_was_answered() {
+    let server = TestServer::start().await;
+    let package = server.push("talker", "1.0.0").await;
+    let mut robots = Vec::new();
+    for n in 0..8 {
+        robots.push(server.enroll(&format!("robot-{n}")).await);
+    }
+    server.deploy(&package, "*", "key-1").await;
+    let mut asking = Vec::new();
+    let server = std::sync::Arc::new(server);
+    for mut robot in robots {
+        let server = server.clone();
+        asking.push(tokio::spawn(async move {
+            let state = server.desired(&robot).await;
+            let status = server.report(&mut robot, &state, Phase::Running).await.status();
+            (robot, status)
+        }));
+    }
+    // Two answers are there, the others are somewhere under way.
+    let mut done = Vec::new();
+    for task in asking {
+        let (robot, status) = task.await.expect("no panic");
+        assert_eq!(status, StatusCode::OK);
+        done.push(robot);
+    }
+    let server = std::sync::Arc::into_inner(server).expect("the last");
+    let server = server.restart().await;
+    let list: RobotList = server.get("/api/v1/robots").await;
+    assert!(list.robots.iter().all(|robot| robot.tasks[0].phase == Phase::Running));
+    assert_eq!(list.robots.len(), done.len());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn idle_and_dawdling_clients_do_not_hold_up_a_stop() {
+    let server = TestServer::start().await;
+    let address = server.server.addresses().http.clone();
+    let mut idle = TcpStream::connect(&address).await.expect("connects");
+    let mut dawdling = TcpStream::connect(&address).await.expect("connects");
+    dawdling.write_all(b"GET /healthz HTTP/1.1\r\nhost: x\r\nx-slow: ").await.expect("written");
+    let mut asked = TcpStream::connect(&address).await.expect("connects");
+    asked.write_all(b"GET /healthz HTTP/1.1\r\nhost: x\r\n\r\n").await.expect("written");
+    let mut first = [0; 12];
+    asked.read_exact(&mut first).await.expect("an answer");
+    assert_eq!(&first, b"HTTP/1.1 200");
+    tokio::time::timeout(Duration::from_secs(9), server.stop()).await.expect("stops in time");
+    for connection in [&mut idle, &mut dawdling, &mut asked] {
+        let mut rest = Vec::new();
+        // A reset is an end as well.
+        let _ = connection.read_to_end(&mut rest).await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_database_that_was_put_back_leaves_robots_alone_until_their_next_order() {
+    let server = TestServer::start().await;
+    let mut robot = server.enroll("atlas").await;
+    let (first, later) = (server.push("talker", "1.0.0").await, server.push("talker", "2.0.0").await);
+    server.deploy(&first, "*", "key-1").await;
+    let directory = server.stop().await;
+    let (database, copy) = (directory.path().join("data/taskd.sqlite"), directory.path().join("copy"));
+    std::fs::copy(&database, &copy).expect("copied");
+
+    let server = TestServer::start_in(directory, |_| {}).await;
+    for n in 0..3 {
+        server.deploy(if n == 1 { &first } else { &later }, "*", &format!("later-{n}")).await;
+    }
+    let state = server.desired(&robot).await;
+    server.report(&mut robot, &state, Phase::Running).await;
+    let directory = server.stop().await;
+    std::fs::copy(&copy, &database).expect("put back");
+
+    let server = TestServer::start_in(directory, |_| {}).await;
+    let reported = server.report(&mut robot, &state, Phase::Running).await;
+    assert_eq!(reported.status(), StatusCode::OK);
+    let view = server.robot(&robot).await;
+    assert!(view.conditions.iter().any(|condition| condition.code == "diverged"), "{view:?}");
+    assert_eq!(server.ask_desired(&robot).await.status(), StatusCode::CONFLICT);
+    let other = server.push("listener", "1.0.0").await;
+    server.deploy(&other, "*", "after").await;
+    let after = server.desired(&robot).await;
+    assert!(after.generation > state.generation);
+    let tasks: Vec<&str> = after.tasks.iter().map(|task| task.task.as_str()).collect();
+    assert_eq!(tasks, ["listener", "talker"]);
+    assert_eq!(after.tasks[1].package, later);
+    assert!(server.robot(&robot).await.conditions.is_empty());
+}

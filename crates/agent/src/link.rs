@@ -1,0 +1,194 @@
+//! The link to the server: reports out, desired states in, over MQTT while it is up and over HTTP otherwise. Polling never
+//! stops, it only gets slow, so that a broker that loses messages costs time and nothing else. It verifies nothing and
+//! decides nothing: the driver does.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use task_proto::Generation;
+use task_proto::api::ReportReply;
+use task_proto::envelope::Envelope;
+use task_proto::report::Report;
+use tokio::sync::{Notify, mpsc, watch};
+use tokio_util::sync::CancellationToken;
+
+use crate::effects::chain;
+use crate::plan::backoff_ms;
+use crate::server::{Server, ServerError};
+
+/// The longest wait before a report is posted again.
+const MAX_POST_BACKOFF_MS: u64 = 60 * 1000;
+/// The longest wait between polls while the server refuses the token.
+const REFUSED_POLL: Duration = Duration::from_secs(300);
+
+/// What the link tells the driver.
+#[derive(Debug)]
+pub enum Heard {
+    /// A desired state, not verified.
+    Desired(Box<Envelope>),
+    /// The server has nothing newer.
+    Unchanged,
+    /// A report is stored.
+    Confirmed {
+        /// Which.
+        seq: u64,
+        /// What the server said, if it was asked over HTTP.
+        reply: Option<ReportReply>,
+    },
+    /// The server does not know this robot's token.
+    TokenRefused,
+    /// The server knows the robot and sends it no state now.
+    Withheld {
+        /// The server's code.
+        code: String,
+        /// Its text.
+        text: String,
+    },
+}
+
+/// What driver and link share. The driver writes reports and the known generation, the link the rest.
+#[derive(Clone)]
+pub struct Shared {
+    /// The newest report.
+    pub reports: watch::Sender<Option<Arc<Report>>>,
+    /// The sequence number of the newest report that is stored.
+    pub confirmed: watch::Sender<u64>,
+    /// The generation the robot has; `None` asks for the state whatever its generation.
+    pub known: watch::Sender<Option<Generation>>,
+    /// Whether a session is up.
+    pub mqtt_up: watch::Sender<bool>,
+    /// Asks for a poll now.
+    pub poll: Arc<Notify>,
+    /// Asks for a report over HTTP now, whether MQTT is up or not.
+    pub post: Arc<Notify>,
+    /// The agent ends.
+    pub shutdown: CancellationToken,
+}
+
+/// How often to poll.
+#[derive(Debug, Clone, Copy)]
+pub struct Intervals {
+    /// While MQTT is up.
+    pub slow: Duration,
+    /// While it is not.
+    pub fast: Duration,
+}
+
+impl Shared {
+    /// Nothing said yet.
+    pub fn new(shutdown: CancellationToken) -> Self {
+        Self {
+            reports: watch::Sender::new(None),
+            confirmed: watch::Sender::new(0),
+            known: watch::Sender::new(None),
+            mqtt_up: watch::Sender::new(false),
+            poll: Arc::default(),
+            post: Arc::default(),
+            shutdown,
+        }
+    }
+}
+
+/// Polls for the desired state, until the agent ends.
+pub async fn poll(server: Server, shared: Shared, intervals: Intervals, heard: mpsc::Sender<Heard>) {
+    let mut mqtt_up = shared.mqtt_up.subscribe();
+    loop {
+        let known = *shared.known.borrow();
+        let outcome = server.desired(known).await;
+        let least = match &outcome {
+            Err(ServerError::TokenRefused(_)) => REFUSED_POLL.min(intervals.slow),
+            Err(ServerError::Busy { retry_after: Some(wait), .. }) => (*wait).min(intervals.slow),
+            _ => Duration::ZERO,
+        };
+        if heard.send(heard_of(outcome)).await.is_err() {
+            return;
+        }
+        loop {
+            let up = *mqtt_up.borrow_and_update();
+            let interval = jittered(if up { intervals.slow } else { intervals.fast }).max(least);
+            tokio::select! {
+                // Cancel-safe: a timer that is made anew each time.
+                () = tokio::time::sleep(interval) => {
+                    // A report over HTTP brings the name and labels the server holds, which MQTT does not.
+                    shared.post.notify_one();
+                    break;
+                }
+                // Cancel-safe: a permit that was not taken stays.
+                () = shared.poll.notified() => break,
+                // Cancel-safe: a watch remembers that it changed. The other interval holds from now on.
+                Ok(()) = mqtt_up.changed() => {}
+                // Cancel-safe: a token can be awaited again.
+                () = shared.shutdown.cancelled() => return,
+            }
+        }
+    }
+}
+
+fn heard_of(outcome: Result<Option<Envelope>, ServerError>) -> Heard {
+    match outcome {
+        Ok(Some(envelope)) => Heard::Desired(Box::new(envelope)),
+        Ok(None) => Heard::Unchanged,
+        Err(ServerError::TokenRefused(_)) => Heard::TokenRefused,
+        Err(ServerError::Refused { code, message }) => Heard::Withheld { code, text: message },
+        Err(error) => {
+            tracing::info!(error = %chain(&error), "no desired state over HTTP");
+            Heard::Withheld { code: "server_unreachable".to_owned(), text: chain(&error) }
+        }
+    }
+}
+
+/// Delivers reports over HTTP while MQTT is down, and now and then while it is up, until the agent ends.
+pub async fn post(server: Server, shared: Shared, heard: mpsc::Sender<Heard>) {
+    let (mut reports, mut mqtt_up) = (shared.reports.subscribe(), shared.mqtt_up.subscribe());
+    let mut asked = true;
+    let mut failures = 0;
+    loop {
+        let newest = reports.borrow_and_update().clone();
+        let up = *mqtt_up.borrow_and_update();
+        let due = newest.filter(|report| asked || (!up && report.seq > *shared.confirmed.borrow()));
+        let mut retry = Duration::MAX;
+        if let Some(report) = due {
+            match server.report(&report).await {
+                Ok(reply) => {
+                    (asked, failures) = (false, 0);
+                    shared.confirmed.send_modify(|confirmed| *confirmed = (*confirmed).max(report.seq));
+                    if heard.send(Heard::Confirmed { seq: report.seq, reply: Some(reply) }).await.is_err() {
+                        return;
+                    }
+                    continue;
+                }
+                Err(error) => {
+                    tracing::info!(error = %chain(&error), "no report over HTTP");
+                    failures += 1;
+                    if matches!(error, ServerError::TokenRefused(_)) && heard.send(Heard::TokenRefused).await.is_err() {
+                        return;
+                    }
+                    retry = Duration::from_millis(backoff_ms(failures, MAX_POST_BACKOFF_MS, rand::random()).max(100));
+                }
+            }
+        }
+        let newer = async {
+            if retry == Duration::MAX {
+                // Nothing failed: a new report goes out at once.
+                let _ = reports.changed().await;
+            } else {
+                tokio::time::sleep(retry).await;
+            }
+        };
+        tokio::select! {
+            // Cancel-safe: a watch remembers that it changed, a timer is made anew.
+            () = newer => {}
+            // Cancel-safe: a watch remembers that it changed.
+            Ok(()) = mqtt_up.changed() => {}
+            // Cancel-safe: a permit that was not taken stays.
+            () = shared.post.notified() => asked = true,
+            // Cancel-safe: a token can be awaited again.
+            () = shared.shutdown.cancelled() => return,
+        }
+    }
+}
+
+/// Between half and one and a half of the interval, so that a fleet that began together does not poll together.
+fn jittered(interval: Duration) -> Duration {
+    interval.mul_f64(0.5 + rand::random::<f64>())
+}

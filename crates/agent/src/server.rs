@@ -1,0 +1,173 @@
+//! The HTTP half of the link: enrol, ask for the desired state, deliver reports. It tells "the server said no" from
+//! "something else answered" (a captive portal, a proxy); it never retries and decides nothing.
+
+use std::time::Duration;
+
+use reqwest::header::{ETAG, HeaderMap, IF_NONE_MATCH, RETRY_AFTER};
+use reqwest::{Method, StatusCode, Url};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use task_proto::api::{EnrollRequest, EnrollResponse, ErrorBody, ReportReply};
+use task_proto::envelope::Envelope;
+use task_proto::report::Report;
+use task_proto::{Generation, RobotId};
+
+/// The longest answer that is read.
+const MAX_ANSWER_BYTES: usize = 8 * 1024 * 1024;
+/// How long a connection may take to come about.
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(10);
+/// How long a whole request may take.
+const REQUEST_TIMEOUT: Duration = Duration::from_secs(30);
+
+/// Why there is no answer to use.
+#[derive(Debug, thiserror::Error)]
+pub enum ServerError {
+    /// No connection, or it broke.
+    #[error("the server can't be reached")]
+    Unreachable(#[source] reqwest::Error),
+    /// Something answered that is not taskd.
+    #[error("something else answers in the server's place: {0}")]
+    NotTheServer(String),
+    /// The token is not accepted.
+    #[error("the server does not accept the token: {0}")]
+    TokenRefused(String),
+    /// The server is overloaded, restarting or broken.
+    #[error("the server answers {status}")]
+    Busy {
+        /// The HTTP status.
+        status: u16,
+        /// When it wants to be asked again.
+        retry_after: Option<Duration>,
+    },
+    /// The server said no.
+    #[error("the server refuses: {message} ({code})")]
+    Refused {
+        /// The stable code.
+        code: String,
+        /// For people.
+        message: String,
+    },
+}
+
+/// The server, as one registered robot sees it.
+#[derive(Clone)]
+pub struct Server {
+    client: reqwest::Client,
+    base: Url,
+    robot: RobotId,
+    token: String,
+}
+
+/// The one HTTP client of the agent.
+pub fn client() -> Result<reqwest::Client, reqwest::Error> {
+    // The second call in a process finds it installed: that is fine.
+    let _ = rustls::crypto::ring::default_provider().install_default();
+    reqwest::Client::builder()
+        .connect_timeout(CONNECT_TIMEOUT)
+        .timeout(REQUEST_TIMEOUT)
+        .redirect(reqwest::redirect::Policy::none())
+        .user_agent(concat!("task-agent/", env!("CARGO_PKG_VERSION")))
+        .build()
+}
+
+/// Registers a robot.
+pub async fn enroll(
+    client: &reqwest::Client,
+    base: &Url,
+    token: &str,
+    request: &EnrollRequest,
+) -> Result<EnrollResponse, ServerError> {
+    let answer = send(client, Method::POST, at(base, "enroll"), token, Some(request), None).await?;
+    parse(&answer.body)
+}
+
+impl Server {
+    /// The server at `base`, for the robot with this token.
+    pub fn new(client: reqwest::Client, base: Url, robot: RobotId, token: String) -> Self {
+        Self { client, base, robot, token }
+    }
+
+    /// The signed desired state; `None` if it still has the generation `known`.
+    pub async fn desired(&self, known: Option<Generation>) -> Result<Option<Envelope>, ServerError> {
+        let url = at(&self.base, &format!("robots/{}/desired", self.robot));
+        let answer = send::<()>(&self.client, Method::GET, url, &self.token, None, known).await?;
+        if answer.status == StatusCode::NOT_MODIFIED {
+            return Ok(None);
+        }
+        tracing::debug!(etag = ?answer.headers.get(ETAG), "the server sent a desired state");
+        parse(&answer.body).map(Some)
+    }
+
+    /// Delivers a report; once this returns it is stored.
+    pub async fn report(&self, report: &Report) -> Result<ReportReply, ServerError> {
+        let url = at(&self.base, &format!("robots/{}/report", self.robot));
+        let answer = send(&self.client, Method::POST, url, &self.token, Some(report), None).await?;
+        parse(&answer.body)
+    }
+}
+
+struct Answer {
+    status: StatusCode,
+    headers: HeaderMap,
+    body: Vec<u8>,
+}
+
+fn at(base: &Url, path: &str) -> Url {
+    let mut url = base.clone();
+    url.set_path(&format!("{}{}/{path}", base.path().trim_end_matches('/'), task_proto::api::BASE));
+    url
+}
+
+async fn send<B: Serialize>(
+    client: &reqwest::Client,
+    method: Method,
+    url: Url,
+    token: &str,
+    body: Option<&B>,
+    known: Option<Generation>,
+) -> Result<Answer, ServerError> {
+    let mut request = client.request(method, url).bearer_auth(token);
+    if let Some(body) = body {
+        request = request.json(body);
+    }
+    if let Some(generation) = known {
+        request = request.header(IF_NONE_MATCH, format!("\"{generation}\""));
+    }
+    let mut response = request.send().await.map_err(ServerError::Unreachable)?;
+    let (status, headers) = (response.status(), response.headers().clone());
+    let mut bytes = Vec::new();
+    while let Some(chunk) = response.chunk().await.map_err(ServerError::Unreachable)? {
+        if bytes.len() + chunk.len() > MAX_ANSWER_BYTES {
+            return Err(ServerError::NotTheServer(format!("an answer of more than {MAX_ANSWER_BYTES} bytes")));
+        }
+        bytes.extend_from_slice(&chunk);
+    }
+    let answer = Answer { status, headers, body: bytes };
+    if status.is_success() || status == StatusCode::NOT_MODIFIED { Ok(answer) } else { Err(refusal(&answer)) }
+}
+
+fn refusal(answer: &Answer) -> ServerError {
+    let status = answer.status;
+    if status.is_server_error() || status == StatusCode::TOO_MANY_REQUESTS {
+        let seconds = answer.headers.get(RETRY_AFTER).and_then(|value| value.to_str().ok()?.parse().ok());
+        return ServerError::Busy { status: status.as_u16(), retry_after: seconds.map(Duration::from_secs) };
+    }
+    // A proxy also says 401 or 403; only the server says it in its own words.
+    let Ok(body) = serde_json::from_slice::<ErrorBody>(&answer.body) else { return not_the_server(answer) };
+    if status == StatusCode::UNAUTHORIZED {
+        return ServerError::TokenRefused(body.error.message);
+    }
+    ServerError::Refused { code: body.error.code, message: body.error.message }
+}
+
+fn not_the_server(answer: &Answer) -> ServerError {
+    let start = String::from_utf8_lossy(&answer.body[..answer.body.len().min(80)]).replace(char::is_control, " ");
+    ServerError::NotTheServer(format!("status {}, {start:?}", answer.status.as_u16()))
+}
+
+fn parse<T: DeserializeOwned>(body: &[u8]) -> Result<T, ServerError> {
+    serde_json::from_slice(body).map_err(|_| {
+        let start = String::from_utf8_lossy(&body[..body.len().min(80)]).replace(char::is_control, " ");
+        ServerError::NotTheServer(format!("{start:?} where JSON should be"))
+    })
+}

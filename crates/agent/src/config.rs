@@ -16,8 +16,8 @@ use crate::durable;
 pub const FILE_NAME: &str = "agent.toml";
 /// What every variable starts with.
 const VARIABLE_PREFIX: &str = "TASK_AGENT_";
-/// Variables that are no settings: the data directory and the log filter.
-const OTHER_VARIABLES: [&str; 2] = ["TASK_AGENT_DATA", "TASK_AGENT_LOG"];
+/// Variables that are no settings: the data directory, the log filter, the enrolment token.
+const OTHER_VARIABLES: [&str; 3] = ["TASK_AGENT_DATA", "TASK_AGENT_LOG", "TASK_AGENT_ENROLL_TOKEN"];
 
 /// The property file. What is absent has its default.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]

@@ -47,6 +47,9 @@ pub trait Effects: Send + Sync + 'static {
     /// What the reports say of the machine.
     fn host_facts(&self) -> HostFacts;
 
+    /// The runs whose processes live, found without the ledger.
+    fn survivors(&self) -> impl Future<Output = Vec<(TaskName, ActiveRun)>> + Send;
+
     /// What is on the disk of this version.
     fn prepared(&self, package: &PackageRef) -> impl Future<Output = Prepared> + Send;
 

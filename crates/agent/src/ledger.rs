@@ -8,7 +8,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use task_proto::desired::{DesiredTask, PackageRef, Wanted};
+use task_proto::desired::{Delivery, DesiredTask, PackageRef, Wanted};
 use task_proto::envelope::Envelope;
 use task_proto::manifest::{OnBoot, Restart, TaskKind, TaskManifest};
 use task_proto::report::{Failure, Phase};
@@ -269,6 +269,23 @@ impl TaskRecord {
             phase: Phase::Assigned,
             phase_since_ms: now_ms,
         };
+        record.settle_phase(now_ms);
+        record
+    }
+
+    /// The record of a run that was found alive when the ledger was lost: as if it were ordered, until the server has
+    /// said what is.
+    pub fn of_survivor(task: TaskName, run: ActiveRun, now_ms: u64) -> Self {
+        let order = DesiredTask {
+            task,
+            deployment: run.deployment.clone(),
+            package: run.package.clone(),
+            wanted: Wanted::Running,
+            run: run.run,
+            delivery: Delivery::default(),
+        };
+        let mut record = Self::new(order, now_ms);
+        record.active = Some(run);
         record.settle_phase(now_ms);
         record
     }

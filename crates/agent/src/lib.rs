@@ -7,6 +7,7 @@ pub mod commands;
 pub mod config;
 pub mod containment;
 pub mod disk;
+pub mod driver;
 pub mod durable;
 pub mod effects;
 pub mod environment;

@@ -52,8 +52,8 @@ pub struct Exit {
 pub struct RobotFacts {
     /// The processor architecture.
     pub arch: String,
-    /// The labels, the server's if they are known.
-    pub labels: Labels,
+    /// The labels the server holds; `None` until it has said.
+    pub labels: Option<Labels>,
     /// ROS distributions found.
     pub ros_distros: Vec<String>,
 }
@@ -63,7 +63,7 @@ impl RobotFacts {
     pub fn lacks(&self, requires: &Requires) -> Vec<String> {
         let mut lacks = Vec::new();
         for (key, value) in &requires.labels {
-            match self.labels.get(key) {
+            match self.labels.as_ref().and_then(|labels| labels.get(key)) {
                 Some(have) if have == value => {}
                 Some(have) => lacks.push(format!("label {key}={value} (it has {key}={have})")),
                 None => lacks.push(format!("label {key}={value}")),
@@ -108,7 +108,7 @@ mod tests {
     fn what_is_lacking_is_listed_by_the_packages_keys() {
         let robot = RobotFacts {
             arch: "x86_64".to_owned(),
-            labels: [("base".parse().expect("valid"), "husky".parse().expect("valid"))].into(),
+            labels: Some([("base".parse().expect("valid"), "husky".parse().expect("valid"))].into()),
             ros_distros: vec!["jazzy".to_owned()],
         };
         let mut requires = Requires::default();

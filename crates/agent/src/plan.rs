@@ -86,7 +86,7 @@ pub enum Step {
     /// Build it.
     Build(PackageRef),
     /// Make this run the active one and start a process of it.
-    Start(ActiveRun),
+    Start(Box<ActiveRun>),
     /// Stop the active run's process.
     Stop {
         /// Which.
@@ -184,6 +184,9 @@ pub fn prepare(s: &Situation<'_>) -> Next {
         return Next::Rest { until_ms: Some(preparation.retry_at_ms) };
     }
     let Some(manifest) = &s.prepared.manifest else { return Next::Act(Step::PullManifest(order.package.clone())) };
+    if s.robot.labels.is_none() && !manifest.requires.labels.is_empty() {
+        return NOTHING;
+    }
     let lacks = s.robot.lacks(&manifest.requires);
     if !lacks.is_empty() {
         let text =
@@ -260,14 +263,14 @@ fn without_process(s: &Situation<'_>, active: Option<&ActiveRun>) -> Next {
         && active.is_none_or(|active| !active.is_for(order))
         && let Some(manifest) = &s.prepared.manifest
     {
-        return Next::Act(Step::Start(ActiveRun::of(order, RunRules::from(manifest), s.now_ms)));
+        return Next::Act(Step::Start(Box::new(ActiveRun::of(order, RunRules::from(manifest), s.now_ms))));
     }
     match active {
         Some(active) if active.end.is_none() && s.held => tidy(s, None),
         Some(active) if active.end.is_none() && s.now_ms < active.retry_at_ms => {
             Next::Rest { until_ms: Some(active.retry_at_ms) }
         }
-        Some(active) if active.end.is_none() => Next::Act(Step::Start(active.clone())),
+        Some(active) if active.end.is_none() => Next::Act(Step::Start(Box::new(active.clone()))),
         _ => tidy(s, None),
     }
 }

@@ -1,17 +1,153 @@
-//! `task-agent configure`.
+//! `task-agent configure`: the paper's form. It shows the MAC that was found, asks for what it can't know, and writes the
+//! property file. Flags answer questions; with `--yes` the rest keeps its value.
 
+use std::io::{IsTerminal as _, Write as _};
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use super::DataDir;
+use anyhow::{Context as _, bail};
+use task_proto::RobotName;
+use task_proto::id::{LabelKey, LabelValue};
+
+use super::enroll::parse_label;
+use super::{DataDir, say};
+use crate::config::{FILE_NAME, Settings, parse_server};
+use crate::durable;
+use crate::identity;
+use crate::layout::DataDir as Layout;
+use crate::underlay::{SYSTEM_ROOT, Underlays};
 
 /// Arguments of `configure`.
 #[derive(Debug, clap::Args)]
 pub struct Arguments {
+    /// The server's URL
+    #[arg(long, value_name = "URL")]
+    server: Option<String>,
+    /// The robot's name
+    #[arg(long)]
+    name: Option<RobotName>,
+    /// A label; may be given more than once. Those given replace all others
+    #[arg(long = "label", value_name = "K=V", value_parser = parse_label)]
+    labels: Vec<(LabelKey, LabelValue)>,
+    /// A setup file to source before a task is built or run; may be given more than once
+    #[arg(long = "underlay", value_name = "FILE")]
+    underlays: Vec<PathBuf>,
+    /// Ask nothing: what is not given keeps its value
+    #[arg(long, short)]
+    yes: bool,
     #[command(flatten)]
     data: DataDir,
 }
 
-/// Runs the subcommand.
+/// Asks, and writes the property file.
 pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
-    anyhow::bail!("nothing is enrolled in {}", arguments.data.data.display())
+    let data = Layout::new(&arguments.data.data)?;
+    let mut settings = Settings::read(data.root())?;
+    match identity::find_mac(Path::new(identity::INTERFACES)) {
+        Ok(mac) => say(format_args!("MAC address: {mac}")),
+        Err(error) => say(format_args!("MAC address: {error} when you enroll")),
+    }
+    if !arguments.yes && !std::io::stdin().is_terminal() {
+        bail!("there is no terminal to ask at: give the values as flags, with --yes");
+    }
+    apply_flags(&mut settings, &arguments)?;
+    if !arguments.yes {
+        ask_for_the_rest(&mut settings, &arguments)?;
+    }
+    durable::create_dir_all(data.root()).with_context(|| format!("cannot make {}", data.root().display()))?;
+    settings.write(data.root())?;
+    say(format_args!("wrote {}", data.root().join(FILE_NAME).display()));
+    Ok(ExitCode::SUCCESS)
+}
+
+fn apply_flags(settings: &mut Settings, arguments: &Arguments) -> anyhow::Result<()> {
+    if let Some(server) = &arguments.server {
+        settings.server = Some(parse_server(server)?.to_string());
+    }
+    if let Some(name) = &arguments.name {
+        settings.name = Some(name.clone());
+    }
+    if !arguments.labels.is_empty() {
+        settings.labels = Some(arguments.labels.iter().cloned().collect());
+    }
+    if !arguments.underlays.is_empty() {
+        settings.underlays = Some(arguments.underlays.clone());
+    }
+    Ok(())
+}
+
+fn ask_for_the_rest(settings: &mut Settings, arguments: &Arguments) -> anyhow::Result<()> {
+    if arguments.server.is_none() {
+        let server = settings.server.clone().unwrap_or_else(|| "http://localhost:8080".to_owned());
+        settings.server = ask("Server", &server, |text| Ok(parse_server(text)?.to_string()))?;
+    }
+    if arguments.name.is_none() {
+        let hostname = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
+        let name = settings.name.as_ref().map_or(hostname.trim().to_owned(), ToString::to_string);
+        settings.name = ask("Name", &name, |text| Ok(text.parse()?))?;
+    }
+    if arguments.labels.is_empty() {
+        let pairs = settings.labels.iter().flatten().map(|(key, value)| format!("{key}={value}"));
+        settings.labels = ask("Labels (key=value,…)", &pairs.collect::<Vec<_>>().join(","), |text| {
+            let labels = text.split(',').filter(|pair| !pair.trim().is_empty());
+            labels.map(|pair| parse_label(pair.trim()).map_err(anyhow::Error::msg)).collect()
+        })?;
+    }
+    if arguments.underlays.is_empty() {
+        let underlays = match &settings.underlays {
+            Some(underlays) => underlays.clone(),
+            None => Underlays::find(&[], Path::new(SYSTEM_ROOT)).for_task(&[]).unwrap_or_default(),
+        };
+        let shown = underlays.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(":");
+        settings.underlays = ask("ROS setup file (a:b for several)", &shown, |text| {
+            Ok(text.split(':').filter(|path| !path.is_empty()).map(PathBuf::from).collect())
+        })?;
+    }
+    Ok(())
+}
+
+/// Asks until the answer can be used; an empty one takes the default, and where that is empty too, nothing.
+fn ask<T>(question: &str, default: &str, parse: impl Fn(&str) -> anyhow::Result<T>) -> anyhow::Result<Option<T>> {
+    loop {
+        let mut out = std::io::stdout().lock();
+        write!(out, "{question} [{default}]: ")?;
+        out.flush()?;
+        let mut answer = String::new();
+        if std::io::stdin().read_line(&mut answer)? == 0 {
+            bail!("the form was left: nothing is written");
+        }
+        let answer = if answer.trim().is_empty() { default } else { answer.trim() };
+        if answer.is_empty() {
+            return Ok(None);
+        }
+        match parse(answer) {
+            Ok(value) => return Ok(Some(value)),
+            Err(error) => say(format_args!("  {error:#}")),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn flags_are_written_and_what_is_not_given_stays() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let arguments = |name: Option<&str>, server: Option<&str>| Arguments {
+            server: server.map(str::to_owned),
+            name: name.map(|name| name.parse().expect("valid")),
+            labels: vec![parse_label("site=lab").expect("valid")],
+            underlays: Vec::new(),
+            yes: true,
+            data: DataDir { data: dir.path().to_owned() },
+        };
+        run(arguments(None, Some("http://server:8080"))).expect("written");
+        run(arguments(Some("atlas"), None)).expect("written");
+        let settings = Settings::read(dir.path()).expect("read");
+        assert_eq!(settings.server.as_deref(), Some("http://server:8080/"));
+        assert_eq!(settings.name.expect("given").as_str(), "atlas");
+        assert_eq!(settings.labels.expect("given").len(), 1);
+        assert!(run(arguments(None, Some("nonsense"))).is_err());
+    }
 }

@@ -1,17 +1,141 @@
-//! `task-agent enroll`.
+//! `task-agent enroll`: registers this robot at a server with an enrolment token, and keeps who it is.
 
 use std::process::ExitCode;
 
-use super::DataDir;
+use anyhow::{Context as _, bail};
+use task_proto::api::{EnrollRequest, EnrollResponse};
+use task_proto::envelope::PublicKey;
+use task_proto::id::{LabelKey, LabelValue};
+use task_proto::token::{Token, TokenKind};
+use task_proto::{MacAddress, RobotName};
+
+use super::{DataDir, say};
+use crate::admission;
+use crate::config::{Config, Settings, parse_server};
+use crate::durable;
+use crate::identity::{self, Identity};
+use crate::layout::DataDir as Layout;
+use crate::server::{self, Server, ServerError};
 
 /// Arguments of `enroll`.
 #[derive(Debug, clap::Args)]
 pub struct Arguments {
+    /// The server's URL; absent: the one in the property file
+    #[arg(long, value_name = "URL")]
+    server: Option<String>,
+    /// The enrolment token: `taskd enroll-token create` makes one
+    #[arg(long, value_name = "TOKEN", env = "TASK_AGENT_ENROLL_TOKEN", hide_env_values = true)]
+    token: String,
+    /// The robot's name
+    #[arg(long)]
+    name: Option<RobotName>,
+    /// A label; may be given more than once
+    #[arg(long = "label", value_name = "K=V", value_parser = parse_label)]
+    labels: Vec<(LabelKey, LabelValue)>,
+    /// The MAC the robot shall be known by; absent: that of its first physical network interface
+    #[arg(long)]
+    mac: Option<MacAddress>,
+    /// Register anew although this robot is registered
+    #[arg(long)]
+    force: bool,
     #[command(flatten)]
     data: DataDir,
 }
 
-/// Runs the subcommand.
+/// Reads `key=value`.
+pub(super) fn parse_label(text: &str) -> Result<(LabelKey, LabelValue), String> {
+    let (key, value) = text.split_once('=').ok_or("expected key=value")?;
+    let key = key.parse().map_err(|error: task_proto::id::InvalidId| error.to_string())?;
+    Ok((key, value.parse().map_err(|error: task_proto::id::InvalidId| error.to_string())?))
+}
+
+/// Registers the robot.
 pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
-    anyhow::bail!("nothing is enrolled in {}", arguments.data.data.display())
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    runtime.block_on(enroll(arguments))
+}
+
+async fn enroll(arguments: Arguments) -> anyhow::Result<ExitCode> {
+    let data = Layout::new(&arguments.data.data)?;
+    if data.identity().exists() && !arguments.force {
+        let known = Identity::read(&data.identity())?;
+        bail!("this robot is registered as {} at {}: use --force to register it anew", known.robot_id, known.server);
+    }
+    let token: Token = arguments.token.parse().context("--token")?;
+    let (TokenKind::Enrolment, Some(key)) = (token.kind(), token.server_key()) else {
+        bail!("--token: this is no enrolment token; taskd enroll-token create makes one");
+    };
+    let config = Config::load(data.root(), std::env::vars())?;
+    let server = match (&arguments.server, &config.server) {
+        (Some(server), _) => parse_server(server)?,
+        (None, Some(server)) => server.clone(),
+        (None, None) => bail!("--server: no server is given, here or in the property file"),
+    };
+    let mac = match arguments.mac {
+        Some(mac) => mac,
+        None => identity::find_mac(std::path::Path::new(identity::INTERFACES))?,
+    };
+    durable::create_dir_all(data.root()).with_context(|| format!("cannot make {}", data.root().display()))?;
+
+    let mut labels = config.labels.clone().unwrap_or_default();
+    labels.extend(arguments.labels.iter().cloned());
+    let request = EnrollRequest { mac, name: arguments.name.clone().or(config.name.clone()), labels: labels.clone() };
+    let client = server::client()?;
+    let response = match server::enroll(&client, &server, &arguments.token, &request).await {
+        Ok(response) => response,
+        Err(error) => return Err(anyhow::Error::new(error).context(format!("{server} did not register the robot"))),
+    };
+    check_key(&Server::new(client, server.clone(), response.robot_id.clone(), response.token.clone()), &response, key)
+        .await?;
+
+    remember_settings(&data, &arguments, &server, &response, labels)?;
+    let robot = Identity {
+        robot_id: response.robot_id.clone(),
+        token: response.token,
+        server: server.to_string(),
+        server_key: key.clone(),
+        mqtt: response.mqtt,
+        mac,
+    };
+    robot.write(&data.identity())?;
+    say(format_args!("{} is registered at {server} as {}, by {mac}", response.name, response.robot_id));
+    Ok(ExitCode::SUCCESS)
+}
+
+/// The server must hold the key that the token pins: a desired state that it signed shows it.
+async fn check_key(server: &Server, response: &EnrollResponse, key: &PublicKey) -> anyhow::Result<()> {
+    match server.desired(None).await {
+        Ok(Some(envelope)) => {
+            admission::open(&envelope, key, &response.robot_id)
+                .context("the server does not hold the key that the enrolment token names")?;
+            Ok(())
+        }
+        Ok(None) => bail!("the server sent no desired state to verify its key by"),
+        // Whoever withholds the state may still be the right server; every state is verified before it is obeyed.
+        Err(ServerError::Refused { .. }) => Ok(()),
+        Err(error) => Err(anyhow::Error::new(error).context("the server's key could not be verified")),
+    }
+}
+
+/// Keeps in the property file what was given on the command line.
+fn remember_settings(
+    data: &Layout,
+    arguments: &Arguments,
+    server: &reqwest::Url,
+    response: &EnrollResponse,
+    labels: task_proto::id::Labels,
+) -> anyhow::Result<()> {
+    let before = Settings::read(data.root())?;
+    let mut settings = before.clone();
+    settings.server = Some(server.to_string());
+    if arguments.name.is_some() {
+        settings.name = Some(response.name.clone());
+    }
+    if !arguments.labels.is_empty() {
+        settings.labels = Some(labels);
+    }
+    if settings != before {
+        settings.write(data.root())?;
+    }
+    Ok(())
 }

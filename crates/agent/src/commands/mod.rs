@@ -26,3 +26,9 @@ pub struct DataDir {
 pub fn print_error(error: &anyhow::Error) {
     eprintln!("task-agent: {error:#}");
 }
+
+/// Prints a line on stdout. A reader that has gone away is no reason to fail.
+fn say(line: std::fmt::Arguments<'_>) {
+    use std::io::Write as _;
+    let _ = writeln!(std::io::stdout(), "{line}");
+}

@@ -1,8 +1,34 @@
-//! `task-agent run`.
+//! `task-agent run`: puts the agent together and drives until a signal. Tasks go on running afterwards; under systemd
+//! that needs `KillMode=process`.
 
+use std::fs::{File, TryLockError};
 use std::process::ExitCode;
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::Context as _;
+use task_proto::report::Status;
+use task_proto::{Digest, InstanceId};
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
 
 use super::DataDir;
+use crate::config::{Config, parse_server};
+use crate::driver::{Driver, Speaker};
+use crate::effects::Robot;
+use crate::fetch::{FetchSettings, Fetcher};
+use crate::identity::Identity;
+use crate::layout::DataDir as Layout;
+use crate::ledger::{Found, Ledger};
+use crate::link::{self, Intervals, Shared};
+use crate::mqtt::{self, MqttAccess};
+use crate::server::{self, Server};
+use crate::{clock, process};
+
+/// Messages from the link that the driver has not taken yet.
+const QUEUED_MESSAGES: usize = 16;
+/// How long what is left may take after a signal.
+const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(3);
 
 /// Arguments of `run`.
 #[derive(Debug, clap::Args)]
@@ -11,7 +37,129 @@ pub struct Arguments {
     data: DataDir,
 }
 
-/// Runs the subcommand.
+/// Runs the agent until SIGINT or SIGTERM.
 pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
-    anyhow::bail!("nothing is enrolled in {}", arguments.data.data.display())
+    start_logging();
+    // Two, also on one core: writing the ledger to a slow card must not keep the link from being served.
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
+    let outcome = runtime.block_on(drive(arguments));
+    runtime.shutdown_timeout(SHUTDOWN_TIMEOUT);
+    outcome.map(|()| ExitCode::SUCCESS)
+}
+
+async fn drive(arguments: Arguments) -> anyhow::Result<()> {
+    let data = Layout::new(&arguments.data.data)?;
+    let identity = Identity::read(&data.identity())?;
+    let config = Config::load(data.root(), std::env::vars())?;
+    let _lock = lock(&data)?;
+    let (ledger, lost) = open_ledger(&data)?;
+    let ordered: Vec<Digest> = ledger.tasks.values().map(|record| record.order.package.content.digest).collect();
+    data.clean_leftovers().and_then(|()| data.clean_parts(&ordered)).context("cannot clean the data directory")?;
+    let base = match &config.server {
+        Some(server) => server.clone(),
+        None => parse_server(&identity.server)?,
+    };
+    let client = server::client().context("cannot make an HTTP client")?;
+    let fetcher =
+        Fetcher::new(client.clone(), base.clone(), identity.token.clone(), data.clone(), fetch_settings(&config));
+    let robot = Arc::new(Robot::new(data.clone(), fetcher, &config, identity.mac));
+    let shutdown = CancellationToken::new();
+    let shared = Shared::new(shutdown.clone());
+    let instance = InstanceId::random();
+    let speaker = Speaker {
+        robot_id: identity.robot_id.clone(),
+        server_key: identity.server_key.clone(),
+        instance: instance.clone(),
+        boot_id: process::boot_id().context("cannot read the kernel's boot id")?,
+        name: config.name.clone(),
+        labels: config.labels.clone(),
+        parallel_tasks: config.parallel_tasks,
+    };
+    let status = Status { online: true, start: ledger.start + 1, instance, connection: 0 };
+    let driver = Driver::new(robot, speaker, shared.clone(), ledger, lost).await;
+    tracing::info!(robot = %identity.robot_id, server = %base, "task-agent runs");
+
+    let (heard, messages) = mpsc::channel(QUEUED_MESSAGES);
+    let server = Server::new(client, base.clone(), identity.robot_id.clone(), identity.token.clone());
+    let intervals = Intervals { slow: config.poll_interval, fast: config.poll_interval_without_mqtt };
+    tokio::spawn(link::poll(server.clone(), shared.clone(), intervals, heard.clone()));
+    tokio::spawn(link::post(server, shared.clone(), heard.clone()));
+    if config.mqtt {
+        let host = identity.mqtt.host.clone().or_else(|| base.host_str().map(str::to_owned)).unwrap_or_default();
+        let (port, prefix) = (identity.mqtt.port, identity.mqtt.prefix.clone());
+        let access = MqttAccess { host, port, prefix, robot: identity.robot_id, token: identity.token, status };
+        tokio::spawn(mqtt::run(access, shared, heard));
+    }
+    let stop = tokio::spawn(cancel_on_signal(shutdown));
+    driver.run(messages).await;
+    stop.abort();
+    tracing::info!("task-agent ends; its tasks go on running");
+    Ok(())
+}
+
+fn start_logging() {
+    let filter = tracing_subscriber::EnvFilter::try_from_env("TASK_AGENT_LOG")
+        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info,rumqttc=warn"));
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+}
+
+/// Keeps a second agent away from the data directory while this one lives.
+fn lock(data: &Layout) -> anyhow::Result<File> {
+    let path = data.root().join("lock");
+    let file = File::create(&path).with_context(|| format!("cannot make {}", path.display()))?;
+    match file.try_lock() {
+        Ok(()) => Ok(file),
+        Err(TryLockError::WouldBlock) => {
+            anyhow::bail!("another task-agent already runs in {}", data.root().display())
+        }
+        Err(TryLockError::Error(error)) => Err(error).with_context(|| format!("cannot lock {}", path.display())),
+    }
+}
+
+/// The ledger, and what to say if an earlier one could not be read.
+fn open_ledger(data: &Layout) -> anyhow::Result<(Ledger, Option<String>)> {
+    // The start counter must be above that of the lost ledger; seconds since 1970 are above any count of starts.
+    let rebuilt = || Ledger::new(clock::wall_ms().max(clock::PROGRAM_EXISTS_SINCE_MS) / 1000);
+    Ok(match Ledger::read(&data.ledger())? {
+        Found::Ledger(ledger) => (*ledger, None),
+        Found::Nothing if data.task_names()?.is_empty() => (Ledger::new(0), None),
+        Found::Nothing => {
+            (rebuilt(), Some("the ledger was gone: it was rebuilt from the running processes".to_owned()))
+        }
+        Found::Unreadable(aside) => {
+            let text = format!(
+                "the ledger could not be read and was moved to {}: it was rebuilt from the running processes",
+                aside.display()
+            );
+            (rebuilt(), Some(text))
+        }
+    })
+}
+
+fn fetch_settings(config: &Config) -> FetchSettings {
+    let mut settings = FetchSettings::default();
+    let limits = &config.limits;
+    settings.limits.bytes = limits.archive_bytes.unwrap_or(settings.limits.bytes);
+    settings.limits.entries = limits.archive_entries.unwrap_or(settings.limits.entries);
+    settings.reserve_bytes = limits.disk_reserve_bytes.unwrap_or(settings.reserve_bytes);
+    settings
+}
+
+async fn cancel_on_signal(shutdown: CancellationToken) {
+    use tokio::signal::unix::{SignalKind, signal};
+    let (interrupt, terminate) = (signal(SignalKind::interrupt()), signal(SignalKind::terminate()));
+    match (interrupt, terminate) {
+        (Ok(mut interrupt), Ok(mut terminate)) => {
+            tokio::select! {
+                // Cancel-safe, and nothing follows: a signal stays noticed until it is received.
+                _ = interrupt.recv() => {}
+                // Cancel-safe, likewise.
+                _ = terminate.recv() => {}
+            }
+            shutdown.cancel();
+        }
+        (interrupt, terminate) => {
+            tracing::error!(?interrupt, ?terminate, "signals can't be received: only SIGKILL ends this agent");
+        }
+    }
 }

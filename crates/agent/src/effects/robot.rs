@@ -8,7 +8,6 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use task_proto::desired::PackageRef;
-use task_proto::id::Labels;
 use task_proto::manifest::{BuildTool, TaskManifest};
 use task_proto::report::{Failure, FailureCode, HostFacts, Progress};
 use task_proto::{Digest, MacAddress, TaskName};
@@ -30,6 +29,8 @@ use crate::{clock, disk, durable, environment, script};
 
 /// Written into a version's directory once it is built.
 const BUILT_MARKER: &str = "built";
+/// Written into a run's directory before its start: what the ledger says of the run, should the ledger be lost.
+const RUN_RECORD: &str = "run.json";
 /// How much of a log's end goes into a failure's text.
 const TAIL_BYTES: u64 = 2048;
 /// Variables of the agent's own environment that say how ROS finds its peers; the tasks get them too.
@@ -51,7 +52,6 @@ pub struct Robot {
     environment: BTreeMap<String, String>,
     build_limits: BuildLimits,
     log_bytes: Option<u64>,
-    labels: Labels,
     mac: MacAddress,
 }
 
@@ -77,7 +77,6 @@ impl Robot {
             environment: environment::of_this_robot(&settings),
             build_limits,
             log_bytes: config.limits.log_bytes,
-            labels: config.labels.clone().unwrap_or_default(),
             mac,
         }
     }
@@ -134,15 +133,27 @@ impl Effects for Robot {
     }
 
     fn robot_facts(&self) -> RobotFacts {
-        RobotFacts {
-            arch: std::env::consts::ARCH.to_owned(),
-            labels: self.labels.clone(),
-            ros_distros: self.underlays.distros(),
-        }
+        RobotFacts { arch: std::env::consts::ARCH.to_owned(), labels: None, ros_distros: self.underlays.distros() }
     }
 
     fn host_facts(&self) -> HostFacts {
         host_facts(self.data.root(), self.mac, self.underlays.distros())
+    }
+
+    async fn survivors(&self) -> Vec<(TaskName, ActiveRun)> {
+        let mut survivors = Vec::new();
+        for task in self.data.task_names().unwrap_or_default() {
+            for entry in std::fs::read_dir(self.data.task(&task).run()).into_iter().flatten().flatten() {
+                let record = std::fs::read(entry.path().join(RUN_RECORD)).ok();
+                let Some(run) = record.and_then(|bytes| serde_json::from_slice::<ActiveRun>(&bytes).ok()) else {
+                    continue;
+                };
+                if let Ok(Observed::Running { .. }) = self.supervisor.observe(&entry.path()).await {
+                    survivors.push((task.clone(), run));
+                }
+            }
+        }
+        survivors
     }
 
     async fn prepared(&self, package: &PackageRef) -> Prepared {
@@ -228,7 +239,11 @@ impl Effects for Robot {
             environment: self.environment.clone(),
             log: self.log(task),
         };
-        let started = self.supervisor.start(&self.run_dir(task, process), &spec).await;
+        let run_dir = self.run_dir(task, process);
+        let record = serde_json::to_vec(run).map_err(|error| failed(&error))?;
+        durable::create_dir_all(&run_dir).map_err(|error| failed(&error))?;
+        durable::write(&run_dir.join(RUN_RECORD), &record, 0o600).map_err(|error| failed(&error))?;
+        let started = self.supervisor.start(&run_dir, &spec).await;
         Ok(started.map_err(|error| failed(&error))?.task.pid)
     }
 

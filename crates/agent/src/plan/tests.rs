@@ -194,7 +194,9 @@ impl World {
         self.record = Some(begun(record, &step, &self.boot.to_string(), self.start, self.now_ms));
         // What a start will do is fixed by the record written before it.
         let step = match step {
-            Step::Start(_) => Step::Start(self.record.clone().and_then(|record| record.active).expect("begun")),
+            Step::Start(_) => {
+                Step::Start(Box::new(self.record.clone().and_then(|record| record.active).expect("begun")))
+            }
             other => other,
         };
         self.steps.push((step, false));

@@ -58,7 +58,7 @@ pub fn begun(record: &TaskRecord, step: &Step, boot_id: &str, start: u64, now_ms
         if !record.active.as_ref().is_some_and(same) {
             record.retire_active();
         }
-        let mut run = run.clone();
+        let mut run = ActiveRun::clone(run);
         run.starts = run.starts.saturating_add(1);
         run.process = Some(ProcessRecord {
             dir: run_dir_name(&run, start),

@@ -1,0 +1,589 @@
+//! The driver: the one task that owns the ledger. It asks the plan for each task's next step, writes the ledger, lets the
+//! step run, and reports what changed. It decides nothing about tasks and does nothing to the robot itself: that is the
+//! plan's and the effects' work.
+//!
+//! Steps run as tasks of their own and send back only that they ended, so nothing here is ever waited for long; a step
+//! that is no longer wanted is told so and, if it does not end, dropped.
+
+use std::collections::{BTreeMap, HashMap};
+use std::sync::Arc;
+use std::time::Duration;
+
+use task_proto::api::ReportReply;
+use task_proto::desired::{DesiredState, DesiredTask};
+use task_proto::envelope::{Envelope, PublicKey};
+use task_proto::id::Labels;
+use task_proto::report::{Condition, Failure, FailureCode, Progress};
+use task_proto::{InstanceId, RobotId, RobotName, TaskName};
+use tokio::sync::{mpsc, watch};
+use tokio::task::{AbortHandle, Id, JoinSet};
+use tokio::time::Instant;
+use tokio_util::sync::CancellationToken;
+
+use crate::admission;
+use crate::effects::{Effects, Now, chain};
+use crate::ledger::{Accepted, Ledger, TaskRecord};
+use crate::link::{Heard, Shared};
+use crate::observed::{Prepared, ProcessState, RobotFacts};
+use crate::plan::{self, Lane, Next, Situation, Step, StepFailure};
+
+mod reporting;
+
+/// How often the hold flag is looked at and progress is reported.
+const TICK: Duration = Duration::from_secs(1);
+/// How long an interrupted step may take to end by itself.
+const INTERRUPT_GRACE: Duration = Duration::from_secs(5);
+/// When to try again after the ledger could not be written.
+const LEDGER_RETRY: Duration = Duration::from_secs(5);
+/// More turns than this for one task mean that the plan goes in circles.
+const MAX_TURNS: u32 = 64;
+
+/// Who the driver speaks for.
+#[derive(Debug, Clone)]
+pub struct Speaker {
+    /// The robot.
+    pub robot_id: RobotId,
+    /// The key its desired states are signed with.
+    pub server_key: PublicKey,
+    /// This start of the agent.
+    pub instance: InstanceId,
+    /// The kernel's boot id.
+    pub boot_id: String,
+    /// The name the robot gives itself.
+    pub name: Option<RobotName>,
+    /// The labels it gives itself.
+    pub labels: Option<Labels>,
+    /// How many versions are prepared at the same time.
+    pub parallel_tasks: usize,
+}
+
+/// What the driver has seen of one task; lost at a restart.
+#[derive(Default)]
+struct View {
+    /// What is on the disk of the ordered version; `None` when that must be looked at.
+    prepared: Option<Prepared>,
+    /// What became of the active run's process; `None` likewise.
+    process: Option<ProcessState>,
+    /// The run directory that a watcher looks at.
+    watched: Option<String>,
+    /// How far the pull under way has come.
+    pull: Option<watch::Receiver<Progress>>,
+    /// The same, as it is reported.
+    progress: Option<Progress>,
+}
+
+/// A step under way.
+struct UnderWay {
+    step: Step,
+    handle: AbortHandle,
+    cancel: CancellationToken,
+    /// When it is dropped, once it was told to end.
+    drop_at: Option<Instant>,
+}
+
+type Outcome = Result<Option<u32>, StepFailure>;
+
+/// The driver of one robot.
+pub struct Driver<E> {
+    effects: Arc<E>,
+    speaker: Speaker,
+    shared: Shared,
+    ledger: Ledger,
+    /// The ledger has changes that are not on the disk.
+    dirty: bool,
+    desired: Option<DesiredState>,
+    views: BTreeMap<TaskName, View>,
+    under_way: HashMap<(TaskName, Lane), UnderWay>,
+    steps: JoinSet<(TaskName, Lane, Outcome)>,
+    watchers: JoinSet<TaskName>,
+    robot: RobotFacts,
+    held: bool,
+    /// Conditions by code; those that follow from other fields are not in it.
+    conditions: BTreeMap<&'static str, String>,
+    /// What the server withholds, in its words.
+    withheld: Option<Condition>,
+    seq: u64,
+    started: Instant,
+}
+
+impl<E: Effects> Driver<E> {
+    /// The driver that goes on from `ledger`, which the caller has not counted this start in. `lost` says that and where
+    /// an earlier ledger was moved.
+    pub async fn new(
+        effects: Arc<E>,
+        speaker: Speaker,
+        shared: Shared,
+        mut ledger: Ledger,
+        lost: Option<String>,
+    ) -> Self {
+        let now = effects.now();
+        ledger.start += 1;
+        ledger.enter_boot(&speaker.boot_id, now.boot_ms);
+        let mut conditions = BTreeMap::new();
+        if let Some(text) = lost {
+            for (task, run) in effects.survivors().await {
+                ledger.tasks.insert(task.clone(), TaskRecord::of_survivor(task, run, now.boot_ms));
+            }
+            conditions.insert("ledger_rebuilt", text);
+        }
+        let mut desired = None;
+        if let Some(accepted) = &ledger.accepted {
+            match admission::open(&accepted.envelope, &speaker.server_key, &speaker.robot_id) {
+                Ok(state) => desired = Some(state),
+                // The robot was registered anew: the tasks go on as they are until the new server has spoken.
+                Err(error) => {
+                    tracing::warn!(error = %chain(&error), "the state in the ledger is not this server's");
+                    ledger.accepted = None;
+                }
+            }
+        }
+        let robot = effects.robot_facts();
+        let held = effects.is_held();
+        Self {
+            effects,
+            speaker,
+            shared,
+            ledger,
+            dirty: true,
+            desired,
+            views: BTreeMap::new(),
+            under_way: HashMap::new(),
+            steps: JoinSet::new(),
+            watchers: JoinSet::new(),
+            robot,
+            held,
+            conditions,
+            withheld: None,
+            seq: 0,
+            started: Instant::now(),
+        }
+    }
+
+    /// Drives until the agent ends. Steps under way are dropped then, tasks go on running.
+    pub async fn run(mut self, mut heard: mpsc::Receiver<Heard>) {
+        let mut tick = tokio::time::interval(TICK);
+        loop {
+            let wake = self.turn().await;
+            tokio::select! {
+                // Cancel-safe: a step that has ended stays in the set until it is taken.
+                Some(ended) = self.steps.join_next_with_id() => self.step_ended(ended),
+                // Cancel-safe: likewise.
+                Some(ended) = self.watchers.join_next() => {
+                    if let Ok(task) = ended {
+                        let view = self.views.entry(task).or_default();
+                        (view.process, view.watched) = (None, None);
+                    }
+                }
+                // Cancel-safe: a message stays in the channel until it is received.
+                Some(message) = heard.recv() => self.hear(message),
+                // Cancel-safe: an interval keeps its own time.
+                _ = tick.tick() => self.tick(),
+                // Cancel-safe: a timer that is made anew each time.
+                () = tokio::time::sleep_until(wake) => {}
+                // Cancel-safe: a token can be awaited again.
+                () = self.shared.shutdown.cancelled() => break,
+            }
+        }
+        self.save();
+    }
+
+    /// Plans every task until all rest, begins what is to be done, reports. Gives the time of the next turn.
+    async fn turn(&mut self) -> Instant {
+        self.interrupt_unwanted();
+        let mut wake = Instant::now() + Duration::from_secs(3600);
+        let mut begin = Vec::new();
+        for task in self.task_names() {
+            let until_ms = self.plan_task(&task, &mut begin).await;
+            if let Some(until_ms) = until_ms {
+                let wait_ms = until_ms.saturating_sub(self.effects.now().boot_ms);
+                wake = wake.min(Instant::now() + Duration::from_millis(wait_ms));
+            }
+        }
+        // Written before anything is done: if that fails nothing is, and the plan sees steps that never began.
+        if self.save() {
+            for (task, step) in begin {
+                self.begin(task, step);
+            }
+        } else {
+            wake = wake.min(Instant::now() + LEDGER_RETRY);
+        }
+        for under_way in self.under_way.values() {
+            wake = under_way.drop_at.map_or(wake, |at| wake.min(at));
+        }
+        self.watch_processes();
+        self.publish_report();
+        wake
+    }
+
+    fn task_names(&self) -> Vec<TaskName> {
+        let desired = self.desired.iter().flat_map(|state| &state.tasks).map(|task| task.task.clone());
+        let mut names: Vec<TaskName> = self.ledger.tasks.keys().cloned().chain(desired).collect();
+        names.sort();
+        names.dedup();
+        names
+    }
+
+    /// What is desired of a task. Before any desired state is known, what its record was ordered to be.
+    fn desired_task(&self, task: &TaskName) -> Option<DesiredTask> {
+        match &self.desired {
+            Some(state) => state.tasks.iter().find(|desired| desired.task == *task).cloned(),
+            None => self.ledger.tasks.get(task).map(|record| record.order.clone()),
+        }
+    }
+
+    /// Whether new work may be begun.
+    fn may_begin(&self, now: Now) -> bool {
+        let in_force = self.desired.as_ref().is_none_or(|state| !admission::is_expired(state, now.wall_ms));
+        in_force && !self.ledger.removed
+    }
+
+    async fn plan_task(&mut self, task: &TaskName, begin: &mut Vec<(TaskName, Step)>) -> Option<u64> {
+        let desired = self.desired_task(task);
+        if !self.ledger.tasks.contains_key(task) {
+            let record = TaskRecord::new(desired.clone()?, self.effects.now().boot_ms);
+            self.ledger.tasks.insert(task.clone(), record);
+            self.dirty = true;
+        }
+        let mut until_ms: Option<u64> = None;
+        for _ in 0..MAX_TURNS {
+            let mut changed = false;
+            until_ms = None;
+            for lane in [Lane::Run, Lane::Prepare] {
+                let planned = |(other, step): &(TaskName, Step)| other == task && step.lane() == lane;
+                if self.under_way.contains_key(&(task.clone(), lane)) || begin.iter().any(planned) {
+                    continue;
+                }
+                self.observe(task).await;
+                match self.ask(task, lane, desired.as_ref(), begin) {
+                    Next::Rest { until_ms: rest } => until_ms = [until_ms, rest].into_iter().flatten().min(),
+                    Next::Record(record) => {
+                        self.put(task, *record);
+                        changed = true;
+                    }
+                    Next::Act(step) if lane == Lane::Prepare && !self.has_room(begin) => {
+                        tracing::debug!(step = plan::describe(task, &step), "waits for another task's step");
+                    }
+                    Next::Act(step) => {
+                        let record = self.ledger.tasks.get(task)?;
+                        let (boot_id, start) = (&self.speaker.boot_id, self.ledger.start);
+                        let record = plan::begun(record, &step, boot_id, start, self.effects.now().boot_ms);
+                        // A start does what the record written before it says.
+                        let step = match (step, &record.active) {
+                            (Step::Start(_), Some(active)) => Step::Start(Box::new(active.clone())),
+                            (step, _) => step,
+                        };
+                        self.put(task, record);
+                        begin.push((task.clone(), step));
+                        changed = true;
+                    }
+                }
+            }
+            if !changed {
+                return until_ms;
+            }
+        }
+        tracing::error!(%task, "the plan goes in circles");
+        until_ms
+    }
+
+    fn ask(&self, task: &TaskName, lane: Lane, desired: Option<&DesiredTask>, begin: &[(TaskName, Step)]) -> Next {
+        let rest = Next::Rest { until_ms: None };
+        let (Some(record), Some(view)) = (self.ledger.tasks.get(task), self.views.get(task)) else { return rest };
+        let (Some(prepared), Some(process)) = (&view.prepared, &view.process) else { return rest };
+        let now = self.effects.now();
+        let steps = || {
+            let planned = begin.iter().filter(|(other, _)| other == task).map(|(_, step)| step);
+            let lanes = [Lane::Run, Lane::Prepare].map(|lane| self.under_way.get(&(task.clone(), lane)));
+            planned.chain(lanes.into_iter().flatten().map(|under_way| &under_way.step)).collect::<Vec<_>>()
+        };
+        let situation = Situation {
+            desired,
+            record,
+            prepared,
+            process,
+            preparing: steps().iter().any(|step| step.lane() == Lane::Prepare),
+            deleting: steps().iter().any(|step| step.deletes()),
+            robot: &self.robot,
+            may_begin: self.may_begin(now),
+            held: self.held,
+            boot_id: &self.speaker.boot_id,
+            now_ms: now.boot_ms,
+            jitter: rand::random(),
+        };
+        match lane {
+            Lane::Run => plan::supervise(&situation),
+            Lane::Prepare => plan::prepare(&situation),
+        }
+    }
+
+    /// Looks at whatever is not known to be as it was.
+    async fn observe(&mut self, task: &TaskName) {
+        let Some(record) = self.ledger.tasks.get(task) else { return };
+        let view = self.views.entry(task.clone()).or_default();
+        if view.prepared.is_none() {
+            view.prepared = Some(self.effects.prepared(&record.order.package).await);
+        }
+        if view.process.is_none() || view.process == Some(ProcessState::Unknown) {
+            view.process = Some(match record.active.as_ref().and_then(|active| active.process.as_ref()) {
+                Some(process) => self.effects.process(task, process).await,
+                None => ProcessState::None,
+            });
+        }
+    }
+
+    fn has_room(&self, begin: &[(TaskName, Step)]) -> bool {
+        let under_way = self.under_way.keys().filter(|(_, lane)| *lane == Lane::Prepare).count();
+        let planned = begin.iter().filter(|(_, step)| step.lane() == Lane::Prepare).count();
+        under_way + planned < self.speaker.parallel_tasks
+    }
+
+    /// Takes a changed record; what was seen under another order or process is forgotten.
+    fn put(&mut self, task: &TaskName, record: TaskRecord) {
+        let view = self.views.entry(task.clone()).or_default();
+        let before = self.ledger.tasks.get(task);
+        let package = |record: &TaskRecord| record.order.package.clone();
+        if before.map(package).as_ref() != Some(&record.order.package) {
+            view.prepared = None;
+        }
+        let process = |record: &TaskRecord| Some(record.active.as_ref()?.process.as_ref()?.dir.clone());
+        if before.and_then(process) != process(&record) {
+            view.process = None;
+        }
+        self.ledger.tasks.insert(task.clone(), record);
+        self.dirty = true;
+    }
+
+    fn begin(&mut self, task: TaskName, step: Step) {
+        tracing::info!("{}", plan::describe(&task, &step));
+        let cancel = CancellationToken::new();
+        let (progress, pull) = watch::channel(Progress { done: 0, total: 0 });
+        if matches!(step, Step::PullContent(_)) {
+            self.views.entry(task.clone()).or_default().pull = Some(pull);
+        }
+        let running = self.ledger.tasks.get(&task).and_then(|record| record.active.as_ref()?.process.clone());
+        let (effects, lane) = (self.effects.clone(), step.lane());
+        let (name, doing, stop) = (task.clone(), step.clone(), cancel.clone());
+        let handle = self.steps.spawn(async move {
+            let done = |()| None;
+            let outcome = match &doing {
+                Step::PullManifest(package) => effects.pull_manifest(package, &stop).await.map(done),
+                Step::PullContent(package) => effects.pull_content(package, &progress, &stop).await.map(done),
+                Step::Build(package) => effects.build(package, &stop).await.map(done),
+                Step::Start(run) => effects.start(&name, run).await.map(Some),
+                Step::Stop { process, stop_timeout_s } => effects.stop(&name, process, *stop_timeout_s).await.map(done),
+                Step::Prune { kept } => effects.prune(&name, kept, running.as_ref()).await.map(done),
+                Step::Remove => effects.remove(&name).await.map(done),
+            };
+            (name, lane, outcome)
+        });
+        self.under_way.insert((task, lane), UnderWay { step, handle, cancel, drop_at: None });
+    }
+
+    /// Tells steps to end that serve nothing any more, and drops those that do not listen.
+    fn interrupt_unwanted(&mut self) {
+        let now = Instant::now();
+        let unwanted: Vec<(TaskName, Lane)> = self
+            .under_way
+            .iter()
+            .filter(|((task, _), under_way)| !under_way.step.is_wanted(self.desired_task(task).as_ref()))
+            .map(|(key, _)| key.clone())
+            .collect();
+        for key in unwanted {
+            if let Some(under_way) = self.under_way.get_mut(&key).filter(|under_way| under_way.drop_at.is_none()) {
+                under_way.cancel.cancel();
+                under_way.drop_at = Some(now + INTERRUPT_GRACE);
+            }
+        }
+        for ((task, _), under_way) in &mut self.under_way {
+            if under_way.drop_at.is_some_and(|at| at <= now) {
+                tracing::warn!("{} does not end and is dropped", plan::describe(task, &under_way.step));
+                under_way.handle.abort();
+                under_way.drop_at = Some(now + INTERRUPT_GRACE);
+            }
+        }
+    }
+
+    fn step_ended(&mut self, ended: Result<(Id, (TaskName, Lane, Outcome)), tokio::task::JoinError>) {
+        let (id, outcome) = match ended {
+            Ok((id, (_, _, outcome))) => (id, outcome),
+            Err(error) => {
+                let failure = Failure::new(FailureCode::IO_ERROR, format!("the step ended without a result: {error}"));
+                (error.id(), Err(StepFailure { failure, retry_after_ms: Some(1000) }))
+            }
+        };
+        let found =
+            self.under_way.iter().find(|(_, under_way)| under_way.handle.id() == id).map(|(key, _)| key.clone());
+        let Some((task, lane)) = found else { return };
+        let Some(under_way) = self.under_way.remove(&(task.clone(), lane)) else { return };
+        let view = self.views.entry(task.clone()).or_default();
+        (view.pull, view.progress) = (None, None);
+        if under_way.cancel.is_cancelled() {
+            view.prepared = None;
+            return;
+        }
+        if let Err(error) = &outcome {
+            tracing::warn!(failure = %error.failure, "{} failed", plan::describe(&task, &under_way.step));
+        }
+        self.finish(&task, &under_way.step, outcome);
+    }
+
+    fn finish(&mut self, task: &TaskName, step: &Step, outcome: Outcome) {
+        if *step == Step::Remove && outcome.is_ok() {
+            self.ledger.tasks.remove(task);
+            self.views.remove(task);
+            self.dirty = true;
+            return;
+        }
+        let (Some(record), Some(view)) = (self.ledger.tasks.get(task), self.views.get(task)) else { return };
+        let now = self.effects.now();
+        let nothing = Prepared::default();
+        let situation = Situation {
+            desired: None,
+            record,
+            prepared: view.prepared.as_ref().unwrap_or(&nothing),
+            process: view.process.as_ref().unwrap_or(&ProcessState::None),
+            preparing: false,
+            deleting: false,
+            robot: &self.robot,
+            may_begin: self.may_begin(now),
+            held: self.held,
+            boot_id: &self.speaker.boot_id,
+            now_ms: now.boot_ms,
+            jitter: rand::random(),
+        };
+        let record = plan::finished(&situation, step, outcome);
+        if let (Step::Prune { kept }, Some(prepared)) =
+            (step, &mut self.views.entry(task.clone()).or_default().prepared)
+        {
+            // Should deleting have failed, it is not tried again before the next look at the disk.
+            prepared.versions.retain(|version| kept.contains(version));
+        } else if step.lane() == Lane::Prepare {
+            self.views.entry(task.clone()).or_default().prepared = None;
+        }
+        if matches!(step, Step::Start(_) | Step::Stop { .. }) {
+            self.views.entry(task.clone()).or_default().process = None;
+        }
+        self.put(task, record);
+    }
+
+    /// Sees to it that the end of each live process is noticed.
+    fn watch_processes(&mut self) {
+        for (task, record) in &self.ledger.tasks {
+            let Some(view) = self.views.get_mut(task) else { continue };
+            let Some(process) = record.active.as_ref().and_then(|active| active.process.as_ref()) else { continue };
+            let lives = matches!(view.process, Some(ProcessState::Alive { .. }));
+            if !lives || view.watched.as_ref() == Some(&process.dir) {
+                continue;
+            }
+            view.watched = Some(process.dir.clone());
+            let (effects, task, process) = (self.effects.clone(), task.clone(), process.clone());
+            self.watchers.spawn(async move {
+                effects.process_ended(&task, &process).await;
+                task
+            });
+        }
+    }
+
+    fn tick(&mut self) {
+        self.held = self.effects.is_held();
+        for view in self.views.values_mut() {
+            view.progress = view.pull.as_ref().map(|pull| *pull.borrow()).filter(|progress| progress.total > 0);
+        }
+    }
+
+    fn hear(&mut self, message: Heard) {
+        match message {
+            Heard::Desired(envelope) => {
+                self.known_by_server();
+                self.consider(*envelope);
+            }
+            Heard::Unchanged => self.known_by_server(),
+            Heard::Confirmed { reply, .. } => {
+                if let Some(reply) = reply {
+                    self.known_by_server();
+                    self.settle_settings(&reply);
+                }
+            }
+            Heard::TokenRefused => {
+                if !self.ledger.removed {
+                    tracing::warn!("the server does not know this robot any more: nothing new is begun");
+                    self.ledger.removed = true;
+                    self.dirty = true;
+                }
+            }
+            Heard::Withheld { code, text } => self.withheld = Some(Condition { code, text }),
+        }
+    }
+
+    fn known_by_server(&mut self) {
+        self.withheld = None;
+        if self.ledger.removed {
+            self.ledger.removed = false;
+            self.dirty = true;
+        }
+    }
+
+    /// Accepts a desired state or says why not.
+    fn consider(&mut self, envelope: Envelope) {
+        let Speaker { server_key, robot_id, .. } = &self.speaker;
+        let wall_ms = self.effects.now().wall_ms;
+        match admission::admit(&envelope, server_key, robot_id, self.desired.as_ref(), wall_ms) {
+            Ok(state) => {
+                self.conditions.remove("state_refused");
+                if self.desired.as_ref() != Some(&state) {
+                    tracing::info!(generation = %state.generation, tasks = state.tasks.len(), "accepted a desired state");
+                    self.ledger.accepted = Some(Accepted { generation: state.generation, envelope });
+                    // The order may be for a label that the robot was given just before it: ask again.
+                    self.robot.labels = None;
+                    self.shared.post.notify_one();
+                    self.desired = Some(state);
+                    self.dirty = true;
+                }
+            }
+            Err(refused) => {
+                let text = format!("a desired state was refused: {}", chain(&refused));
+                tracing::warn!("{text}");
+                self.conditions.insert("state_refused", text);
+            }
+        }
+    }
+
+    /// What the server holds wins; what the robot's own settings say otherwise is reported.
+    fn settle_settings(&mut self, reply: &ReportReply) {
+        let mut differences = Vec::new();
+        if let Some(own) = self.speaker.name.as_ref().filter(|own| **own != reply.name) {
+            differences.push(format!("name is {own} here and {} there", reply.name));
+        }
+        if let Some(own) = self.speaker.labels.as_ref().filter(|own| **own != reply.labels) {
+            let text = |labels: &Labels| {
+                labels.iter().map(|(key, value)| format!("{key}={value}")).collect::<Vec<_>>().join(",")
+            };
+            differences.push(format!("labels are {:?} here and {:?} there", text(own), text(&reply.labels)));
+        }
+        if differences.is_empty() {
+            self.conditions.remove("settings_differ");
+        } else {
+            let text = format!("the server's settings hold, the robot's own differ: {}", differences.join("; "));
+            self.conditions.insert("settings_differ", text);
+        }
+        self.robot.labels = Some(reply.labels.clone());
+    }
+
+    /// Writes the ledger if it changed; whether what it says is on the disk.
+    fn save(&mut self) -> bool {
+        if !self.dirty {
+            return true;
+        }
+        match self.effects.write_ledger(&self.ledger) {
+            Ok(()) => {
+                self.dirty = false;
+                self.conditions.remove("ledger_unwritable");
+            }
+            Err(error) => {
+                tracing::error!(error = %chain(&error), "nothing is begun");
+                self.conditions.insert("ledger_unwritable", chain(&error));
+            }
+        }
+        !self.dirty
+    }
+}

@@ -1,0 +1,116 @@
+//! What the driver reports: a snapshot of the ledger in the wire's types, published when it says something new.
+
+use std::sync::Arc;
+
+use task_proto::report::{ActiveVersion, Condition, Phase, Report, TaskReport};
+use task_proto::{Generation, TaskName};
+
+use super::{Driver, View};
+use crate::admission;
+use crate::effects::Effects;
+use crate::ledger::TaskRecord;
+use crate::observed::ProcessState;
+
+impl<E: Effects> Driver<E> {
+    /// Publishes a snapshot, if it says anything that the last one did not.
+    pub(super) fn publish_report(&mut self) {
+        let report = self.report();
+        let news = self.shared.reports.borrow().as_ref().is_none_or(|last| !says_the_same(last, &report));
+        if news {
+            self.seq = report.seq;
+            self.shared.reports.send_replace(Some(Arc::new(report)));
+        }
+        let known = self.known_generation();
+        self.shared.known.send_if_modified(|last| std::mem::replace(last, known) != known);
+    }
+
+    fn report(&self) -> Report {
+        let now_ms = self.effects.now().boot_ms;
+        let tasks = self.ledger.tasks.iter();
+        Report {
+            robot_id: self.speaker.robot_id.clone(),
+            start: self.ledger.start,
+            instance: self.speaker.instance.clone(),
+            boot_id: self.speaker.boot_id.clone(),
+            seq: self.seq + 1,
+            observed_generation: self.ledger.accepted.as_ref().map_or(Generation(0), |accepted| accepted.generation),
+            uptime_ms: u64::try_from(self.started.elapsed().as_millis()).unwrap_or(u64::MAX),
+            host: self.effects.host_facts(),
+            conditions: self.all_conditions(),
+            tasks: tasks.map(|(task, record)| task_report(task, record, self.views.get(task), now_ms)).collect(),
+        }
+    }
+
+    fn all_conditions(&self) -> Vec<Condition> {
+        let condition = |code: &str, text: &str| Condition { code: code.to_owned(), text: text.to_owned() };
+        let mut conditions: Vec<Condition> = self.conditions.iter().map(|(code, text)| condition(code, text)).collect();
+        if self.held {
+            conditions.push(condition("held", "a person at the robot said hold: nothing is started or switched"));
+        }
+        if self.ledger.removed {
+            conditions
+                .push(condition("removed", "the server does not accept this robot's token: nothing new is begun"));
+        }
+        let wall_ms = self.effects.now().wall_ms;
+        if self.desired.as_ref().is_some_and(|state| admission::is_expired(state, wall_ms)) {
+            conditions.push(condition("state_expired", "the desired state has expired: nothing new is begun"));
+        }
+        conditions.extend(self.withheld.clone());
+        conditions
+    }
+
+    /// The generation to name when asking for the desired state: none once half of its lifetime is over, so that the
+    /// server sends it signed anew.
+    fn known_generation(&self) -> Option<Generation> {
+        let state = self.desired.as_ref()?;
+        let half_ms = state.issued_at_ms + state.expires_at_ms.saturating_sub(state.issued_at_ms) / 2;
+        let refused = self.conditions.contains_key("state_refused");
+        (!refused && self.effects.now().wall_ms < half_ms).then_some(state.generation)
+    }
+}
+
+/// Whether two snapshots differ only in what always changes.
+fn says_the_same(last: &Report, next: &Report) -> bool {
+    let without_times = |report: &Report| {
+        let mut report = report.clone();
+        (report.seq, report.uptime_ms, report.host.disk_free_bytes) = (0, 0, 0);
+        report.tasks.iter_mut().for_each(|task| task.phase_ms = 0);
+        report
+    };
+    without_times(last) == without_times(next)
+}
+
+fn task_report(task: &TaskName, record: &TaskRecord, view: Option<&View>, now_ms: u64) -> TaskReport {
+    let (phase, failure) = record.standing();
+    let progress = view.and_then(|view| view.progress).filter(|_| phase == Phase::Fetching);
+    // All bytes are there: what is left of a pull is unpacking.
+    let unpacking = progress.is_some_and(|progress| progress.done >= progress.total);
+    let active = record.active.as_ref();
+    let for_order = active.filter(|active| active.is_for(&record.order));
+    TaskReport {
+        task: task.clone(),
+        deployment: record.order.deployment.clone(),
+        package: record.order.package.clone(),
+        wanted: record.order.wanted,
+        run: record.order.run,
+        kind: for_order.map(|active| active.rules.kind).or(record.preparation.kind),
+        phase: if unpacking { Phase::Unpacking } else { phase },
+        phase_ms: now_ms.saturating_sub(record.phase_since_ms),
+        progress: progress.filter(|_| !unpacking),
+        attempts: record.preparation.attempts,
+        restarts: for_order.map_or(0, |active| active.restarts),
+        failure: failure.cloned(),
+        active: active.and_then(|active| {
+            let process = active.process.as_ref()?;
+            let pid = match view.and_then(|view| view.process.as_ref()) {
+                Some(ProcessState::Alive { pid }) => Some(*pid),
+                _ => process.pid,
+            };
+            Some(ActiveVersion {
+                deployment: active.deployment.clone(),
+                version: active.package.version.clone(),
+                pid: pid?,
+            })
+        }),
+    }
+}

@@ -78,7 +78,9 @@ pub(crate) fn table(header: &[&str], rows: Vec<Vec<String>>) -> String {
     for row in rows {
         table.add_row(row.into_iter().map(|cell| printable(&cell)));
     }
-    table.lines().map(|line| line.trim_end().to_owned()).collect::<Vec<_>>().join("\n")
+    // Each cell has a space on both sides, which is wanted between columns only.
+    let line = |line: String| line.trim_end().strip_prefix(' ').unwrap_or_default().to_owned();
+    table.lines().map(line).collect::<Vec<_>>().join("\n")
 }
 
 /// `text` on one line and without control characters: a robot or a package may have put them there.
@@ -124,6 +126,11 @@ pub(crate) fn time(ms: u64) -> String {
     format!("{year:04}-{month:02}-{day:02} {:02}:{:02}:{:02}Z", second / 3600, second / 60 % 60, second % 60)
 }
 
+/// So many robots, as people say it.
+pub(crate) fn robots(count: u64) -> String {
+    if count == 1 { "1 robot".to_owned() } else { format!("{count} robots") }
+}
+
 /// Bytes as people read them.
 pub(crate) fn bytes(count: u64) -> String {
     indicatif::HumanBytes(count).to_string()
@@ -143,6 +150,6 @@ mod tests {
     #[test]
     fn a_table_has_a_header_and_no_lines() {
         let text = table(&["id", "name"], vec![vec!["r1".to_owned(), "a\u{1b}[31mb\nc".to_owned()]]);
-        assert_eq!(text, " ID  NAME\n r1  a [31mb c");
+        assert_eq!(text, "ID  NAME\nr1  a [31mb c");
     }
 }

@@ -9,7 +9,7 @@ use task_proto::desired::Delivery;
 use task_proto::selector::Selector;
 
 use super::confirm::confirm;
-use super::output::{bytes, say};
+use super::output::{bytes, robots, say};
 use super::{CommandError, Outcome, Session, deploy, duration, robot, task, upload, wait};
 use crate::package::{self, Packed};
 
@@ -106,8 +106,8 @@ pub(super) async fn run(session: &Session, push: Push) -> Result<Outcome, Comman
     };
     let key = push.idempotency_key.unwrap_or_else(random_key);
     let ordered: DeploymentView = session.client.order("/deployments", &order, &key).await?;
-    let robots: u64 = ordered.counts.iter().map(|count| count.count).sum();
-    say(&format!("deployment {}: {} {} to {robots} robots", ordered.id, order.package, ordered.package.version));
+    let count = robots(ordered.counts.iter().map(|count| count.count).sum());
+    say(&format!("deployment {}: {} {} to {count}", ordered.id, order.package, ordered.package.version));
     for superseded in &ordered.supersedes {
         say(&format!("it supersedes {superseded}"));
     }

@@ -7,7 +7,7 @@ use task_proto::selector::Selector;
 
 use super::client::ClientError;
 use super::confirm::confirm;
-use super::output::say;
+use super::output::{robots, say};
 use super::{CommandError, Outcome, Session};
 
 /// Which task on which robots.
@@ -70,7 +70,7 @@ pub(super) async fn run(session: &Session, verb: Verb, order: TaskOrder) -> Resu
     let ordered: MatchedRobots = session.client.order(&path, &OrderTask { selector: on, dry_run: false }, &key).await?;
     print_matched(session, &ordered)?;
     let offline = ordered.robots.iter().filter(|robot| !robot.online).count();
-    say(&format!("ordered: {} {task} on {} robots", verb.as_str(), ordered.robots.len()));
+    say(&format!("ordered: {} {task} on {}", verb.as_str(), robots(ordered.robots.len() as u64)));
     if offline > 0 {
         say(&format!("{offline} of them are offline and follow when they are back"));
     }

@@ -256,7 +256,7 @@ async fn many_robots_need_a_yes() {
     bench.taskd(&["push", &package, "--to", "*"]).await.expect(2, "give --yes");
     bench.taskd(&["push", &package, "--to", "*", "--yes"]).await.expect(0, "to 11 robots");
     bench.taskd(&["stop", "hello", "--on", "*"]).await.expect(2, "give --yes");
-    bench.taskd(&["stop", "hello", "--on", "robot-3"]).await.expect(0, "stop hello on 1 robots");
+    bench.taskd(&["stop", "hello", "--on", "robot-3"]).await.expect(0, "stop hello on 1 robot");
     bench.taskd(&["stop", "other", "--on", "*"]).await.expect(2, "has the task other");
 }
 

@@ -352,8 +352,12 @@ impl Config {
                     if Setting::by_key(&key).is_none() {
                         return Err(ConfigError::Unknown { hint: nearest(&key), origin });
                     }
-                    let reason =
-                        format!("expected a text, a whole number or a truth value, not a {}", other.type_str());
+                    let reason = match other {
+                        toml::Value::Array(_) => "expected a text, a whole number or true or false, not an array",
+                        toml::Value::Table(_) => "expected a text, a whole number or true or false, not a table",
+                        _ => "expected a text, a whole number or true or false",
+                    }
+                    .to_owned();
                     return Err(ConfigError::Value { origin, reason });
                 }
             };
@@ -529,23 +533,23 @@ mod tests {
 
     #[test]
     fn what_is_unknown_or_wrong_is_refused_by_name() {
-        let cases: [(&[(&str, &str)], Option<&str>, &str); 9] = [
-            (&[("TASKD_HTPT", "x")], None, "TASKD_HTPT: there is no such setting"),
-            (&[("TASKD_MQTTS", "x")], None, "TASKD_MQTTS: there is no such setting; mqtt is the closest one"),
-            (&[("TASKD_HTTP", "x")], None, "TASKD_HTTP: \"x\" is not an address"),
-            (&[], Some("htpt = 1"), "htpt in taskd.toml: there is no such setting"),
-            (&[], Some("[limits]\nx = 1"), "limits in taskd.toml: there is no such setting"),
-            (
-                &[],
-                Some("http = [1]"),
-                "http in taskd.toml: expected a text, a whole number or a truth value, not a array",
-            ),
-            (&[], Some("blob_read = \"sendfile\""), "blob_read in taskd.toml: \"sendfile\" is neither"),
-            (&[], Some("assignment_expiry = \"0s\""), "assignment_expiry in taskd.toml: \"0s\" is not a time"),
-            (&[], Some("http ="), "taskd.toml is not valid TOML"),
-        ];
-        for (env, file, expected) in cases {
-            let message = load(&[], env, file).expect_err(expected);
+        for (name, value, expected) in [
+            ("TASKD_HTPT", "x", "TASKD_HTPT: there is no such setting"),
+            ("TASKD_MQTTS", "x", "TASKD_MQTTS: there is no such setting; mqtt is the closest one"),
+            ("TASKD_HTTP", "x", "TASKD_HTTP: \"x\" is not an address"),
+        ] {
+            let message = load(&[], &[(name, value)], None).expect_err(expected);
+            assert!(message.starts_with(expected), "{message}");
+        }
+        for (file, expected) in [
+            ("htpt = 1", "htpt in taskd.toml: there is no such setting"),
+            ("[limits]\nx = 1", "limits in taskd.toml: there is no such setting"),
+            ("http = [1]", "http in taskd.toml: expected a text, a whole number or true or false, not an array"),
+            ("blob_read = \"sendfile\"", "blob_read in taskd.toml: \"sendfile\" is neither"),
+            ("assignment_expiry = \"0s\"", "assignment_expiry in taskd.toml: \"0s\" is not a time"),
+            ("http =", "taskd.toml is not valid TOML"),
+        ] {
+            let message = load(&[], &[], Some(file)).expect_err(expected);
             assert!(message.starts_with(expected), "{message}");
         }
         let config = load(&[], &[("TASKD_SERVER", "http://x"), ("TASKD_TEST_POSTGRES", "x")], None);

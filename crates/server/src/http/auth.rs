@@ -44,7 +44,7 @@ pub enum Caller {
     /// A robot.
     Robot(RobotId),
     /// The holder of an enrolment token.
-    Enrolment(Token),
+    Enrolment(Box<Token>),
 }
 
 impl Caller {
@@ -147,7 +147,7 @@ async fn identify(app: &App, method: &Method, headers: &HeaderMap) -> Result<Cal
     match app.store.token_holder(&token, now_ms).await? {
         Some(TokenHolder::Operator) => Ok(Caller::Operator),
         Some(TokenHolder::Robot(robot)) => Ok(Caller::Robot(robot)),
-        Some(TokenHolder::Enrolment) => Ok(Caller::Enrolment(token)),
+        Some(TokenHolder::Enrolment) => Ok(Caller::Enrolment(Box::new(token))),
         None => Err(ApiError::unauthorized("the token is unknown, expired or revoked")),
     }
 }

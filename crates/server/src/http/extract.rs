@@ -132,7 +132,7 @@ mod tests {
             (r#"{"package": "No!"}"#.to_owned(), "package: \"No!\" is not a valid package name"),
         ];
         for (text, expected) in cases {
-            let error = parse_json::<CreateDeployment>(text.as_bytes()).err().expect(expected);
+            let error = parse_json::<CreateDeployment>(text.as_bytes()).expect_err(expected);
             assert!(error.message.starts_with(expected), "{} / {expected}", error.message);
         }
         let misspelt = body(r#", "selektor": "*""#);

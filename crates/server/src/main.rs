@@ -1,6 +1,6 @@
 //! The `taskd` binary: parses the command line and hands over. It never holds logic of its own.
 
-use std::io::Write as _;
+use std::io::{IsTerminal as _, Write as _};
 use std::process::ExitCode;
 use std::time::Duration;
 
@@ -49,7 +49,11 @@ fn main() -> ExitCode {
 async fn serve(flags: &ServeFlags) -> anyhow::Result<ExitCode> {
     let filter =
         EnvFilter::try_from_env("TASKD_LOG").unwrap_or_else(|_| EnvFilter::new("info,sqlx=warn,rumqttd=error"));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr)
+        .with_ansi(std::io::stderr().is_terminal())
+        .init();
     let config = Config::load(flags, std::env::vars_os())?;
     // Installed before anything is started, so that an early signal stops it softly as well.
     let mut signals = Signals::install().context("signals can't be caught")?;

@@ -60,7 +60,7 @@ pub fn parse_json<T: DeserializeOwned>(body: &[u8]) -> Result<T, ApiError> {
     let mut parser = serde_json::Deserializer::from_slice(body);
     let value = serde_path_to_error::deserialize(&mut parser).map_err(|error| {
         let path = error.path().to_string();
-        let place = if path == "." { "the body".to_owned() } else { path };
+        let place = if matches!(path.as_str(), "." | "?") { "the body".to_owned() } else { path };
         ApiError::invalid(format!("{place}: {}", error.into_inner()))
     })?;
     parser.end().map_err(|error| ApiError::invalid(format!("the body: {error}")))?;

@@ -6,9 +6,9 @@ use reqwest::{Client, Method, RequestBuilder, Response, StatusCode};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
-use task_proto::api::{DeploymentView, EnrollResponse, EnrollmentToken, IDEMPOTENCY_KEY, RobotView};
+use task_proto::api::{DeploymentView, EnrollResponse, EnrollmentToken, IDEMPOTENCY_KEY, RobotView, ServerInfo};
 use task_proto::desired::{BlobRef, DesiredState, DesiredTask, PackageRef};
-use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, PublicKey};
+use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope};
 use task_proto::manifest::TaskKind;
 use task_proto::oci::{ImageManifest, MANIFEST_TYPE};
 use task_proto::report::{HostFacts, Phase, Report, TaskReport};
@@ -106,7 +106,7 @@ impl TestServer {
         let mac = format!("02:{}:{}:{}:{}:{}", &mac[..2], &mac[2..4], &mac[4..6], &mac[6..8], &mac[8..10]);
         let request = self.bare(Method::POST, "/api/v1/enroll").bearer_auth(token.token);
         let enrolled: EnrollResponse = answer(request.json(&json!({ "mac": mac, "name": name }))).await;
-        TestRobot { id: enrolled.robot_id, token: enrolled.token, instance: InstanceId::random(), seq: 0 }
+        TestRobot::new(enrolled.robot_id, enrolled.token)
     }
 
     /// Pushes a package that no robot could unpack, but every robot can be told of.
@@ -161,33 +161,46 @@ impl TestServer {
         let response = self.ask_desired(robot).await;
         assert_eq!(response.status(), StatusCode::OK, "{}", response.text().await.unwrap_or_default());
         let envelope: Envelope = response.json().await.expect("an envelope");
-        let info: task_proto::api::ServerInfo = self.get("/api/v1/server").await;
-        open(&envelope, &info.key)
+        opened(self, &envelope).await
     }
 
     /// The robot reports that it accepted `state` and that all of its tasks stand in `phase`.
     pub async fn report(&self, robot: &mut TestRobot, state: &DesiredState, phase: Phase) -> Response {
-        robot.seq += 1;
-        let report = Report {
-            robot_id: robot.id.clone(),
-            start: 1,
-            instance: robot.instance.clone(),
-            boot_id: "boot".to_owned(),
-            seq: robot.seq,
-            observed_generation: state.generation,
-            uptime_ms: 1_000,
-            host: HostFacts { hostname: "host".to_owned(), ..HostFacts::default() },
-            conditions: Vec::new(),
-            tasks: state.tasks.iter().map(|task| in_phase(task, phase)).collect(),
-        };
+        let report = robot.next_report(state, phase);
         let path = format!("/api/v1/robots/{}/report", robot.id);
         let request = self.bare(Method::POST, &path).bearer_auth(&robot.token);
         request.json(&report).send().await.expect("an answer")
     }
 }
 
-fn open(envelope: &Envelope, key: &PublicKey) -> DesiredState {
-    let payload = envelope.open(DESIRED_STATE_TYPE, key).expect("signed by this server");
+impl TestRobot {
+    /// A first instance of a robot, or one more.
+    pub fn new(id: RobotId, token: String) -> Self {
+        Self { id, token, instance: InstanceId::random(), seq: 0 }
+    }
+
+    /// Says that it accepted `state` and that all of its tasks stand in `phase`.
+    pub fn next_report(&mut self, state: &DesiredState, phase: Phase) -> Report {
+        self.seq += 1;
+        Report {
+            robot_id: self.id.clone(),
+            start: 1,
+            instance: self.instance.clone(),
+            boot_id: "boot".to_owned(),
+            seq: self.seq,
+            observed_generation: state.generation,
+            uptime_ms: 1_000,
+            host: HostFacts { hostname: "host".to_owned(), ..HostFacts::default() },
+            conditions: Vec::new(),
+            tasks: state.tasks.iter().map(|task| in_phase(task, phase)).collect(),
+        }
+    }
+}
+
+/// What an envelope holds, its signature verified.
+pub async fn opened(server: &TestServer, envelope: &Envelope) -> DesiredState {
+    let info: ServerInfo = server.get("/api/v1/server").await;
+    let payload = envelope.open(DESIRED_STATE_TYPE, &info.key).expect("signed by this server");
     serde_json::from_slice(&payload).expect("a desired state")
 }
 

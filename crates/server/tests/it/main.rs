@@ -11,3 +11,4 @@ mod mqtt_harness;
 mod oci;
 mod serve;
 mod story;
+mod uplink;

@@ -1,0 +1,170 @@
+//! A robot on MQTT: it is told of its state, its reports are stored before they are acknowledged, and the operator sees
+//! it come and go.
+
+use std::time::Duration;
+
+use reqwest::Method;
+use rumqttc::{AsyncClient, Event, EventLoop, MqttOptions, Packet, QoS};
+use serde_json::json;
+use task_proto::desired::{DesiredState, Doorbell};
+use task_proto::report::Phase;
+
+use crate::harness::{TestRobot, TestServer, opened};
+
+/// More than anything here takes, unless it hangs.
+const PATIENCE: Duration = Duration::from_secs(10);
+
+/// A robot's MQTT session.
+struct Session {
+    client: AsyncClient,
+    packets: EventLoop,
+    topics: String,
+}
+
+impl Session {
+    async fn open(server: &TestServer, robot: &TestRobot) -> Self {
+        let mut session = Self::dial(server, robot.id.as_str(), &robot.token);
+        session.until(|packet| matches!(packet, Packet::ConnAck(_))).await;
+        session.client.subscribe(format!("{}/desired", session.topics), QoS::AtLeastOnce).await.expect("queued");
+        session
+    }
+
+    fn dial(server: &TestServer, id: &str, token: &str) -> Self {
+        let (host, port) = server.server.addresses().mqtt.rsplit_once(':').expect("host:port");
+        let mut options = MqttOptions::new(id, host, port.parse().expect("a port"));
+        options.set_credentials(id, token).set_max_packet_size(256 * 1024, 256 * 1024);
+        let (client, packets) = AsyncClient::new(options, 16);
+        Self { client, packets, topics: format!("taskd/v1/r/{id}") }
+    }
+
+    async fn until(&mut self, mut wanted: impl FnMut(&Packet) -> bool) -> Packet {
+        tokio::time::timeout(PATIENCE, async {
+            loop {
+                if let Event::Incoming(packet) = self.packets.poll().await.expect("connected")
+                    && wanted(&packet)
+                {
+                    return packet;
+                }
+            }
+        })
+        .await
+        .expect("the packet comes")
+    }
+
+    /// The next state it is told of, from `generation` on.
+    async fn told(&mut self, server: &TestServer, generation: u64) -> DesiredState {
+        loop {
+            let Packet::Publish(publish) = self.until(|packet| matches!(packet, Packet::Publish(_))).await else {
+                continue;
+            };
+            assert_eq!(publish.topic, format!("{}/desired", self.topics));
+            let Ok(Doorbell::State(envelope)) = serde_json::from_slice(&publish.payload) else {
+                panic!("the whole state fits into a message");
+            };
+            let state = opened(server, &envelope).await;
+            if state.generation.0 >= generation {
+                return state;
+            }
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_connected_robot_is_told_and_its_report_is_stored_before_the_acknowledgement() {
+    let server = TestServer::start().await;
+    let mut robot = server.enroll("atlas").await;
+    let package = server.push("talker", "1.0.0").await;
+    let mut session = Session::open(&server, &robot).await;
+    let first = session.told(&server, 0).await;
+    assert!(first.tasks.is_empty());
+    server.deploy(&package, "*", "key-1").await;
+    let state = session.told(&server, first.generation.0 + 1).await;
+    assert_eq!(state.tasks[0].package, package);
+
+    let report = serde_json::to_vec(&robot.next_report(&state, Phase::Running)).expect("json");
+    let topic = format!("{}/report", session.topics);
+    session.client.publish(topic, QoS::AtLeastOnce, false, report).await.expect("queued");
+    session.until(|packet| matches!(packet, Packet::PubAck(_))).await;
+    let view = server.robot(&robot).await;
+    assert_eq!(view.tasks[0].phase, Phase::Running);
+    assert!(view.online && view.address.is_some());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_robot_that_reports_an_old_generation_is_told_again() {
+    let server = TestServer::start().await;
+    let mut robot = server.enroll("atlas").await;
+    let package = server.push("talker", "1.0.0").await;
+    let mut session = Session::open(&server, &robot).await;
+    let first = session.told(&server, 0).await;
+    server.deploy(&package, "*", "key-1").await;
+    let state = session.told(&server, first.generation.0 + 1).await;
+    let report = serde_json::to_vec(&robot.next_report(&first, Phase::Running)).expect("json");
+    session
+        .client
+        .publish(format!("{}/report", session.topics), QoS::AtLeastOnce, false, report)
+        .await
+        .expect("queued");
+    assert_eq!(session.told(&server, state.generation.0).await.generation, state.generation);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn nonsense_is_acknowledged_and_dropped() {
+    let server = TestServer::start().await;
+    let mut robot = server.enroll("atlas").await;
+    let other = server.enroll("boreas").await;
+    let mut session = Session::open(&server, &robot).await;
+    let state = session.told(&server, 0).await;
+    let mut forged = robot.next_report(&state, Phase::Running);
+    forged.robot_id = other.id.clone();
+    for payload in [b"nonsense".to_vec(), Vec::new(), serde_json::to_vec(&forged).expect("json")] {
+        let topic = format!("{}/report", session.topics);
+        session.client.publish(topic, QoS::AtLeastOnce, false, payload).await.expect("queued");
+        session.until(|packet| matches!(packet, Packet::PubAck(_))).await;
+    }
+    assert_eq!(server.robot(&other).await.host, None);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_removed_robot_is_hung_up_on_and_not_let_in_again() {
+    let server = TestServer::start().await;
+    let robot = server.enroll("atlas").await;
+    let mut session = Session::open(&server, &robot).await;
+    session.told(&server, 0).await;
+    let path = format!("/api/v1/robots/{}", robot.id);
+    server.request(Method::DELETE, &path).send().await.expect("an answer");
+    let hung_up = tokio::time::timeout(PATIENCE, async { while session.packets.poll().await.is_ok() {} });
+    hung_up.await.expect("the connection ends");
+    let mut again = Session::dial(&server, robot.id.as_str(), &robot.token);
+    assert!(tokio::time::timeout(PATIENCE, again.packets.poll()).await.expect("an answer").is_err());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn two_instances_that_displace_each_other_get_no_more_work() {
+    let server = TestServer::start().await;
+    let mut robot = server.enroll("atlas").await;
+    let mut clone = TestRobot::new(robot.id.clone(), robot.token.clone());
+    let state = server.desired(&robot).await;
+    for _ in 0..3 {
+        server.report(&mut robot, &state, Phase::Running).await;
+        server.report(&mut clone, &state, Phase::Running).await;
+    }
+    let refused = server.ask_desired(&robot).await;
+    assert_eq!(refused.status(), 409);
+    let body: serde_json::Value = refused.json().await.expect("json");
+    assert_eq!(body["error"]["code"], "duplicate_identity");
+    assert_eq!(server.robot(&robot).await.conditions[0].code, "duplicate_identity");
+    server.clock.advance_ms(10 * 60 * 1000);
+    assert_eq!(server.ask_desired(&robot).await.status(), 200);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_enrolment_token_or_another_robots_name_opens_nothing() {
+    let server = TestServer::start().await;
+    let (robot, other) = (server.enroll("atlas").await, server.enroll("boreas").await);
+    let token: task_proto::api::EnrollmentToken = server.post("/api/v1/enrollment-tokens", &json!({})).await;
+    for (id, token) in [(other.id.as_str(), &robot.token), (robot.id.as_str(), &token.token)] {
+        let mut session = Session::dial(&server, id, token);
+        assert!(tokio::time::timeout(PATIENCE, session.packets.poll()).await.expect("an answer").is_err());
+    }
+}

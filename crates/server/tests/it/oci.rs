@@ -19,6 +19,10 @@ use taskd::http::auth::Caller;
 use taskd::http::drain::drain_unread;
 use taskd::http::oci::{self, Registry};
 use taskd::store::{Store, sqlite_url};
+use tempfile::TempDir;
+
+use crate::database::{TestDatabase, on_both_databases};
+use crate::fleet::{Fleet, order_of, random_key};
 
 const GRACE: Duration = Duration::from_secs(3600);
 /// Past what any file's time can be when a test runs.
@@ -28,7 +32,7 @@ struct TestRegistry {
     base: String,
     client: Client,
     registry: Registry,
-    _data: tempfile::TempDir,
+    data: TempDir,
 }
 
 impl TestRegistry {
@@ -40,20 +44,13 @@ impl TestRegistry {
     async fn start_with(settings: BlobSettings, caller: Option<Caller>) -> Self {
         let data = tempfile::tempdir().expect("a directory");
         let store = Store::open(&sqlite_url(&data.path().join("taskd.db"))).await.expect("a store");
+        Self::start_on(store, data, settings, caller).await
+    }
+
+    async fn start_on(store: Store, data: TempDir, settings: BlobSettings, caller: Option<Caller>) -> Self {
         let blobs = Blobs::open(data.path(), settings).expect("a blob store");
         let registry = Registry { store, blobs, clock: Clock::fixed(NOW_MS) };
-        let router = Router::new()
-            .route("/v2/", any(oci::version))
-            .route("/v2/{*path}", any(oci::dispatch))
-            .with_state(registry.clone())
-            .layer(map_request_with_state(caller, let_in))
-            .layer(map_request(drain_unread));
-        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("a port");
-        let base = format!("http://{}", listener.local_addr().expect("an address"));
-        tokio::spawn(async move { axum::serve(listener, router).await });
-        // Another test may have installed it before.
-        let _ = rustls::crypto::ring::default_provider().install_default();
-        Self { base, client: Client::new(), registry, _data: data }
+        Self { base: serve(registry.clone(), caller).await, client: client(), registry, data }
     }
 
     fn ask(&self, method: Method, path: &str) -> RequestBuilder {
@@ -102,6 +99,26 @@ impl TestRegistry {
     async fn collect(&self, now_ms: u64) -> Collected {
         collector::collect(&self.registry.store, &self.registry.blobs, now_ms, GRACE).await.expect("collected")
     }
+}
+
+/// Serves a registry to one caller and says where.
+async fn serve(registry: Registry, caller: Option<Caller>) -> String {
+    let router = Router::new()
+        .route("/v2/", any(oci::version))
+        .route("/v2/{*path}", any(oci::dispatch))
+        .with_state(registry)
+        .layer(map_request_with_state(caller, let_in))
+        .layer(map_request(drain_unread));
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("a port");
+    let base = format!("http://{}", listener.local_addr().expect("an address"));
+    tokio::spawn(async move { axum::serve(listener, router).await });
+    base
+}
+
+fn client() -> Client {
+    // Another test may have installed it before.
+    let _ = rustls::crypto::ring::default_provider().install_default();
+    Client::new()
 }
 
 async fn let_in(axum::extract::State(caller): axum::extract::State<Option<Caller>>, mut request: Request) -> Request {
@@ -250,7 +267,7 @@ async fn wrong_bytes_and_cancelled_uploads_leave_nothing() {
     assert_eq!(registry.status(Method::DELETE, &upload).await, StatusCode::NO_CONTENT);
     let answer = registry.ask(Method::PATCH, &upload).body("x").send().await.expect("an answer");
     assert_eq!(refusal(answer).await, refused(404, "BLOB_UPLOAD_UNKNOWN"));
-    let uploads = std::fs::read_dir(registry._data.path().join("uploads")).expect("a directory");
+    let uploads = std::fs::read_dir(registry.data.path().join("uploads")).expect("a directory");
     assert_eq!(uploads.count(), 0);
 }
 
@@ -460,6 +477,46 @@ async fn a_task_package_is_checked_and_listed() {
     assert_eq!(registry.status(Method::DELETE, &manifest).await, StatusCode::ACCEPTED);
     assert_eq!(registry.registry.store.packages().await.expect("packages"), []);
 }
+
+async fn a_package_in_use_outlives_its_manifest(database: TestDatabase) {
+    let data = tempfile::tempdir().expect("a directory");
+    let store = database.store.clone();
+    let registry = TestRegistry::start_on(store, data, BlobSettings::default(), Some(operator())).await;
+    let config = registry.push_blob("talker", task("talker").to_string().as_bytes()).await;
+    let content = registry.push_blob("talker", b"content").await;
+    let package = ImageManifest::package(config, content);
+    let answer = registry.put_manifest("/v2/talker/manifests/1.0.0", MANIFEST_TYPE, &package).await;
+    assert_eq!(answer.status(), StatusCode::CREATED);
+    let tags: Value = registry.get("/v2/talker/tags/list").await.json().await.expect("JSON");
+    assert_eq!(tags["tags"], json!(["1.0.0"]));
+
+    let fleet = Fleet::new(database);
+    let robots = fleet.enroll(1).await;
+    let ordered = registry.registry.store.packages().await.expect("packages").remove(0);
+    fleet.actions.create_deployment(&random_key(), &order_of(&ordered), &ordered).await.expect("ordered");
+    let robot = serve(registry.registry.clone(), Some(Caller::Robot(robots[0].id.clone()))).await;
+    let stranger = serve(registry.registry.clone(), Some(Caller::Robot(RobotId::random()))).await;
+
+    let manifest = ordered.package.manifest.digest;
+    let path = format!("/v2/talker/manifests/{manifest}");
+    assert_eq!(registry.status(Method::DELETE, &path).await, StatusCode::ACCEPTED);
+    assert_eq!(registry.status(Method::GET, &path).await, StatusCode::NOT_FOUND);
+    let loose = registry.push_blob("talker", b"loose").await.digest;
+    let year_ms = 365 * 24 * 3_600_000;
+    assert_eq!(registry.collect(NOW_MS + year_ms).await.blobs, 1);
+    for (digest, expected) in [
+        (manifest, StatusCode::OK),
+        (config.digest, StatusCode::OK),
+        (content.digest, StatusCode::OK),
+        (loose, StatusCode::FORBIDDEN),
+    ] {
+        let path = format!("/v2/talker/blobs/{digest}");
+        assert_eq!(registry.status(Method::GET, &format!("{robot}{path}")).await, expected, "{digest}");
+        assert_eq!(registry.status(Method::GET, &format!("{stranger}{path}")).await, StatusCode::FORBIDDEN);
+    }
+}
+
+on_both_databases!(a_package_in_use_outlives_its_manifest);
 
 #[tokio::test]
 async fn what_nothing_refers_to_is_collected_after_its_grace() {

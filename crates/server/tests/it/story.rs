@@ -29,6 +29,7 @@ on_both_databases! {
     tasks_are_stopped_started_and_removed,
     late_reports_change_nothing,
     reports_at_once_are_all_acknowledged,
+    a_report_that_can_not_be_stored_is_answered_so,
     a_restored_database_leaves_robots_alone_until_the_next_order,
     a_reopened_database_knows_everything,
 }
@@ -375,6 +376,14 @@ async fn reports_at_once_are_all_acknowledged(database: TestDatabase) {
     }
     assert_eq!(submissions.join_all().await.len(), 60);
     assert!(fleet.phases(&id).await.iter().all(|phase| *phase == Phase::Running));
+}
+
+async fn a_report_that_can_not_be_stored_is_answered_so(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let mut robots = fleet.enroll(1).await;
+    fleet.database.store.close().await;
+    let refused = fleet.writer.submit(robots[0].next_report()).await;
+    assert!(matches!(refused, Err(ReportError::NotStored)));
 }
 
 async fn a_restored_database_leaves_robots_alone_until_the_next_order(database: TestDatabase) {

@@ -132,7 +132,7 @@ pub struct Limits {
     pub max_silence: Duration,
     /// How often the watchdog sends its canary through the listener.
     pub canary_interval: Duration,
-    /// How long the canary may take.
+    /// How long each half of its way may take: to be let in, and to hear itself.
     pub canary_timeout: Duration,
 }
 
@@ -149,7 +149,7 @@ impl Default for Limits {
             write_timeout: Duration::from_secs(20),
             max_silence: Duration::from_secs(1800),
             canary_interval: Duration::from_secs(5),
-            canary_timeout: Duration::from_secs(5),
+            canary_timeout: Duration::from_secs(10),
         }
     }
 }

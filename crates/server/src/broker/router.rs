@@ -23,6 +23,8 @@ const SEGMENT_BYTES: usize = 2 * 1024 * 1024;
 const SEGMENTS: usize = 4;
 /// Messages the router hands a listener at a time.
 const MAX_BATCH: u64 = 32;
+/// Links besides the listeners': the publisher's, the canary's, and some that are just ending.
+const OTHER_LINKS: usize = 16;
 /// For the router to answer a new link.
 const LINK_TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -78,12 +80,11 @@ pub(super) enum RouterError {
 impl Router {
     /// Starts the router's thread.
     pub(super) async fn start(prefix: &TopicPrefix, max_listeners: usize) -> Result<Arc<Self>, RouterError> {
-        // One more for the publisher and one for the canary.
         let everything = format!("{prefix}/#");
-        let running = Running::start(&everything, max_listeners + 2).await?;
+        let running = Running::start(&everything, max_listeners).await?;
         Ok(Arc::new(Self {
             everything,
-            slots: Mutex::new((0..=max_listeners).rev().collect()),
+            slots: Mutex::new((0..max_listeners).rev().collect()),
             max_listeners,
             listeners: AtomicUsize::new(0),
             current: Mutex::new(Arc::new(running)),
@@ -93,7 +94,7 @@ impl Router {
 
     /// Starts over with a new thread. Listeners of the old one find that it is gone.
     pub(super) async fn restart(&self) -> Result<(), RouterError> {
-        let running = Arc::new(Running::start(&self.everything, self.max_listeners + 2).await?);
+        let running = Arc::new(Running::start(&self.everything, self.max_listeners).await?);
         let before = std::mem::replace(&mut *lock(&self.current), running);
         before.replaced.cancel();
         Ok(())
@@ -114,7 +115,7 @@ impl Router {
         // Inside the router all is QoS 0, so the real one travels as one more level of the topic.
         let message = Publish::new(Bytes::from(format!("{topic}/{}", qos as u8)), payload, false);
         publisher.buffer().push_back(Packet::Publish(message, None));
-        // Says that there is something in the buffer; a full channel has such notes in it already.
+        // Says that there is something in the buffer; a full channel has many such notes in it already.
         if let Err(LinkError::TrySend(flume::TrySendError::Disconnected(_))) = publisher.try_unsubscribe(NOTHING) {
             self.trouble.notify_one();
         }
@@ -122,13 +123,15 @@ impl Router {
 
     /// A new listener, which hears what is published from now on.
     pub(super) async fn listen(self: &Arc<Self>, listening: Listening) -> Result<Listener, RouterError> {
-        let place = Place::take(self.clone(), listening)?;
         let running = lock(&self.current).clone();
-        let filter = match listening {
-            Listening::Everything => self.everything.clone(),
-            Listening::Canary => format!("{CANARY_TOPIC}/#"),
+        let (filter, name, place) = match listening {
+            Listening::Everything => {
+                let place = Place::take(self.clone())?;
+                (self.everything.clone(), format!("listener-{}", place.slot), Some(place))
+            }
+            Listening::Canary => (format!("{CANARY_TOPIC}/#"), "canary".to_owned(), None),
         };
-        let link = Link::open(&running.connect, format!("listener-{}", place.slot), Some(place)).await?;
+        let link = Link::open(&running.connect, name, place).await?;
         let mut listener = Listener { link, replaced: running.replaced.clone(), owes_ready: false };
         listener.subscribe(filter).await?;
         Ok(listener)
@@ -151,9 +154,9 @@ impl Router {
 const NOTHING: &str = "";
 
 impl Running {
-    async fn start(everything: &str, max_connections: usize) -> Result<Self, RouterError> {
+    async fn start(everything: &str, max_listeners: usize) -> Result<Self, RouterError> {
         let config = RouterConfig {
-            max_connections,
+            max_connections: max_listeners + OTHER_LINKS,
             max_outgoing_packet_count: MAX_BATCH,
             max_segment_size: SEGMENT_BYTES,
             max_segment_count: SEGMENTS,
@@ -208,28 +211,23 @@ impl Drop for Link {
     }
 }
 
-/// One of the names that links to the router have, free again when this is dropped.
+/// One of the names that listeners' links have, free again when this is dropped.
 struct Place {
     router: Arc<Router>,
     slot: usize,
-    listening: Listening,
 }
 
 impl Place {
-    fn take(router: Arc<Router>, listening: Listening) -> Result<Self, RouterError> {
+    fn take(router: Arc<Router>) -> Result<Self, RouterError> {
         let slot = lock(&router.slots).pop().ok_or(RouterError::Full)?;
-        if listening == Listening::Everything {
-            router.listeners.fetch_add(1, Ordering::Relaxed);
-        }
-        Ok(Self { router, slot, listening })
+        router.listeners.fetch_add(1, Ordering::Relaxed);
+        Ok(Self { router, slot })
     }
 }
 
 impl Drop for Place {
     fn drop(&mut self) {
-        if self.listening == Listening::Everything {
-            self.router.listeners.fetch_sub(1, Ordering::Relaxed);
-        }
+        self.router.listeners.fetch_sub(1, Ordering::Relaxed);
         lock(&self.router.slots).push(self.slot);
     }
 }

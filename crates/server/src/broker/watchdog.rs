@@ -48,85 +48,66 @@ struct Watchdog {
     flights: u64,
 }
 
-/// Why a canary did not come back.
+/// Why a canary did not come back, by what helps.
 #[derive(Debug, thiserror::Error)]
 enum Lost {
+    /// Nothing helps, if it lasts.
     #[error("the MQTT listener does not accept connections")]
     Listener(#[source] std::io::Error),
-    #[error("the MQTT connection broke")]
-    Connection(#[source] std::io::Error),
-    #[error("the MQTT front does not let the watchdog in: {0:?}")]
-    NotAdmitted(ConnectReturnCode),
-    #[error("the MQTT front answers with something else than expected")]
-    Confused,
-    #[error("no answer within the time allowed")]
-    Late,
+    /// Time helps: too many connections, too much to do. A new router would only make it worse.
+    #[error("the MQTT front did not let the watchdog in: {0}")]
+    Front(&'static str),
+    /// A new router helps.
+    #[error("the message router does not work: {0}")]
+    Router(&'static str),
 }
 
 impl Watchdog {
     async fn run(mut self) {
-        let mut remedies = 0;
+        let mut failures = 0;
         loop {
-            let pause = tokio::time::sleep(self.limits.canary_interval);
             tokio::select! {
-                () = pause => {}
+                () = tokio::time::sleep(self.limits.canary_interval) => {}
                 () = self.router.trouble() => {}
             }
             let Err(lost) = self.fly().await else {
-                remedies = 0;
-                self.health.send_if_modified(|health| {
-                    let changed = *health != Health::Serving;
-                    *health = Health::Serving;
-                    changed
-                });
+                failures = 0;
+                self.say(Health::Serving);
                 continue;
             };
-            let lost: anyhow::Error = lost.into();
-            if remedies == MAX_REMEDIES {
-                tracing::error!("the MQTT broker is beyond repair: {lost:#}");
-                self.health.send_replace(Health::Failed(format!("{lost:#}")));
+            let seen = lost.to_string();
+            if !matches!(lost, Lost::Front(_)) {
+                failures += 1;
+            }
+            if failures > MAX_REMEDIES {
+                tracing::error!("the MQTT broker is beyond repair: {:#}", anyhow::Error::from(lost));
+                self.say(Health::Failed(seen));
                 return;
             }
-            remedies += 1;
-            tracing::warn!(remedies, "the MQTT broker's canary is lost, its router is started anew: {lost:#}");
-            self.health.send_replace(Health::Recovering(format!("{lost:#}")));
-            if let Err(error) = self.router.restart().await {
-                tracing::error!(%error, "the router did not start");
+            if let Lost::Router(_) = lost {
+                tracing::warn!("{lost}; it is started anew");
+                if let Err(error) = self.router.restart().await {
+                    tracing::error!("the message router did not start anew: {error}");
+                }
+            } else {
+                tracing::warn!("{:#}", anyhow::Error::from(lost));
             }
+            self.say(Health::Recovering(seen));
         }
+    }
+
+    fn say(&self, finding: Health) {
+        self.health.send_if_modified(|health| std::mem::replace(health, finding.clone()) != finding);
     }
 
     /// One canary, there and back.
     async fn fly(&mut self) -> Result<(), Lost> {
         self.flights += 1;
-        let song = self.flights.to_string();
-        let flight = fly(self.address, self.pass.renew(), &song);
-        timeout(self.limits.canary_timeout, flight).await.unwrap_or(Err(Lost::Late))
-    }
-}
-
-async fn fly(address: SocketAddr, password: String, song: &str) -> Result<(), Lost> {
-    let stream = TcpStream::connect(address).await.map_err(Lost::Listener)?;
-    let mut bird = Bird { stream, input: BytesMut::new() };
-    let connect = Connect { keep_alive: 30, client_id: CANARY_ID.to_owned(), clean_session: true };
-    let login = Login { username: CANARY_ID.to_owned(), password };
-    match bird.ask(Packet::Connect(connect, None, None, None, Some(login))).await? {
-        Packet::ConnAck(ack, _) if ack.code == ConnectReturnCode::Success => {}
-        Packet::ConnAck(ack, _) => return Err(Lost::NotAdmitted(ack.code)),
-        _ => return Err(Lost::Confused),
-    }
-    let filter = Filter {
-        path: CANARY_TOPIC.to_owned(),
-        qos: QoS::AtMostOnce,
-        nolocal: false,
-        preserve_retain: false,
-        retain_forward_rule: RetainForwardRule::Never,
-    };
-    bird.ask(Packet::Subscribe(Subscribe { pkid: 1, filters: vec![filter] }, None)).await?;
-    let publish = Publish::new(CANARY_TOPIC.to_owned(), song.to_owned(), false);
-    match bird.ask(Packet::Publish(publish, None)).await? {
-        Packet::Publish(heard, _) if heard.payload == song.as_bytes() => Ok(()),
-        _ => Err(Lost::Confused),
+        let patience = self.limits.canary_timeout;
+        let entering = timeout(patience, Bird::enter(self.address, self.pass.renew())).await;
+        let mut bird = entering.unwrap_or(Err(Lost::Front("no answer in time")))?;
+        let singing = timeout(patience, bird.sing(self.flights.to_string())).await;
+        singing.unwrap_or(Err(Lost::Router("the watchdog did not hear itself in time")))
     }
 }
 
@@ -137,19 +118,54 @@ struct Bird {
 }
 
 impl Bird {
-    /// Sends a packet and gives back the next that arrives.
-    async fn ask(&mut self, packet: Packet) -> Result<Packet, Lost> {
+    async fn enter(address: SocketAddr, password: String) -> Result<Self, Lost> {
+        let stream = TcpStream::connect(address).await.map_err(Lost::Listener)?;
+        let mut bird = Self { stream, input: BytesMut::new() };
+        let connect = Connect { keep_alive: 30, client_id: CANARY_ID.to_owned(), clean_session: true };
+        let login = Login { username: CANARY_ID.to_owned(), password };
+        match bird.ask(Packet::Connect(connect, None, None, None, Some(login))).await {
+            Some(Packet::ConnAck(ack, _)) => match ack.code {
+                ConnectReturnCode::Success => Ok(bird),
+                // The one thing the front needs for a canary is a link to the router.
+                ConnectReturnCode::ServiceUnavailable => Err(Lost::Router("it answers no new link")),
+                _ => Err(Lost::Front("it refused the password")),
+            },
+            _ => Err(Lost::Front("the connection broke")),
+        }
+    }
+
+    async fn sing(&mut self, song: String) -> Result<(), Lost> {
+        let filter = Filter {
+            path: CANARY_TOPIC.to_owned(),
+            qos: QoS::AtMostOnce,
+            nolocal: false,
+            preserve_retain: false,
+            retain_forward_rule: RetainForwardRule::Never,
+        };
+        let broke = Lost::Router("the watchdog's connection broke");
+        let Some(_) = self.ask(Packet::Subscribe(Subscribe { pkid: 1, filters: vec![filter] }, None)).await else {
+            return Err(broke);
+        };
+        let publish = Publish::new(CANARY_TOPIC.to_owned(), song.clone(), false);
+        match self.ask(Packet::Publish(publish, None)).await {
+            Some(Packet::Publish(heard, _)) if heard.payload == song.as_bytes() => Ok(()),
+            _ => Err(broke),
+        }
+    }
+
+    /// Sends a packet and gives back the next that arrives; `None` if the connection breaks.
+    async fn ask(&mut self, packet: Packet) -> Option<Packet> {
         let mut output = BytesMut::new();
-        V4.write(packet, &mut output).map_err(|_| Lost::Confused)?;
-        self.stream.write_all(&output).await.map_err(Lost::Connection)?;
+        V4.write(packet, &mut output).ok()?;
+        self.stream.write_all(&output).await.ok()?;
         loop {
             match V4.read_mut(&mut self.input, MAX_PACKET_BYTES) {
-                Ok(packet) => return Ok(packet),
+                Ok(packet) => return Some(packet),
                 Err(Error::InsufficientBytes(_)) => {}
-                Err(_) => return Err(Lost::Confused),
+                Err(_) => return None,
             }
-            if self.stream.read_buf(&mut self.input).await.map_err(Lost::Connection)? == 0 {
-                return Err(Lost::Connection(std::io::ErrorKind::UnexpectedEof.into()));
+            if self.stream.read_buf(&mut self.input).await.ok()? == 0 {
+                return None;
             }
         }
     }
@@ -163,4 +179,104 @@ fn reachable(bound: SocketAddr) -> SocketAddr {
         ip => ip,
     };
     SocketAddr::new(ip, bound.port())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use futures_util::future::BoxFuture;
+    use task_proto::RobotId;
+    use task_proto::topic::TopicPrefix;
+
+    use super::super::{BrokerConfig, Gatekeeper, Inbox, NotStored, Principal, Refusal, RobotMessage};
+    use super::*;
+
+    const PATIENCE: Duration = Duration::from_secs(10);
+
+    struct Nobody;
+
+    impl Gatekeeper for Nobody {
+        fn admit(&self, _: super::super::Login) -> BoxFuture<'_, Result<Principal, Refusal>> {
+            Box::pin(async { Err(Refusal::BadCredentials) })
+        }
+    }
+
+    impl Inbox for Nobody {
+        fn receive(&self, _: RobotMessage) -> BoxFuture<'_, Result<(), NotStored>> {
+            Box::pin(async { Err(NotStored) })
+        }
+        fn connected(&self, _: &RobotId, _: SocketAddr, _: u64) {}
+        fn disconnected(&self, _: &RobotId, _: u64) {}
+    }
+
+    async fn watched(change: impl FnOnce(&mut Limits)) -> (Arc<Front>, Arc<Router>, watch::Receiver<Health>) {
+        let mut limits = Limits { canary_interval: Duration::from_millis(20), ..Limits::default() };
+        change(&mut limits);
+        let listen = "127.0.0.1:0".parse().expect("an address");
+        let config = BrokerConfig { listen, prefix: TopicPrefix::default(), limits: limits.clone() };
+        let router = Router::start(&config.prefix, 4).await.expect("a router");
+        let front =
+            Front::start(config, Arc::new(Nobody), Arc::new(Nobody), router.clone()).await.expect("a free port");
+        let health = start(&front, router.clone(), &limits);
+        (front, router, health)
+    }
+
+    async fn until(health: &mut watch::Receiver<Health>, wanted: impl FnMut(&Health) -> bool) {
+        timeout(PATIENCE, health.wait_for(wanted)).await.expect("in time").expect("the watchdog lives");
+    }
+
+    #[tokio::test]
+    async fn a_killed_router_is_started_anew() {
+        let (front, router, mut health) = watched(|_| {}).await;
+        for _ in 0..3 {
+            let mut listener = router.listen(super::super::router::Listening::Everything).await.expect("a link");
+            router.kill();
+            until(&mut health, |health| matches!(health, Health::Recovering(_))).await;
+            until(&mut health, |health| *health == Health::Serving).await;
+            assert!(timeout(PATIENCE, listener.next()).await.expect("in time").is_err(), "old listeners learn of it");
+        }
+        front.shutdown(PATIENCE).await;
+    }
+
+    #[tokio::test]
+    async fn a_dead_router_is_noticed_by_whoever_publishes() {
+        let (_front, router, mut health) = watched(|limits| limits.canary_interval = Duration::from_secs(3600)).await;
+        router.kill();
+        let noticed = async {
+            while !health.has_changed().expect("the watchdog lives") {
+                router.publish(CANARY_TOPIC, QoS::AtMostOnce, "x".into());
+                tokio::task::yield_now().await;
+            }
+        };
+        timeout(PATIENCE, noticed).await.expect("in time");
+        until(&mut health, |health| matches!(health, Health::Recovering(_))).await;
+        router.listen(super::super::router::Listening::Everything).await.expect("it was started anew");
+    }
+
+    #[tokio::test]
+    async fn a_crowded_front_is_not_taken_for_a_dead_router() {
+        let (front, _router, mut health) = watched(|limits| limits.max_connections = 1).await;
+        let crowd = TcpStream::connect(front.local_addr()).await.expect("a connection");
+        until(&mut health, |health| matches!(health, Health::Recovering(seen) if seen.contains("let the watchdog in")))
+            .await;
+        drop(crowd);
+        until(&mut health, |health| *health == Health::Serving).await;
+    }
+
+    #[tokio::test]
+    async fn a_listener_that_is_gone_is_beyond_repair() {
+        let (front, _router, _) = watched(|_| {}).await;
+        let dead = {
+            let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("a port");
+            listener.local_addr().expect("an address")
+        };
+        let (sender, mut health) = watch::channel(Health::Serving);
+        let limits = Limits { canary_interval: Duration::from_millis(1), ..Limits::default() };
+        let router = Router::start(&TopicPrefix::default(), 1).await.expect("a router");
+        let watchdog =
+            Watchdog { address: dead, pass: front.canary_pass(), router, limits, health: sender, flights: 0 };
+        watchdog.run().await;
+        until(&mut health, |health| matches!(health, Health::Failed(_))).await;
+    }
 }

@@ -8,6 +8,7 @@ mod fleet;
 mod harness;
 mod mqtt;
 mod mqtt_harness;
+mod mqtt_hostile;
 mod oci;
 mod serve;
 mod story;

@@ -108,16 +108,21 @@ impl Router {
         }
         let running = lock(&self.current).clone();
         let mut publisher = lock(&running.publisher);
-        if publisher.buffer().len() >= MAX_BACKLOG {
+        let is_behind = publisher.buffer().len() >= MAX_BACKLOG;
+        if is_behind {
             tracing::debug!(topic, "the router is behind, a message for listeners is dropped");
-            return;
+        } else {
+            // Inside the router all is QoS 0, so the real one travels as one more level of the topic.
+            let message = Publish::new(Bytes::from(format!("{topic}/{}", qos as u8)), payload, false);
+            publisher.buffer().push_back(Packet::Publish(message, None));
         }
-        // Inside the router all is QoS 0, so the real one travels as one more level of the topic.
-        let message = Publish::new(Bytes::from(format!("{topic}/{}", qos as u8)), payload, false);
-        publisher.buffer().push_back(Packet::Publish(message, None));
         // Says that there is something in the buffer; a full channel has many such notes in it already.
         if let Err(LinkError::TrySend(flume::TrySendError::Disconnected(_))) = publisher.try_unsubscribe(NOTHING) {
             self.trouble.notify_one();
+        }
+        if is_behind {
+            // The note itself must not make the backlog longer.
+            publisher.buffer().pop_back();
         }
     }
 
@@ -184,7 +189,8 @@ impl Link {
     async fn open(connect: &Connect, name: String, place: Option<Place>) -> Result<Self, RouterError> {
         let (reply, answer) = oneshot::channel();
         let connect = connect.clone();
-        tokio::task::spawn_blocking(move || {
+        // A thread of its own: if the router dies just now this waits for ever, and the runtime would wait with it.
+        std::thread::spawn(move || {
             let link = connect(&name).map(|(tx, rx)| Link { tx: Some(tx), rx, _place: place });
             // If nobody waits any more, the link is dropped, and so closed, right here.
             let _ = reply.send(link);
@@ -202,11 +208,9 @@ impl Drop for Link {
         let Some(mut tx) = self.tx.take() else { return };
         let reason_code = DisconnectReasonCode::NormalDisconnection;
         tx.buffer().push_back(Packet::Disconnect(Disconnect { reason_code }, None));
-        if let Err(LinkError::TrySend(flume::TrySendError::Full(_))) = tx.try_unsubscribe(NOTHING)
-            && let Ok(runtime) = tokio::runtime::Handle::try_current()
-        {
-            // The router is busy and must not miss this: wait for it where waiting is allowed.
-            runtime.spawn_blocking(move || tx.unsubscribe(NOTHING).is_ok());
+        if let Err(LinkError::TrySend(flume::TrySendError::Full(_))) = tx.try_unsubscribe(NOTHING) {
+            // The router is busy and must not miss this: wait for it where waiting holds up nobody.
+            std::thread::spawn(move || tx.unsubscribe(NOTHING).is_ok());
         }
     }
 }

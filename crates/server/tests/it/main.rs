@@ -1,5 +1,7 @@
 //! Integration tests of the server, all in one binary.
 
+#![expect(clippy::unwrap_used, reason = "a test that can't go on should panic where it stands")]
+
 mod api;
 mod auth;
 mod cli;

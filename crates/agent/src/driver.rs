@@ -28,8 +28,10 @@ use crate::observed::{Prepared, ProcessState, RobotFacts};
 use crate::plan::{self, Lane, Next, Situation, Step, StepFailure};
 
 mod reporting;
+#[cfg(test)]
+mod tests;
 
-/// How often the hold flag is looked at and progress is reported.
+/// How often the hold flag is looked at, were there nothing else to do, and progress is reported.
 const TICK: Duration = Duration::from_secs(1);
 /// How long an interrupted step may take to end by itself.
 const INTERRUPT_GRACE: Duration = Duration::from_secs(5);
@@ -189,6 +191,8 @@ impl<E: Effects> Driver<E> {
 
     /// Plans every task until all rest, begins what is to be done, reports. Gives the time of the next turn.
     async fn turn(&mut self) -> Instant {
+        // Looked at before each turn: after `hold` nothing may be started any more.
+        self.held = self.effects.is_held();
         self.interrupt_unwanted();
         let mut wake = Instant::now() + Duration::from_secs(3600);
         let mut begin = Vec::new();
@@ -485,7 +489,6 @@ impl<E: Effects> Driver<E> {
     }
 
     fn tick(&mut self) {
-        self.held = self.effects.is_held();
         for view in self.views.values_mut() {
             view.progress = view.pull.as_ref().map(|pull| *pull.borrow()).filter(|progress| progress.total > 0);
         }

@@ -244,7 +244,12 @@ impl Effects for Robot {
         durable::create_dir_all(&run_dir).map_err(|error| failed(&error))?;
         durable::write(&run_dir.join(RUN_RECORD), &record, 0o600).map_err(|error| failed(&error))?;
         let started = self.supervisor.start(&run_dir, &spec).await;
-        Ok(started.map_err(|error| failed(&error))?.task.pid)
+        let pid = started.map_err(|error| failed(&error))?.task.pid;
+        // What earlier runs left is of no more use; that it can't be deleted is no reason not to run.
+        if let Err(error) = forget_runs(&task_dir.run(), Some(&run_dir)) {
+            tracing::warn!(%task, %error, "cannot delete what ended runs left");
+        }
+        Ok(pid)
     }
 
     async fn stop(&self, task: &TaskName, process: &ProcessRecord, stop_timeout_s: u32) -> Result<(), StepFailure> {
@@ -263,12 +268,7 @@ impl Effects for Robot {
         let running = running.map(|process| task.run().join(&process.dir));
         on_disk(move || {
             task.prune(&kept)?;
-            for entry in std::fs::read_dir(task.run()).into_iter().flatten().flatten() {
-                if Some(entry.path()) != running {
-                    durable::remove_dir_all(&entry.path())?;
-                }
-            }
-            Ok(())
+            forget_runs(&task.run(), running.as_deref())
         })
         .await
     }
@@ -287,6 +287,16 @@ fn clean(data: &DataDir) -> std::io::Result<()> {
     let ordered = ledger.iter().flat_map(|ledger| ledger.tasks.values());
     let wanted: Vec<Digest> = ordered.map(|record| record.order.package.content.digest).collect();
     data.clean_parts(&wanted)
+}
+
+/// Deletes every run directory but one.
+fn forget_runs(runs: &Path, kept: Option<&Path>) -> std::io::Result<()> {
+    for entry in std::fs::read_dir(runs).into_iter().flatten().flatten() {
+        if Some(entry.path().as_path()) != kept {
+            durable::remove_dir_all(&entry.path())?;
+        }
+    }
+    Ok(())
 }
 
 async fn on_disk(work: impl FnOnce() -> std::io::Result<()> + Send + 'static) -> Result<(), StepFailure> {

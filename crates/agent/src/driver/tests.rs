@@ -1,0 +1,340 @@
+//! The driver's logic, with a robot whose effects only take notes.
+
+use std::collections::BTreeSet;
+use std::sync::Mutex;
+
+use task_proto::desired::{BlobRef, Delivery, PackageRef, Wanted};
+use task_proto::envelope::{DESIRED_STATE_TYPE, SigningKey};
+use task_proto::manifest::{Build, ContentFacts, Outputs, Ready, Requires, Run, TaskManifest};
+use task_proto::report::{HostFacts, Phase, Report};
+use task_proto::{DeploymentId, Digest, Generation};
+
+use super::*;
+use crate::ledger::{ActiveRun, LedgerError, ProcessRecord};
+
+/// How long a test waits for what should come at once.
+const PATIENCE: Duration = Duration::from_secs(20);
+
+#[derive(Default)]
+struct Fake {
+    state: Mutex<State>,
+    /// While set, pulls of content wait to be cancelled.
+    slow: std::sync::atomic::AtomicBool,
+}
+
+#[derive(Default)]
+struct State {
+    manifests: BTreeSet<Digest>,
+    contents: BTreeSet<Digest>,
+    alive: BTreeSet<String>,
+    started: Vec<(DeploymentId, u64)>,
+    cancelled: u32,
+    ledgers: Vec<Ledger>,
+    held: bool,
+}
+
+impl Fake {
+    fn state<T>(&self, look: impl FnOnce(&mut State) -> T) -> T {
+        look(&mut self.state.lock().expect("no test panicked"))
+    }
+}
+
+impl Effects for Fake {
+    fn now(&self) -> Now {
+        Now { boot_ms: crate::clock::boot_ms(), wall_ms: crate::clock::wall_ms() }
+    }
+
+    fn write_ledger(&self, ledger: &Ledger) -> Result<(), LedgerError> {
+        self.state(|state| state.ledgers.push(ledger.clone()));
+        Ok(())
+    }
+
+    fn is_held(&self) -> bool {
+        self.state(|state| state.held)
+    }
+
+    fn robot_facts(&self) -> RobotFacts {
+        RobotFacts::default()
+    }
+
+    fn host_facts(&self) -> HostFacts {
+        HostFacts::default()
+    }
+
+    async fn survivors(&self) -> Vec<(TaskName, ActiveRun)> {
+        Vec::new()
+    }
+
+    async fn prepared(&self, package: &PackageRef) -> Prepared {
+        self.state(|state| {
+            let content = state.contents.contains(&package.manifest.digest);
+            let manifest = state.manifests.contains(&package.manifest.digest).then(|| manifest(package));
+            Prepared { manifest, content, built: content, versions: Vec::new() }
+        })
+    }
+
+    async fn process(&self, _task: &TaskName, process: &ProcessRecord) -> ProcessState {
+        let alive = self.state(|state| state.alive.contains(&process.dir));
+        if alive { ProcessState::Alive { pid: 7 } } else { ProcessState::NeverStarted }
+    }
+
+    async fn process_ended(&self, _task: &TaskName, _process: &ProcessRecord) {
+        std::future::pending().await
+    }
+
+    async fn pull_manifest(&self, package: &PackageRef, _cancel: &CancellationToken) -> Result<(), StepFailure> {
+        self.state(|state| state.manifests.insert(package.manifest.digest));
+        Ok(())
+    }
+
+    async fn pull_content(
+        &self,
+        package: &PackageRef,
+        _progress: &watch::Sender<Progress>,
+        cancel: &CancellationToken,
+    ) -> Result<(), StepFailure> {
+        if self.slow.load(std::sync::atomic::Ordering::SeqCst) {
+            cancel.cancelled().await;
+            self.state(|state| state.cancelled += 1);
+            let failure = Failure::new(FailureCode::IO_ERROR, "cancelled");
+            return Err(StepFailure { failure, retry_after_ms: Some(0) });
+        }
+        self.state(|state| state.contents.insert(package.manifest.digest));
+        Ok(())
+    }
+
+    async fn build(&self, _package: &PackageRef, _cancel: &CancellationToken) -> Result<(), StepFailure> {
+        Ok(())
+    }
+
+    async fn start(&self, task: &TaskName, run: &ActiveRun) -> Result<u32, StepFailure> {
+        self.state(|state| {
+            let dir = run.process.as_ref().expect("a process to start").dir.clone();
+            let written = state.ledgers.last().and_then(|ledger| ledger.tasks.get(task)?.active.clone());
+            assert_eq!(written.as_ref(), Some(run), "the ledger is written before the start");
+            assert!(state.alive.is_empty(), "two processes of a task");
+            state.alive.insert(dir);
+            state.started.push((run.deployment.clone(), run.run));
+        });
+        Ok(7)
+    }
+
+    async fn stop(&self, _task: &TaskName, process: &ProcessRecord, _stop_timeout_s: u32) -> Result<(), StepFailure> {
+        self.state(|state| state.alive.remove(&process.dir));
+        Ok(())
+    }
+
+    async fn prune(
+        &self,
+        _task: &TaskName,
+        _kept: &[Digest],
+        _running: Option<&ProcessRecord>,
+    ) -> Result<(), StepFailure> {
+        Ok(())
+    }
+
+    async fn remove(&self, _task: &TaskName) -> Result<(), StepFailure> {
+        assert!(self.state(|state| state.alive.is_empty()), "removed while it runs");
+        Ok(())
+    }
+}
+
+fn manifest(package: &PackageRef) -> TaskManifest {
+    TaskManifest {
+        name: package.name.clone(),
+        version: package.version.clone(),
+        build: Build::default(),
+        run: Run::default(),
+        ready: Ready { hold_s: 0, ..Ready::default() },
+        parameters: Default::default(),
+        outputs: Outputs::default(),
+        requires: Requires::default(),
+        exec_depends: Vec::new(),
+        content: ContentFacts { tar_digest: Digest::of(b""), tar_size: 0, entries: 0 },
+    }
+}
+
+fn order(version: &str) -> DesiredTask {
+    let blob = BlobRef { digest: Digest::of(version.as_bytes()), size: 1 };
+    let name: TaskName = "talker".parse().expect("valid");
+    let version = version.parse().expect("valid");
+    DesiredTask {
+        task: name.clone(),
+        deployment: DeploymentId::random(),
+        package: PackageRef { name, version, manifest: blob, config: blob, content: blob },
+        wanted: Wanted::Running,
+        run: 1,
+        delivery: Delivery::PushPull,
+    }
+}
+
+/// A driver at work, and the server's side of it.
+struct Bench {
+    fake: Arc<Fake>,
+    shared: Shared,
+    heard: mpsc::Sender<Heard>,
+    key: SigningKey,
+    robot: RobotId,
+    driver: tokio::task::JoinHandle<()>,
+}
+
+impl Bench {
+    async fn new() -> Self {
+        let (key, robot) = (SigningKey::random(), RobotId::random());
+        Self::with(Arc::default(), Ledger::new(0), key, robot).await
+    }
+
+    async fn with(fake: Arc<Fake>, ledger: Ledger, key: SigningKey, robot: RobotId) -> Self {
+        let shared = Shared::new(CancellationToken::new());
+        let speaker = Speaker {
+            robot_id: robot.clone(),
+            server_key: key.public_key(),
+            instance: InstanceId::random(),
+            boot_id: "boot".to_owned(),
+            name: Some("atlas".parse().expect("valid")),
+            labels: None,
+            parallel_tasks: 2,
+        };
+        let driver = Driver::new(fake.clone(), speaker, shared.clone(), ledger, None).await;
+        let (heard, messages) = mpsc::channel(4);
+        Self { fake, shared, heard, key, robot, driver: tokio::spawn(driver.run(messages)) }
+    }
+
+    fn sealed(&self, generation: u64, tasks: Vec<DesiredTask>, key: &SigningKey) -> Heard {
+        let now_ms = crate::clock::wall_ms();
+        let state = DesiredState {
+            robot_id: self.robot.clone(),
+            generation: Generation(generation),
+            issued_at_ms: now_ms,
+            expires_at_ms: now_ms + 1_000_000,
+            tasks,
+        };
+        let payload = serde_json::to_vec(&state).expect("json");
+        Heard::Desired(Box::new(Envelope::seal(DESIRED_STATE_TYPE, &payload, key)))
+    }
+
+    async fn order(&self, generation: u64, tasks: Vec<DesiredTask>) {
+        self.say(self.sealed(generation, tasks, &self.key)).await;
+    }
+
+    async fn say(&self, message: Heard) {
+        self.heard.send(message).await.expect("the driver listens");
+    }
+
+    /// The first report of which `expected` is true.
+    async fn report(&self, expected: impl Fn(&Report) -> bool) -> Report {
+        let mut reports = self.shared.reports.subscribe();
+        let found = reports.wait_for(|report| report.as_ref().is_some_and(|report| expected(report)));
+        let found = tokio::time::timeout(PATIENCE, found).await.expect("it is reported").expect("the driver lives");
+        Report::clone(found.as_ref().expect("waited for"))
+    }
+
+    async fn phase(&self, phase: Phase) -> Report {
+        self.report(|report| report.tasks.first().is_some_and(|task| task.phase == phase)).await
+    }
+
+    async fn end(self) -> Ledger {
+        self.shared.shutdown.cancel();
+        self.driver.await.expect("no panic");
+        self.fake.state(|state| state.ledgers.last().cloned()).expect("a ledger")
+    }
+}
+
+fn has(report: &Report, code: &str) -> bool {
+    report.conditions.iter().any(|condition| condition.code == code)
+}
+
+#[tokio::test]
+async fn an_order_runs_and_its_withdrawal_removes_it() {
+    let bench = Bench::new().await;
+    bench.order(1, vec![order("1.0")]).await;
+    let report = bench.phase(Phase::Running).await;
+    assert_eq!(report.observed_generation, Generation(1));
+    assert_eq!(report.tasks[0].active.as_ref().expect("active").pid, 7);
+    bench.order(2, Vec::new()).await;
+    bench.report(|report| report.tasks.is_empty()).await;
+    assert!(bench.fake.state(|state| state.alive.is_empty()));
+    assert!(bench.end().await.tasks.is_empty());
+}
+
+#[tokio::test]
+async fn a_cancel_interrupts_a_pull_and_leaves_the_old_version_running() {
+    let bench = Bench::new().await;
+    let old = order("1.0");
+    bench.order(1, vec![old.clone()]).await;
+    bench.phase(Phase::Running).await;
+    bench.fake.slow.store(true, std::sync::atomic::Ordering::SeqCst);
+    bench.order(2, vec![order("2.0")]).await;
+    let fetching = bench.phase(Phase::Fetching).await;
+    assert_eq!(fetching.tasks[0].active.as_ref().expect("the old one").version, old.package.version);
+    bench.order(3, vec![old]).await;
+    bench.report(|report| report.observed_generation == Generation(3) && report.tasks[0].phase == Phase::Running).await;
+    let (started, alive) = bench.fake.state(|state| (state.started.len(), state.alive.len()));
+    assert_eq!((started, alive), (1, 1));
+}
+
+#[tokio::test]
+async fn a_refused_state_is_named_and_the_old_one_stays() {
+    let bench = Bench::new().await;
+    bench.order(5, vec![order("1.0")]).await;
+    bench.phase(Phase::Running).await;
+    let forged = bench.sealed(6, Vec::new(), &SigningKey::random());
+    bench.say(forged).await;
+    bench.report(|report| has(report, "state_refused")).await;
+    bench.order(6, vec![order("1.1")]).await;
+    bench.report(|report| !has(report, "state_refused") && report.observed_generation == Generation(6)).await;
+    bench.order(4, Vec::new()).await;
+    let report = bench.report(|report| has(report, "state_refused")).await;
+    assert_eq!((report.observed_generation, report.tasks.len()), (Generation(6), 1));
+}
+
+#[tokio::test]
+async fn a_removed_robot_goes_on_and_begins_nothing_new() {
+    let bench = Bench::new().await;
+    bench.order(1, vec![order("1.0")]).await;
+    bench.phase(Phase::Running).await;
+    bench.say(Heard::TokenRefused).await;
+    let report = bench.report(|report| has(report, "removed")).await;
+    assert_eq!(report.tasks[0].phase, Phase::Running);
+    let ledger = bench.end().await;
+    assert!(ledger.removed, "it is remembered over a restart");
+}
+
+#[tokio::test]
+async fn a_restarted_agent_adopts_what_runs_and_what_was_ordered() {
+    let bench = Bench::new().await;
+    bench.order(1, vec![order("1.0")]).await;
+    bench.phase(Phase::Running).await;
+    let (fake, key, robot) = (bench.fake.clone(), SigningKey::from_bytes(bench.key.to_bytes()), bench.robot.clone());
+    let ledger = bench.end().await;
+    let bench = Bench::with(fake, ledger, key, robot).await;
+    let report = bench.phase(Phase::Running).await;
+    assert_eq!((report.start, report.observed_generation), (2, Generation(1)));
+    assert_eq!(bench.fake.state(|state| state.started.len()), 1, "nothing is started again");
+}
+
+#[tokio::test]
+async fn hold_keeps_a_staged_version_from_starting() {
+    let bench = Bench::new().await;
+    bench.fake.state(|state| state.held = true);
+    bench.order(1, vec![order("1.0")]).await;
+    let report = bench.phase(Phase::Deferred).await;
+    assert!(has(&report, "held"));
+    assert!(bench.fake.state(|state| state.started.is_empty()));
+    bench.fake.state(|state| state.held = false);
+    bench.phase(Phase::Running).await;
+}
+
+#[tokio::test]
+async fn the_servers_name_wins_and_the_difference_is_said() {
+    let bench = Bench::new().await;
+    let reply = |name: &str| ReportReply {
+        generation: Generation(0),
+        name: name.parse().expect("valid"),
+        labels: Labels::new(),
+    };
+    bench.say(Heard::Confirmed { seq: 1, reply: Some(reply("bolt")) }).await;
+    bench.report(|report| has(report, "settings_differ")).await;
+    bench.say(Heard::Confirmed { seq: 2, reply: Some(reply("atlas")) }).await;
+    bench.report(|report| !has(report, "settings_differ")).await;
+}

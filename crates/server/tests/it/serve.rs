@@ -1,10 +1,12 @@
 //! Starting and stopping: what is in the directory, what survives, and what a stop waits for.
 
+use std::io::{BufRead as _, BufReader};
 use std::os::unix::fs::PermissionsExt as _;
+use std::process::{Child, Stdio};
 use std::time::Duration;
 
+use nix::sys::signal::Signal;
 use reqwest::{Method, StatusCode};
-use task_proto::api::RobotList;
 use task_proto::report::Phase;
 use taskd::clock::Clock;
 use taskd::config::Config;
@@ -67,32 +69,25 @@ async fn a_stop_under_load_loses_no_report_that_was_answered() {
     let server = TestServer::start().await;
     let package = server.push("talker", "1.0.0").await;
     let mut robots = Vec::new();
-    for n in 0..8 {
+    for n in 0..16 {
         robots.push(server.enroll(&format!("robot-{n}")).await);
     }
     server.deploy(&package, "*", "key-1").await;
-    let mut asking = Vec::new();
-    let server = std::sync::Arc::new(server);
+    let mut asking = tokio::task::JoinSet::new();
     for mut robot in robots {
-        let server = server.clone();
-        asking.push(tokio::spawn(async move {
-            let state = server.desired(&robot).await;
-            let status = server.report(&mut robot, &state, Phase::Running).await.status();
-            (robot, status)
-        }));
+        let report = robot.next_report(&server.desired(&robot).await, Phase::Running);
+        let request = server.bare(Method::POST, &format!("/api/v1/robots/{}/report", robot.id));
+        let request = request.bearer_auth(&robot.token).json(&report);
+        asking.spawn(async move { (robot, request.send().await.is_ok_and(|answer| answer.status().is_success())) });
     }
-    // Two answers are there, the others are somewhere under way.
-    let mut done = Vec::new();
-    for task in asking {
-        let (robot, status) = task.await.expect("no panic");
-        assert_eq!(status, StatusCode::OK);
-        done.push(robot);
-    }
-    let server = std::sync::Arc::into_inner(server).expect("the last");
+    // One answer is there, the others are somewhere under way.
+    let mut answered: Vec<_> = asking.join_next().await.into_iter().collect::<Result<_, _>>().expect("no panic");
     let server = server.restart().await;
-    let list: RobotList = server.get("/api/v1/robots").await;
-    assert!(list.robots.iter().all(|robot| robot.tasks[0].phase == Phase::Running));
-    assert_eq!(list.robots.len(), done.len());
+    answered.extend(asking.join_all().await);
+    for (robot, was_stored) in answered {
+        let phase = server.robot(&robot).await.tasks[0].phase;
+        assert!(!was_stored || phase == Phase::Running, "{}: {phase}", robot.id);
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -148,4 +143,92 @@ async fn a_database_that_was_put_back_leaves_robots_alone_until_their_next_order
     assert_eq!(tasks, ["listener", "talker"]);
     assert_eq!(after.tasks[1].package, later);
     assert!(server.robot(&robot).await.conditions.is_empty());
+}
+
+/// The real program, which gets real signals.
+struct Program {
+    process: Child,
+    http: String,
+    token: String,
+    _directory: tempfile::TempDir,
+}
+
+impl Program {
+    #[expect(clippy::disallowed_methods, reason = "the test starts the program it tests")]
+    fn start() -> Self {
+        let directory = tempfile::TempDir::new().expect("a directory");
+        let data = directory.path().join("data");
+        let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_taskd"));
+        command.args(["serve", "--http", "127.0.0.1:0", "--mqtt", "127.0.0.1:0", "--data"]).arg(&data);
+        command.env_clear().stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
+        let mut process = command.spawn().expect("it starts");
+        // The first line comes when both listeners accept.
+        let mut said = String::new();
+        let stdout = process.stdout.take().expect("piped");
+        BufReader::new(stdout).read_line(&mut said).expect("it says where it is");
+        assert!(said.starts_with("taskd serves HTTP on http://127.0.0.1:"), "{said}");
+        let addresses = std::fs::read(data.join("addresses.json")).expect("published");
+        let addresses: taskd::data_directory::Addresses = serde_json::from_slice(&addresses).expect("json");
+        let token = std::fs::read_to_string(data.join("operator.token")).expect("a token").trim().to_owned();
+        Self { process, http: addresses.http, token, _directory: directory }
+    }
+
+    /// Begins an upload of ten bytes and sends five.
+    async fn half_an_upload(&self) -> TcpStream {
+        let mut upload = TcpStream::connect(&self.http).await.expect("connects");
+        let digest = task_proto::Digest::of(b"0123456789");
+        let head = format!(
+            "POST /v2/talker/blobs/uploads/?digest={digest} HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {}\r\n\
+             content-type: application/octet-stream\r\nexpect: 100-continue\r\ncontent-length: 10\r\n\r\n",
+            self.token
+        );
+        upload.write_all(head.as_bytes()).await.expect("written");
+        // "Continue" means that a handler waits for the body.
+        let mut answer = [0; 12];
+        upload.read_exact(&mut answer).await.expect("an answer");
+        assert_eq!(&answer, b"HTTP/1.1 100");
+        upload.write_all(b"01234").await.expect("written");
+        upload
+    }
+
+    fn signal(&self, signal: Signal) {
+        let id = nix::unistd::Pid::from_raw(self.process.id().try_into().expect("a process id"));
+        nix::sys::signal::kill(id, signal).expect("it lives");
+    }
+
+    /// Waits until it no longer accepts: the stop is under way.
+    async fn refuses(&self) {
+        let refuses = async { while TcpStream::connect(&self.http).await.is_ok() {} };
+        tokio::time::timeout(Duration::from_secs(9), refuses).await.expect("the listener closes");
+    }
+
+    async fn exit_code(mut self) -> Option<i32> {
+        let ended = tokio::task::spawn_blocking(move || self.process.wait().expect("it ends"));
+        tokio::time::timeout(Duration::from_secs(9), ended).await.expect("it ends in time").expect("no panic").code()
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_signal_lets_requests_under_way_end() {
+    let program = Program::start();
+    let mut upload = program.half_an_upload().await;
+    program.signal(Signal::SIGTERM);
+    program.refuses().await;
+    upload.write_all(b"56789").await.expect("written");
+    let mut answer = String::new();
+    upload.read_to_string(&mut answer).await.expect("an answer, then the end");
+    assert!(answer.contains("HTTP/1.1 201 Created"), "{answer}");
+    assert_eq!(program.exit_code().await, Some(0));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_second_signal_ends_it_at_once() {
+    let program = Program::start();
+    let _upload = program.half_an_upload().await;
+    program.signal(Signal::SIGINT);
+    program.refuses().await;
+    program.signal(Signal::SIGINT);
+    let asked = std::time::Instant::now();
+    assert_eq!(program.exit_code().await, Some(1));
+    assert!(asked.elapsed() < Duration::from_secs(3), "it waited {:?} for the upload", asked.elapsed());
 }

@@ -379,3 +379,68 @@ impl From<&TaskManifest> for RunRules {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use task_proto::desired::BlobRef;
+
+    use super::*;
+
+    fn order() -> DesiredTask {
+        let blob = BlobRef { digest: Digest::of(b"1"), size: 1 };
+        let name: TaskName = "talker".parse().expect("valid");
+        let version = "1.0".parse().expect("valid");
+        DesiredTask {
+            task: name.clone(),
+            deployment: DeploymentId::random(),
+            package: PackageRef { name, version, manifest: blob, config: blob, content: blob },
+            wanted: Wanted::Running,
+            run: 1,
+            delivery: Delivery::PushPull,
+        }
+    }
+
+    #[test]
+    fn a_ledger_reads_back_and_survives_a_crash_while_it_is_written() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let path = dir.path().join("ledger.json");
+        assert!(matches!(Ledger::read(&path), Ok(Found::Nothing)));
+        let mut ledger = Ledger::new(3);
+        let order = order();
+        ledger.tasks.insert(order.task.clone(), TaskRecord::new(order, 5));
+        ledger.write(&path).expect("written");
+        // What a crash half way through the next write leaves behind.
+        std::fs::write(dir.path().join("ledger.json.tmp"), "{\"format\":1,").expect("written");
+        let Ok(Found::Ledger(read)) = Ledger::read(&path) else { panic!("the ledger is there") };
+        assert_eq!(*read, ledger);
+        ledger.write(&path).expect("written again");
+    }
+
+    #[test]
+    fn a_ledger_that_is_cut_off_or_of_another_format_is_moved_aside() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let path = dir.path().join("ledger.json");
+        Ledger::new(3).write(&path).expect("written");
+        let whole = std::fs::read(&path).expect("read");
+        let newer = String::from_utf8(whole.clone()).expect("text").replace("\"format\":1", "\"format\":2");
+        let cuts = (0..whole.len()).step_by(7).map(|length| whole[..length].to_vec());
+        for bytes in cuts.chain([newer.into_bytes(), vec![0; 4096]]) {
+            std::fs::write(&path, &bytes).expect("written");
+            let Ok(Found::Unreadable(aside)) = Ledger::read(&path) else { panic!("taken for a ledger: {bytes:?}") };
+            assert!(!path.exists());
+            assert_eq!(std::fs::read(&aside).expect("kept"), bytes);
+        }
+    }
+
+    #[test]
+    fn another_boot_takes_the_times_out() {
+        let mut ledger = Ledger::new(1);
+        let order = order();
+        let mut record = TaskRecord::new(order.clone(), 900_000);
+        record.preparation.retry_at_ms = 950_000;
+        ledger.tasks.insert(order.task.clone(), record);
+        ledger.enter_boot("second", 10);
+        let record = &ledger.tasks[&order.task];
+        assert_eq!((record.phase_since_ms, record.preparation.retry_at_ms), (10, 0));
+    }
+}

@@ -1,0 +1,183 @@
+//! The agent's HTTP half against a server that misbehaves: what it takes for a refusal, what for a stranger's answer, and
+//! what it obeys.
+
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use axum::Router;
+use axum::extract::State;
+use axum::http::{HeaderMap, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use axum::routing::{get, post};
+use task_agent::admission::{self, Refused};
+use task_agent::link::{self, Heard, Intervals, Shared};
+use task_agent::server::{self, Server, ServerError};
+use task_proto::desired::DesiredState;
+use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
+use task_proto::report::{HostFacts, Report};
+use task_proto::{Generation, InstanceId, RobotId};
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+
+/// How long a test waits for what should come at once.
+const PATIENCE: Duration = Duration::from_secs(20);
+const REFUSAL: &str = r#"{"error":{"code":"unauthorized","message":"no such token"}}"#;
+
+/// One answer: status, content type, body.
+type Canned = (u16, &'static str, String);
+
+struct Fake {
+    answer: Mutex<Canned>,
+    asked_with: Mutex<Vec<Option<String>>>,
+}
+
+impl Fake {
+    async fn start(answer: Canned) -> (Arc<Self>, reqwest::Url) {
+        let fake = Arc::new(Self { answer: Mutex::new(answer), asked_with: Mutex::default() });
+        let routes = Router::new()
+            .route("/api/v1/robots/{id}/desired", get(answer_canned))
+            .route("/api/v1/robots/{id}/report", post(answer_canned))
+            .with_state(fake.clone());
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = listener.local_addr().unwrap();
+        tokio::spawn(async move { axum::serve(listener, routes).await.unwrap() });
+        (fake, format!("http://{address}/").parse().unwrap())
+    }
+
+    fn set(&self, answer: Canned) {
+        *self.answer.lock().unwrap() = answer;
+    }
+}
+
+async fn answer_canned(State(fake): State<Arc<Fake>>, headers: HeaderMap) -> Response {
+    let known = headers.get(header::IF_NONE_MATCH).map(|value| value.to_str().unwrap().to_owned());
+    fake.asked_with.lock().unwrap().push(known);
+    let (status, kind, body) = fake.answer.lock().unwrap().clone();
+    let headers = [(header::CONTENT_TYPE, kind), (header::RETRY_AFTER, "7")];
+    (StatusCode::from_u16(status).unwrap(), headers, body).into_response()
+}
+
+fn server(url: &reqwest::Url, robot: &RobotId) -> Server {
+    Server::new(server::client().unwrap(), url.clone(), robot.clone(), "tskr_secret".to_owned())
+}
+
+fn state(robot: &RobotId, generation: u64) -> DesiredState {
+    DesiredState {
+        robot_id: robot.clone(),
+        generation: Generation(generation),
+        issued_at_ms: 1,
+        expires_at_ms: u64::MAX,
+        tasks: Vec::new(),
+    }
+}
+
+fn sealed(state: &DesiredState, key: &SigningKey) -> Canned {
+    let envelope = Envelope::seal(DESIRED_STATE_TYPE, &serde_json::to_vec(state).unwrap(), key);
+    (200, "application/json", serde_json::to_string(&envelope).unwrap())
+}
+
+#[tokio::test]
+async fn only_the_servers_own_no_is_a_refusal() {
+    let (fake, url) = Fake::start((401, "application/json", REFUSAL.to_owned())).await;
+    let server = server(&url, &RobotId::random());
+    assert!(matches!(server.desired(None).await, Err(ServerError::TokenRefused(_))));
+    for status in [200, 302, 401, 403, 404] {
+        fake.set((status, "text/html", "<html>Please sign in to the hotel's network</html>".to_owned()));
+        let error = server.desired(None).await.unwrap_err();
+        assert!(matches!(error, ServerError::NotTheServer(_)), "{status}: {error:?}");
+    }
+    fake.set((503, "text/html", "<html>".to_owned()));
+    let busy = server.desired(None).await.unwrap_err();
+    assert!(matches!(busy, ServerError::Busy { status: 503, retry_after: Some(wait) } if wait.as_secs() == 7));
+    fake.set((409, "application/json", REFUSAL.replace("unauthorized", "diverged")));
+    assert!(matches!(server.desired(None).await, Err(ServerError::Refused { code, .. }) if code == "diverged"));
+    fake.set((304, "application/json", String::new()));
+    assert!(server.desired(Some(Generation(4))).await.unwrap().is_none());
+    assert_eq!(fake.asked_with.lock().unwrap().last().unwrap().as_deref(), Some("\"4\""));
+}
+
+#[tokio::test]
+async fn altered_foreign_and_old_states_are_refused() {
+    let (key, robot) = (SigningKey::random(), RobotId::random());
+    let (fake, url) = Fake::start(sealed(&state(&robot, 3), &key)).await;
+    let server = server(&url, &robot);
+    let admit = |envelope: &Envelope, accepted: Option<&DesiredState>| {
+        admission::admit(envelope, &key.public_key(), &robot, accepted, 2)
+    };
+    let accepted = admit(&server.desired(None).await.unwrap().unwrap(), None).unwrap();
+    assert_eq!(accepted.generation, Generation(3));
+
+    let (status, kind, body) = sealed(&state(&robot, 4), &key);
+    let at = body.find("payload\":\"").unwrap() + 20;
+    let other = if &body[at..=at] == "A" { "B" } else { "A" };
+    fake.set((status, kind, format!("{}{other}{}", &body[..at], &body[at + 1..])));
+    let altered = admit(&server.desired(None).await.unwrap().unwrap(), Some(&accepted));
+    assert!(matches!(altered, Err(Refused::Signature(_))), "{altered:?}");
+
+    fake.set(sealed(&state(&RobotId::random(), 4), &key));
+    let foreign = admit(&server.desired(None).await.unwrap().unwrap(), Some(&accepted));
+    assert!(matches!(foreign, Err(Refused::OtherRobot(_))));
+
+    fake.set(sealed(&state(&robot, 2), &key));
+    let old = admit(&server.desired(None).await.unwrap().unwrap(), Some(&accepted));
+    assert!(matches!(old, Err(Refused::Stale { .. })));
+}
+
+#[tokio::test]
+async fn a_report_is_sent_again_until_it_is_stored() {
+    let robot = RobotId::random();
+    let (fake, url) = Fake::start((503, "text/plain", String::new())).await;
+    let shared = Shared::new(CancellationToken::new());
+    let report = Report {
+        robot_id: robot.clone(),
+        start: 1,
+        instance: InstanceId::random(),
+        boot_id: "boot".to_owned(),
+        seq: 1,
+        observed_generation: Generation(0),
+        uptime_ms: 0,
+        host: HostFacts::default(),
+        conditions: Vec::new(),
+        tasks: Vec::new(),
+    };
+    shared.reports.send_replace(Some(Arc::new(report)));
+    let (heard, mut messages) = mpsc::channel(4);
+    let posting = tokio::spawn(link::post(server(&url, &robot), shared.clone(), heard));
+    let asked = async {
+        while fake.asked_with.lock().unwrap().is_empty() {
+            tokio::task::yield_now().await;
+        }
+    };
+    tokio::time::timeout(PATIENCE, asked).await.unwrap();
+    fake.set((200, "application/json", r#"{"generation":0,"name":"atlas","labels":{}}"#.to_owned()));
+    let confirmed = tokio::time::timeout(PATIENCE, messages.recv()).await.unwrap().unwrap();
+    assert!(matches!(confirmed, Heard::Confirmed { seq: 1, reply: Some(reply) } if reply.name.as_str() == "atlas"));
+    shared.shutdown.cancel();
+    posting.await.unwrap();
+}
+
+#[tokio::test]
+async fn polling_goes_on_after_every_kind_of_answer() {
+    let (key, robot) = (SigningKey::random(), RobotId::random());
+    let (fake, url) = Fake::start((401, "application/json", REFUSAL.to_owned())).await;
+    let shared = Shared::new(CancellationToken::new());
+    let (heard, mut messages) = mpsc::channel(1);
+    let intervals = Intervals { slow: Duration::from_millis(20), fast: Duration::from_millis(10) };
+    let polling = tokio::spawn(link::poll(server(&url, &robot), shared.clone(), intervals, heard));
+    let answers = [(200, "text/html", "<html>".to_owned()), sealed(&state(&robot, 1), &key)];
+    let mut next = async || tokio::time::timeout(PATIENCE, messages.recv()).await.unwrap().unwrap();
+    assert!(matches!(next().await, Heard::TokenRefused));
+    for (answer, is_state) in answers.into_iter().zip([false, true]) {
+        fake.set(answer);
+        loop {
+            match next().await {
+                Heard::Withheld { code, .. } if !is_state => break assert_eq!(code, "server_unreachable"),
+                Heard::Desired(_) if is_state => break,
+                _ => {}
+            }
+        }
+    }
+    shared.shutdown.cancel();
+    drop(messages);
+    polling.await.unwrap();
+}

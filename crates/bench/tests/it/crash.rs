@@ -64,12 +64,11 @@ async fn a_running_task_outlives_its_agent() {
 
     fleet.robots[0].kill();
     fleet.robots[0].restart();
-    let start = before.host.clone();
-    eventually("the new agent to report the same process", async || {
-        let robot = fleet.server.robot("robot-1").await?;
-        (robot.online && pid_of(&robot, "steady") == Some(pid) && robot.host == start).then_some(())
-    })
-    .await;
+    // What only the new agent can have done.
+    let second = fleet.package("second", "1.0.0", "service", "exec sleep 1000\n");
+    fleet.server.push(&second, "*").await;
+    let after = fleet.server.wait_phase("robot-1", "second", Phase::Running).await;
+    assert_eq!(pid_of(&after, "steady"), Some(pid));
     assert!(std::path::Path::new(&format!("/proc/{pid}")).exists());
 }
 

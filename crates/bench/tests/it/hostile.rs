@@ -89,7 +89,7 @@ async fn hostile_archives_fail_with_their_reason() {
         ("device", vec![entry("null", b'3', "", b"")], "device"),
         ("fifo", vec![entry("pipe", b'6', "", b"")], "fifo"),
         ("duplicate", vec![file("twice"), file("./twice")], "twice"),
-        ("bomb", vec![entry("zeros", b'0', "", &vec![0; 300_000_000])], "ratio"),
+        ("bomb", vec![entry("zeros", b'0', "", &vec![0; 300_000_000])], "uncompressed bytes for so few"),
     ];
     for (name, entries, reason) in cases {
         let digest = upload(&fleet.server, name, &archive(&entries), entries.len()).await;

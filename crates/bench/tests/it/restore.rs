@@ -6,9 +6,11 @@ use task_proto::report::Phase;
 
 use crate::harness::{Fleet, eventually};
 
+/// Copies the database of a server that is stopped.
 fn copy_database(from: &Path, to: &Path) {
+    assert!(from.join("taskd.sqlite").exists(), "no database in {}", from.display());
     std::fs::create_dir_all(to).expect("directory");
-    for name in ["taskd.db", "taskd.db-wal", "taskd.db-shm"] {
+    for name in ["taskd.sqlite", "taskd.sqlite-wal", "taskd.sqlite-shm"] {
         let _ = std::fs::remove_file(to.join(name));
         if from.join(name).exists() {
             std::fs::copy(from.join(name), to.join(name)).expect("copied");

@@ -21,3 +21,4 @@ pub mod rollout;
 pub mod serve;
 pub mod store;
 pub mod uplink;
+pub mod web;

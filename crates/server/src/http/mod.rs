@@ -41,6 +41,7 @@ use crate::clock::Clock;
 use crate::presence::Presence;
 use crate::report_writer::ReportWriter;
 use crate::store::Store;
+use crate::web;
 use auth::{Access, Gate, guard};
 use error::ApiError;
 
@@ -168,7 +169,9 @@ pub fn routes() -> Vec<Route> {
         Route::new(post.clone(), "/api/v1/tasks/{task}/start", Operator, tasks::start).body_bytes(ORDER_BODY_BYTES),
         Route::new(post.clone(), "/api/v1/tasks/{task}/stop", Operator, tasks::stop).body_bytes(ORDER_BODY_BYTES),
         Route::new(post, "/api/v1/tasks/{task}/remove", Operator, tasks::remove).body_bytes(ORDER_BODY_BYTES),
-        Route::new(get, "/api/v1/events", Operator, events::stream).streaming(),
+        Route::new(get.clone(), "/api/v1/events", Operator, events::stream).streaming(),
+        Route::new(get.clone(), "/", Anyone, web::index),
+        Route::new(get, "/ui/{*file}", Anyone, web::file),
         Route::any("/v2", OperatorOrRobot, oci::version),
         Route::any("/v2/", OperatorOrRobot, oci::version),
         Route::any("/v2/{*path}", OperatorOrRobot, oci::dispatch),

@@ -1,0 +1,243 @@
+// The page: signs in, listens, and draws once per frame whatever has changed. All views are functions of `page`.
+
+import { html, nothing, render } from './vendor/lit-html-3.3.3/lit-html.js';
+import * as api from './api.js';
+import { command } from './copy.js';
+import { deploymentList } from './deployments.js';
+import { Fleet } from './fleet.js';
+import { ago, number, plural } from './format.js';
+import { listen } from './live.js';
+import { robotDialog } from './robot.js';
+import { robotTable, window_of } from './robots.js';
+
+const REFETCH_PAUSE_MS = 2_000;
+
+const page = {
+  view: 'starting',
+  fleet: new Fleet(),
+  stream: { state: 'connecting' },
+  /** Heard while the lists are on their way: newer than the lists, or followed by something newer. */
+  backlog: null,
+  heardAt: null,
+  clockAheadMs: 0,
+  problem: null,
+  isSigningIn: false,
+  robot: null,
+  isAllShown: false,
+};
+
+let live = null;
+
+const actions = {
+  sortBy: (column) => change(() => page.fleet.sortBy(column)),
+  filterBy: (text) => change(() => page.fleet.filterBy(text)),
+  showAll: (yes) => change(() => (page.isAllShown = yes)),
+  show: (robot) => change(() => (page.robot = robot)),
+};
+
+// Signing in and out
+
+async function start() {
+  const token = tokenOfLink();
+  if (token) return signIn(token);
+  try {
+    const { expires_at_ms: until } = await api.session();
+    if (until) enter();
+    else leave();
+  } catch (error) {
+    change(() => (page.problem = error.message));
+    setTimeout(start, REFETCH_PAUSE_MS);
+  }
+}
+
+/** The token of a link `/#token=…`, which then leaves the address bar and the history. */
+function tokenOfLink() {
+  const token = new URLSearchParams(location.hash.slice(1)).get('token');
+  if (token) history.replaceState(null, '', location.pathname);
+  return token;
+}
+
+async function signIn(token) {
+  change(() => Object.assign(page, { isSigningIn: true, problem: null }));
+  try {
+    await api.signIn(token.trim());
+    enter();
+  } catch (error) {
+    leave(error.message);
+  }
+}
+
+function enter() {
+  live?.stop();
+  change(() => Object.assign(page, { view: 'fleet', fleet: new Fleet(), problem: null, isSigningIn: false, stream: { state: 'connecting' } }));
+  live = listen(hear);
+}
+
+function leave(problem = null) {
+  live?.stop();
+  live = null;
+  change(() => Object.assign(page, { view: 'signed_out', fleet: new Fleet(), problem, isSigningIn: false, robot: null }));
+}
+
+async function signOut() {
+  await api.signOut().catch(() => null);
+  live?.signOut();
+  leave();
+}
+
+// Listening
+
+function hear({ state, events, retry_at }) {
+  if (!live) return;
+  if (state === 'signed_out') return leave();
+  if (state) change(() => (page.stream = { state, retry_at }));
+  if (state === 'open') refetch();
+  if (!events) return;
+  page.heardAt = serverNow();
+  if (page.backlog) page.backlog.push(...events);
+  else change(() => take(events));
+}
+
+function take(events) {
+  const stale = events.map((event) => page.fleet.apply(event));
+  if (stale.includes(true)) refetch();
+}
+
+let refetchedAt = -Infinity;
+
+/** Fetches the lists; asked again meanwhile, it does so once more, but never without a pause. */
+async function refetch() {
+  if (page.backlog) return void (page.isStale = true);
+  page.backlog = [];
+  page.isStale = false;
+  const wait = refetchedAt + REFETCH_PAUSE_MS - performance.now();
+  if (wait > 0) await new Promise((resume) => setTimeout(resume, wait));
+  refetchedAt = performance.now();
+  const listener = live;
+  try {
+    const [server, lists] = await Promise.all([api.server(), api.lists()]);
+    if (live !== listener) return;
+    page.clockAheadMs = server.now_ms - Date.now();
+    page.heardAt = serverNow();
+    page.problem = null;
+    page.fleet.load(lists);
+  } catch (error) {
+    if (error instanceof api.SignedOut) leave();
+    else page.problem = error.message;
+    page.isStale = true;
+  } finally {
+    const heard = page.backlog;
+    page.backlog = null;
+    if (live === listener) change(() => take(heard));
+    if (live && page.isStale) refetch();
+  }
+}
+
+// Drawing
+
+let isDirty = false;
+
+function change(act) {
+  act();
+  if (!isDirty) requestAnimationFrame(paint);
+  isDirty = true;
+}
+
+const serverNow = () => Date.now() + page.clockAheadMs;
+
+function paint(frame) {
+  isDirty = false;
+  if (page.view === 'starting') return render(page.problem ? html`<p class="bad">${page.problem}</p>` : nothing, document.body);
+  if (page.view === 'signed_out') return render(signInView(), document.body);
+  page.fleet.settle(frame);
+  const rows = document.querySelector('.rows');
+  const top = rows?.getBoundingClientRect().top ?? 0;
+  const sight = window_of(page.fleet, -top, innerHeight - top);
+  render(fleetView(sight), document.body);
+  place(sight);
+  const dialog = document.querySelector('dialog');
+  if (page.robot && !dialog.open) dialog.showModal();
+}
+
+/** Through the style objects: the policy of this page allows no style attributes. */
+function place({ height, offset }) {
+  document.querySelector('.rows').style.height = `${height}px`;
+  document.querySelector('.sight').style.transform = `translateY(${offset}px)`;
+}
+
+const signInView = () => html`
+  <main class="sign-in">
+    <h1>taskd</h1>
+    <form @submit=${(event) => { event.preventDefault(); signIn(new FormData(event.currentTarget).get('token')); }}>
+      <label for="token">Operator token</label>
+      <input id="token" name="token" type="password" required autofocus autocomplete="current-password" spellcheck="false" aria-describedby="hint problem">
+      <button ?disabled=${page.isSigningIn}>Sign in</button>
+      <p id="problem" class="bad" role="alert">${page.problem ?? ''}</p>
+    </form>
+    <p id="hint" class="quiet">It starts with <code>tsko_</code> and lies in the server's data directory, in <code>operator.token</code>.</p>
+  </main>`;
+
+function fleetView(sight) {
+  const { fleet } = page;
+  const now = serverNow();
+  return html`
+    <header class="top">
+      <h1>taskd</h1>
+      <p class="stream" role="status">${streamState(now)}</p>
+      <button class="plain link" @click=${signOut}>Sign out</button>
+    </header>
+    <main>
+      ${page.problem ? html`<p class="bad" role="alert">▲ ${page.problem}</p>` : nothing}
+      ${deploymentList(fleet, page.isAllShown, now, actions)}
+      <section aria-labelledby="robots">
+        <header>
+          <h2 id="robots">Robots <span class="count">${robotCount(fleet)}</span></h2>
+          <input id="filter" type="search" placeholder="Filter" aria-label="Filter robots" aria-keyshortcuts="/" autocomplete="off" spellcheck="false"
+            .value=${fleet.filter} @input=${(event) => actions.filterBy(event.currentTarget.value)}>
+        </header>
+        ${robotTable(fleet, sight, now, actions)}
+        ${fleet.isLoaded && !fleet.robots.size ? noRobots() : nothing}
+        ${fleet.robots.size && !fleet.shown.length ? html`<p class="empty quiet">No robot has “${fleet.filter}”.</p>` : nothing}
+      </section>
+    </main>
+    ${robotDialog(fleet.robots.get(page.robot), now, () => actions.show(null))}`;
+}
+
+function robotCount({ robots, online, shown, filter, isLoaded }) {
+  if (!isLoaded) return '';
+  const found = filter ? `${number(shown.length)} of ` : '';
+  return `${found}${number(robots.size)}, ${number(online)} online`;
+}
+
+const noRobots = () => html`
+  <div class="empty">
+    <p class="quiet">No robot is enrolled yet. On this server, make a token; on each robot, enrol with it and start the agent.</p>
+    ${command('taskd enroll-token create')}
+    ${command(`task-agent enroll --server ${location.origin} --token TOKEN`)}
+    ${command('task-agent run')}
+  </div>`;
+
+function streamState(now) {
+  const { state, retry_at } = page.stream;
+  if (state === 'open' && page.fleet.isLoaded) return html`<span class="live">● Live</span>`;
+  const since = page.heardAt ? `, shown as of ${ago(page.heardAt, now)}` : '';
+  if (state !== 'waiting') return html`<span class="offline">○ Connecting${since}</span>`;
+  const seconds = Math.max(0, Math.ceil((retry_at - Date.now()) / 1000));
+  return html`<span class="bad">○ Not live${since}; trying again in ${plural(seconds, 'second')}</span>`;
+}
+
+addEventListener('hashchange', () => { const token = tokenOfLink(); if (token) signIn(token); });
+addEventListener('scroll', () => change(() => {}), { passive: true });
+addEventListener('resize', () => change(() => {}));
+addEventListener('keydown', (event) => {
+  const filter = document.getElementById('filter');
+  if (!filter || event.ctrlKey || event.metaKey || event.altKey || document.querySelector('dialog[open]')) return;
+  if (event.key === '/' && document.activeElement !== filter) {
+    event.preventDefault();
+    filter.focus();
+    filter.select();
+  } else if (event.key === 'Escape' && document.activeElement === filter) actions.filterBy('');
+});
+// Times move on, and rows find their places, also while nothing is heard.
+setInterval(() => change(() => {}), 1_000);
+start();

@@ -9,9 +9,8 @@ use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 use std::time::Duration;
 
-use task_proto::api::ReportReply;
 use task_proto::desired::{DesiredState, DesiredTask};
-use task_proto::envelope::{Envelope, PublicKey};
+use task_proto::envelope::PublicKey;
 use task_proto::id::Labels;
 use task_proto::report::{Condition, Failure, FailureCode, Progress};
 use task_proto::{InstanceId, RobotId, RobotName, TaskName};
@@ -22,14 +21,13 @@ use tokio_util::sync::CancellationToken;
 
 use crate::admission;
 use crate::effects::{Effects, Now, chain};
-use crate::ledger::{Accepted, Ledger, TaskRecord};
+use crate::ledger::{Ledger, TaskRecord};
 use crate::link::{Heard, Shared};
 use crate::observed::{Prepared, ProcessState, RobotFacts};
 use crate::plan::{self, Lane, Next, Situation, Step, StepFailure};
 
+mod hearing;
 mod reporting;
-#[cfg(test)]
-mod tests;
 
 /// How often the hold flag is looked at, were there nothing else to do, and progress is reported.
 const TICK: Duration = Duration::from_secs(1);
@@ -494,84 +492,6 @@ impl<E: Effects> Driver<E> {
         }
     }
 
-    fn hear(&mut self, message: Heard) {
-        match message {
-            Heard::Desired(envelope) => {
-                self.known_by_server();
-                self.consider(*envelope);
-            }
-            Heard::Unchanged => self.known_by_server(),
-            Heard::Confirmed { reply, .. } => {
-                if let Some(reply) = reply {
-                    self.known_by_server();
-                    self.settle_settings(&reply);
-                }
-            }
-            Heard::TokenRefused => {
-                if !self.ledger.removed {
-                    tracing::warn!("the server does not know this robot any more: nothing new is begun");
-                    self.ledger.removed = true;
-                    self.dirty = true;
-                }
-            }
-            Heard::Withheld { code, text } => self.withheld = Some(Condition { code, text }),
-        }
-    }
-
-    fn known_by_server(&mut self) {
-        self.withheld = None;
-        if self.ledger.removed {
-            self.ledger.removed = false;
-            self.dirty = true;
-        }
-    }
-
-    /// Accepts a desired state or says why not.
-    fn consider(&mut self, envelope: Envelope) {
-        let Speaker { server_key, robot_id, .. } = &self.speaker;
-        let wall_ms = self.effects.now().wall_ms;
-        match admission::admit(&envelope, server_key, robot_id, self.desired.as_ref(), wall_ms) {
-            Ok(state) => {
-                self.conditions.remove("state_refused");
-                if self.desired.as_ref() != Some(&state) {
-                    tracing::info!(generation = %state.generation, tasks = state.tasks.len(), "accepted a desired state");
-                    self.ledger.accepted = Some(Accepted { generation: state.generation, envelope });
-                    // The order may be for a label that the robot was given just before it: ask again.
-                    self.robot.labels = None;
-                    self.shared.post.notify_one();
-                    self.desired = Some(state);
-                    self.dirty = true;
-                }
-            }
-            Err(refused) => {
-                let text = format!("a desired state was refused: {}", chain(&refused));
-                tracing::warn!("{text}");
-                self.conditions.insert("state_refused", text);
-            }
-        }
-    }
-
-    /// What the server holds wins; what the robot's own settings say otherwise is reported.
-    fn settle_settings(&mut self, reply: &ReportReply) {
-        let mut differences = Vec::new();
-        if let Some(own) = self.speaker.name.as_ref().filter(|own| **own != reply.name) {
-            differences.push(format!("name is {own} here and {} there", reply.name));
-        }
-        if let Some(own) = self.speaker.labels.as_ref().filter(|own| **own != reply.labels) {
-            let text = |labels: &Labels| {
-                labels.iter().map(|(key, value)| format!("{key}={value}")).collect::<Vec<_>>().join(",")
-            };
-            differences.push(format!("labels are {:?} here and {:?} there", text(own), text(&reply.labels)));
-        }
-        if differences.is_empty() {
-            self.conditions.remove("settings_differ");
-        } else {
-            let text = format!("the server's settings hold, the robot's own differ: {}", differences.join("; "));
-            self.conditions.insert("settings_differ", text);
-        }
-        self.robot.labels = Some(reply.labels.clone());
-    }
-
     /// Writes the ledger if it changed; whether what it says is on the disk.
     fn save(&mut self) -> bool {
         if !self.dirty {
@@ -590,3 +510,6 @@ impl<E: Effects> Driver<E> {
         !self.dirty
     }
 }
+
+#[cfg(test)]
+mod tests;

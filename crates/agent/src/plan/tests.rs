@@ -274,8 +274,9 @@ impl World {
             Step::Remove => {
                 assert!(self.alive.is_empty(), "removes a task that runs");
                 self.disk.clear();
-                // With the task its history goes: the same order afterwards is a new one.
+                // With the task its history and directories go: the same order afterwards is a new one.
                 self.job_starts.clear();
+                self.ended.clear();
             }
         }
     }

@@ -331,6 +331,14 @@ impl<E: Effects> Driver<E> {
                 None => ProcessState::None,
             });
         }
+        if let Some(ProcessState::Alive { pid }) = view.process {
+            // An agent that died during the start did not write it down.
+            let record = self.ledger.tasks.get_mut(task).and_then(|record| record.active.as_mut()?.process.as_mut());
+            if let Some(process) = record.filter(|process| process.pid != Some(pid)) {
+                process.pid = Some(pid);
+                self.dirty = true;
+            }
+        }
     }
 
     fn has_room(&self, begin: &[(TaskName, Step)]) -> bool {

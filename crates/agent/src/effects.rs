@@ -47,7 +47,8 @@ pub trait Effects: Send + Sync + 'static {
     /// What the reports say of the machine.
     fn host_facts(&self) -> HostFacts;
 
-    /// The runs whose processes live, found without the ledger.
+    /// Each task's last run, found without the ledger: one that lives, else one that has ended, so that a job that was
+    /// done is not done again.
     fn survivors(&self) -> impl Future<Output = Vec<(TaskName, ActiveRun)>> + Send;
 
     /// What is on the disk of this version.

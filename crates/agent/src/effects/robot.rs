@@ -143,15 +143,21 @@ impl Effects for Robot {
     async fn survivors(&self) -> Vec<(TaskName, ActiveRun)> {
         let mut survivors = Vec::new();
         for task in self.data.task_names().unwrap_or_default() {
+            let mut last = None;
             for entry in std::fs::read_dir(self.data.task(&task).run()).into_iter().flatten().flatten() {
                 let record = std::fs::read(entry.path().join(RUN_RECORD)).ok();
                 let Some(run) = record.and_then(|bytes| serde_json::from_slice::<ActiveRun>(&bytes).ok()) else {
                     continue;
                 };
-                if let Ok(Observed::Running { .. }) = self.supervisor.observe(&entry.path()).await {
-                    survivors.push((task.clone(), run));
+                match self.supervisor.observe(&entry.path()).await {
+                    Ok(Observed::Running { .. }) => last = Some((true, run)),
+                    Ok(Observed::Exited(_) | Observed::Gone) if !matches!(last, Some((true, _))) => {
+                        last = Some((false, run));
+                    }
+                    _ => {}
                 }
             }
+            survivors.extend(last.map(|(_, run)| (task, run)));
         }
         survivors
     }

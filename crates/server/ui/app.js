@@ -8,7 +8,7 @@ import { Fleet } from './fleet.js';
 import { ago, number, plural } from './format.js';
 import { listen } from './live.js';
 import { robotDialog } from './robot.js';
-import { robotTable, window_of } from './robots.js';
+import { Layout, robotTable, sign } from './robots.js';
 
 const REFETCH_PAUSE_MS = 2_000;
 
@@ -24,16 +24,25 @@ const page = {
   isSigningIn: false,
   robot: null,
   isAllShown: false,
+  /** The person, not the stream, has changed which rows stand where. */
+  isRearranged: false,
+  /** The lists have to be fetched once more. */
+  isStale: false,
 };
 
 let live = null;
 
 const actions = {
-  sortBy: (column) => change(() => page.fleet.sortBy(column)),
-  filterBy: (text) => change(() => page.fleet.filterBy(text)),
+  sortBy: (column) => rearrange(() => page.fleet.sortBy(column)),
+  filterBy: (text) => rearrange(() => page.fleet.filterBy(text)),
   showAll: (yes) => change(() => (page.isAllShown = yes)),
   show: (robot) => change(() => (page.robot = robot)),
 };
+
+function rearrange(act) {
+  page.isRearranged = true;
+  change(act);
+}
 
 // Signing in and out
 
@@ -107,9 +116,9 @@ let refetchedAt = -Infinity;
 
 /** Fetches the lists; asked again meanwhile, it does so once more, but never without a pause. */
 async function refetch() {
-  if (page.backlog) return void (page.isStale = true);
+  page.isStale = Boolean(page.backlog);
+  if (page.backlog) return;
   page.backlog = [];
-  page.isStale = false;
   const wait = refetchedAt + REFETCH_PAUSE_MS - performance.now();
   if (wait > 0) await new Promise((resume) => setTimeout(resume, wait));
   refetchedAt = performance.now();
@@ -150,19 +159,33 @@ function paint(frame) {
   if (page.view === 'starting') return render(page.problem ? html`<p class="bad">${page.problem}</p>` : nothing, document.body);
   if (page.view === 'signed_out') return render(signInView(), document.body);
   page.fleet.settle(frame);
+  const layout = new Layout(page.fleet);
+  const scrolled = keepInPlace(layout);
   const rows = document.querySelector('.rows');
-  const top = rows?.getBoundingClientRect().top ?? 0;
-  const sight = window_of(page.fleet, -top, innerHeight - top);
+  const top = (rows?.getBoundingClientRect().top ?? 0) - scrolled;
+  const sight = layout.sight(-top, innerHeight - top);
   render(fleetView(sight), document.body);
-  place(sight);
+  // Through the style objects: the policy of this page allows no style attributes.
+  document.querySelector('.rows').style.height = `${layout.height}px`;
+  document.querySelector('.sight').style.transform = `translateY(${sight.offset}px)`;
+  if (scrolled) scrollBy(0, scrolled);
   const dialog = document.querySelector('dialog');
   if (page.robot && !dialog.open) dialog.showModal();
 }
 
-/** Through the style objects: the policy of this page allows no style attributes. */
-function place({ height, offset }) {
-  document.querySelector('.rows').style.height = `${height}px`;
-  document.querySelector('.sight').style.transform = `translateY(${offset}px)`;
+/** How far to scroll so that the row at the table's upper edge stays where it is, though rows above it grow or shrink. */
+function keepInPlace(layout) {
+  const rows = document.querySelector('.rows');
+  const head = document.querySelector('.row.head');
+  const wasRearranged = page.isRearranged;
+  page.isRearranged = false;
+  if (!rows || wasRearranged) return 0;
+  const edge = head.getBoundingClientRect().bottom;
+  const { left, top } = rows.getBoundingClientRect();
+  if (top >= edge) return 0;
+  const row = document.elementFromPoint(left + 1, edge + 1)?.closest('[data-robot]');
+  const index = row ? layout.ids.indexOf(row.dataset.robot) : -1;
+  return index < 0 ? 0 : Math.round(top + layout.top(index) - row.getBoundingClientRect().top);
 }
 
 const signInView = () => html`
@@ -205,8 +228,7 @@ function fleetView(sight) {
 
 function robotCount({ robots, online, shown, filter, isLoaded }) {
   if (!isLoaded) return '';
-  const found = filter ? `${number(shown.length)} of ` : '';
-  return `${found}${number(robots.size)}, ${number(online)} online`;
+  return filter ? `${number(shown.length)} of ${number(robots.size)}` : `${number(robots.size)}, ${number(online)} online`;
 }
 
 const noRobots = () => html`
@@ -219,11 +241,11 @@ const noRobots = () => html`
 
 function streamState(now) {
   const { state, retry_at } = page.stream;
-  if (state === 'open' && page.fleet.isLoaded) return html`<span class="live">● Live</span>`;
+  if (state === 'open' && page.fleet.isLoaded) return sign(true, 'Live');
   const since = page.heardAt ? `, shown as of ${ago(page.heardAt, now)}` : '';
-  if (state !== 'waiting') return html`<span class="offline">○ Connecting${since}</span>`;
+  if (state !== 'waiting') return sign(false, `Connecting${since}`);
   const seconds = Math.max(0, Math.ceil((retry_at - Date.now()) / 1000));
-  return html`<span class="bad">○ Not live${since}; trying again in ${plural(seconds, 'second')}</span>`;
+  return sign(false, html`<span class="bad">Not live${since}; trying again in ${plural(seconds, 'second')}</span>`);
 }
 
 addEventListener('hashchange', () => { const token = tokenOfLink(); if (token) signIn(token); });

@@ -49,13 +49,11 @@ function deploymentRow(deployment, fleet, now, actions) {
 
 const STATES = { active: '▸ Active', paused: '‖ Paused', settled: '✓ Settled', cancelled: '✕ Cancelled' };
 
+/** Only versions: what a deployment takes the place of is always the same package. */
 function replaced({ supersedes }, fleet) {
   if (!supersedes.length) return nothing;
-  const names = supersedes.map((id) => {
-    const older = fleet.deployment(id);
-    return older ? `${older.package.name}@${older.package.version}` : id;
-  });
-  return html`<span class="quiet" title=${`supersedes ${supersedes.join(', ')}`}>, supersedes ${[...new Set(names)].join(', ')}</span>`;
+  const versions = new Set(supersedes.map((id) => fleet.deployment(id)?.package.version ?? id));
+  return html`<span class="quiet" title=${supersedes.join(', ')}>, supersedes ${[...versions].join(', ')}</span>`;
 }
 
 const ORDER = ['done', 'busy', 'waiting', 'bad', 'gone'];

@@ -42,12 +42,10 @@ export class Fleet {
   apply(event) {
     switch (event.type) {
       case 'robot':
-        this.robots.set(event.robot.id, event.robot);
-        this.#isUnordered = true;
+        this.#replaceRobot(event.robot.id, event.robot);
         return false;
       case 'robot_removed':
-        this.robots.delete(event.id);
-        this.#isUnordered = true;
+        this.#replaceRobot(event.id, null);
         return false;
       case 'deployment':
         this.#replaceDeployment(event.deployment);
@@ -60,6 +58,20 @@ export class Fleet {
       default:
         return false;
     }
+  }
+
+  #replaceRobot(id, robot) {
+    const old = this.robots.get(id);
+    if (robot) this.robots.set(id, robot);
+    else this.robots.delete(id);
+    this.online += Boolean(robot?.online) - Boolean(old?.online);
+    // Most news leave a robot where it is, and ten thousand names take a while to sort.
+    const isInPlace = old && robot && !this.filter && old.name === robot.name && this.#key(old) === this.#key(robot);
+    if (!isInPlace) this.#isUnordered = true;
+  }
+
+  #key(robot) {
+    return COLUMNS.find(({ id }) => id === this.sort.column).key(robot);
   }
 
   #replaceDeployment(deployment) {
@@ -89,13 +101,12 @@ export class Fleet {
 
   order(now = performance.now()) {
     const words = this.filter.toLowerCase().split(/\s+/).filter(Boolean);
-    const { key } = COLUMNS.find(({ id }) => id === this.sort.column);
     const rows = [];
     this.online = 0;
     for (const robot of this.robots.values()) {
       if (robot.online) this.online += 1;
       if (words.length && !matches(robot, words)) continue;
-      rows.push({ id: robot.id, key: key(robot), name: robot.name });
+      rows.push({ id: robot.id, key: this.#key(robot), name: robot.name });
     }
     const sign = this.sort.isDescending ? -1 : 1;
     rows.sort((a, b) => sign * compare(a.key, b.key) || compare(a.name, b.name));

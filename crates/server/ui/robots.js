@@ -11,9 +11,9 @@ const LINE = 24;
 const PADDING = 17;
 // Rows drawn beyond the edges, so that the next ones are there when the wheel turns.
 const SPARE_ROWS = 6;
-const narrow = matchMedia('(max-width: 899px)');
+const narrow = matchMedia('(max-width: 1099px)');
 
-const linesOf = (task) => (narrow.matches && task.failure ? 2 : 1);
+const linesOf = (task) => (task.failure ? 2 : 1);
 
 function height(robot) {
   if (!robot) return 0;
@@ -21,24 +21,26 @@ function height(robot) {
   return PADDING + LINE * (narrow.matches ? 2 + lines : Math.max(1, lines));
 }
 
-/** Which rows are in sight, and where they begin. */
-export function window_of(fleet, from, to) {
-  let top = 0;
-  let first = 0;
-  let last = 0;
-  let offset = 0;
-  fleet.shown.forEach((id, index) => {
-    const bottom = top + height(fleet.robots.get(id));
-    if (bottom <= from) {
-      first = index + 1;
-      offset = bottom;
-    }
-    if (top < to) last = index + 1;
-    top = bottom;
-  });
-  const start = Math.max(0, first - SPARE_ROWS);
-  for (let index = start; index < first; index += 1) offset -= height(fleet.robots.get(fleet.shown[index]));
-  return { start, end: Math.min(fleet.shown.length, last + SPARE_ROWS), offset, height: top };
+/** Where each row ends, and which rows are in sight between two distances from the table's top. */
+export class Layout {
+  constructor(fleet) {
+    let bottom = 0;
+    this.ids = fleet.shown;
+    this.bottoms = fleet.shown.map((id) => (bottom += height(fleet.robots.get(id))));
+    this.height = bottom;
+  }
+
+  top(index) {
+    return index > 0 ? this.bottoms[index - 1] : 0;
+  }
+
+  sight(from, to) {
+    const first = this.bottoms.findIndex((bottom) => bottom > from);
+    const start = Math.max(0, (first < 0 ? this.ids.length : first) - SPARE_ROWS);
+    const last = this.bottoms.findIndex((bottom) => bottom >= to);
+    const end = last < 0 ? this.ids.length : Math.min(this.ids.length, last + 1 + SPARE_ROWS);
+    return { start, end, offset: this.top(start) };
+  }
 }
 
 /** The table. `actions` has `sortBy(column)` and `show(robotId)`. */
@@ -71,14 +73,17 @@ function robotRow(robot, index, now, actions) {
       <span class="seen" role="cell">${lastSeen(robot, now)}</span>
       <div class="work" role="cell">
         ${robot.conditions.map(conditionLine)}
-        ${robot.tasks.length ? robot.tasks.map(taskLine) : html`<div class="line quiet">–</div>`}
+        ${robot.tasks.map(taskLine)}
       </div>
     </div>`;
 }
 
 /** Text and shape, never colour alone. */
-export const robotState = ({ online }) => html`
-  <span class=${online ? 'online' : 'offline'}><svg class="dot" viewBox="0 0 10 10" aria-hidden="true"><circle cx="5" cy="5" r="3.75"></circle></svg>${online ? 'Online' : 'Offline'}</span>`;
+export const robotState = ({ online }) => sign(online, online ? 'Online' : 'Offline');
+
+/** A full or an empty dot before a text. */
+export const sign = (isOn, text) => html`
+  <span class=${isOn ? 'online' : 'offline'}><svg class="dot" viewBox="0 0 10 10" aria-hidden="true"><circle cx="5" cy="5" r="3.75"></circle></svg>${text}</span>`;
 
 const lastSeen = ({ online, last_seen_ms: then }, now) =>
   then || online ? html`<time title=${then ? moment(then) : nothing}>${online ? 'now' : ago(then, now)}</time>` : 'never';
@@ -90,17 +95,15 @@ const taskLine = (task) => html`
   <div class="line task" data-task=${task.task}>
     <span class="package" title=${task.deployment}>${task.task}<span class="quiet">@${task.version}</span></span>
     <span class="phase ${tone(task.phase)}">${words(task.phase)}</span>
-    ${note(task)}
+    <span class="note">${task.progress?.total && tone(task.phase) === 'busy' ? progress(task) : html`<span class="quiet">${remarks(task).join(' · ')}</span>`}</span>
+    ${task.failure ? failure(task.failure) : nothing}
   </div>`;
 
-function note(task) {
-  if (task.progress?.total && tone(task.phase) === 'busy') {
-    const { done, total } = task.progress;
-    return html`<span class="note"><progress max=${total} .value=${Math.min(done, total)} aria-label=${`${task.task} ${words(task.phase)}`}></progress><span class="quiet bytes">${bytes(task.progress)}</span></span>`;
-  }
-  if (task.failure) return html`<span class="note failure" title=${`${task.failure.code}: ${task.failure.text}`}>${words(task.failure.code)}<span class="quiet">: ${task.failure.text}</span></span>`;
-  return html`<span class="note quiet">${remarks(task).join(' · ')}</span>`;
-}
+const progress = ({ task, phase, progress: { done, total } }) => html`
+  <progress max=${total} .value=${Math.min(done, total)} aria-label=${`${task} ${words(phase)}`}></progress><span class="quiet bytes">${bytes({ done, total })}</span>`;
+
+const failure = ({ code, text }) => html`
+  <span class="failure" title=${`${code}: ${text}`}>${words(code)}<span class="quiet">: ${text}</span></span>`;
 
 /** What else is worth knowing of a task that has not failed. */
 export function remarks({ active, version, restarts, wanted, phase }) {

@@ -4,6 +4,7 @@
 
 mod api;
 mod auth;
+mod browser;
 mod cli;
 mod database;
 mod fleet;
@@ -12,6 +13,7 @@ mod mqtt;
 mod mqtt_harness;
 mod mqtt_hostile;
 mod oci;
+mod page;
 mod serve;
 mod story;
 mod uplink;

@@ -1,0 +1,108 @@
+//! The page in a real browser, against a whole server: what an operator sees, live, and that nothing a robot says is
+//! taken for more than text.
+
+use reqwest::{Method, StatusCode};
+use serde_json::{Value, json};
+use task_proto::desired::DesiredState;
+use task_proto::report::{Condition, Failure, FailureCode, Phase, Progress, Report};
+
+use crate::browser::Browser;
+use crate::harness::{TestRobot, TestServer};
+
+const HOSTILE: &str = "<img src=x onerror=\"document.title='owned'\"><script>document.title='owned'</script>";
+
+async fn post(server: &TestServer, report: &Report, token: &str) {
+    let path = format!("/api/v1/robots/{}/report", report.robot_id);
+    let response = server.bare(Method::POST, &path).bearer_auth(token).json(report).send().await;
+    assert_eq!(response.expect("an answer").status(), StatusCode::OK);
+}
+
+/// The robot says that its one task is being fetched, and how far.
+fn fetching(robot: &mut TestRobot, state: &DesiredState, done: u64) -> Report {
+    let mut report = robot.next_report(state, Phase::Fetching);
+    report.tasks[0].progress = Some(Progress { done, total: 48_000_000 });
+    report
+}
+
+/// The robot says hostile things wherever it may say anything.
+fn hostile(robot: &mut TestRobot, state: &DesiredState) -> Report {
+    let mut report = robot.next_report(state, Phase::Failed);
+    report.tasks[0].failure = Some(Failure::new(FailureCode::BUILD_FAILED, HOSTILE));
+    report.conditions = vec![Condition { code: "held".to_owned(), text: HOSTILE.to_owned() }];
+    report.host.hostname = HOSTILE.to_owned();
+    report
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_operator_watches_a_robot_through_its_life() {
+    let server = TestServer::start().await;
+    let browser = Browser::start().await;
+
+    browser.open(&server.url(&format!("/#token={}", server.operator.reveal()))).await;
+    browser.wait("document.body.innerText.includes('No robot is enrolled yet')").await;
+    assert_eq!(browser.run("return location.href").await, json!(server.url("/")), "the token has left the address bar");
+    browser.wait("document.querySelector('.stream').innerText.includes('Live')").await;
+    browser.run("window.isSameDocument = true").await;
+
+    let mut robot = server.enroll("atlas").await;
+    browser.wait("document.querySelector('[data-robot] .name')?.innerText === 'atlas'").await;
+
+    let package = server.push("talker", "1.2.0").await;
+    server.deploy(&package, "*", "first").await;
+    let state = server.desired(&robot).await;
+    browser.wait("document.querySelector('[data-robot] .state').innerText === 'Online'").await;
+    for done in [12_000_000, 36_000_000] {
+        post(&server, &fetching(&mut robot, &state, done), &robot.token).await;
+        browser.wait(&format!("document.querySelector('[data-task=talker] progress')?.value === {done}")).await;
+    }
+    browser.wait("document.querySelector('[data-deployment] .counts').innerText.trim() === '1 fetching'").await;
+    post(&server, &robot.next_report(&state, Phase::Running), &robot.token).await;
+    browser.wait("document.querySelector('[data-task=talker] .phase').innerText === 'running'").await;
+    browser.wait("document.querySelector('[data-deployment] .counts').innerText.trim() === '1 running'").await;
+
+    post(&server, &hostile(&mut robot, &state), &robot.token).await;
+    browser.wait("document.querySelector('[data-task=talker] .failure')?.innerText.includes('<img src=x')").await;
+    browser.wait("document.querySelector('[data-robot] .condition')?.innerText.includes('<img src=x')").await;
+    browser.run("document.querySelector('[data-robot] .name button').click()").await;
+    browser.wait("document.querySelector('dialog[open] dl')?.innerText.includes('<img src=x')").await;
+    assert_eq!(browser.run("return document.querySelectorAll('body img, body script').length").await, json!(0));
+    assert_eq!(browser.run("return document.title").await, json!("taskd"));
+    assert_eq!(browser.run("return window.isSameDocument").await, json!(true), "the page was never loaded again");
+    browser.run("document.querySelector('dialog').close()").await;
+
+    assert_eq!(browser.console().await, Vec::<Value>::new(), "no error, no warning, no violated policy");
+    // And one would have been seen:
+    browser.run("document.body.setAttribute('style', 'color: red')").await;
+    assert_eq!(browser.console().await.len(), 1);
+
+    browser
+        .run("[...document.querySelectorAll('button')].find((button) => button.innerText === 'Sign out').click()")
+        .await;
+    browser.wait("document.querySelector('label')?.innerText === 'Operator token'").await;
+    let status = "return fetch('/api/v1/robots').then((response) => response.status)";
+    assert_eq!(browser.run(status).await, json!(401));
+    server.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_wrong_token_is_refused_in_words_and_a_restarted_server_is_found_again() {
+    let server = TestServer::start().await;
+    let browser = Browser::start().await;
+
+    browser.open(&server.url("/#token=tsko_wrong")).await;
+    browser.wait("document.querySelector('[role=alert]')?.innerText.startsWith('token: ')").await;
+    let form = "document.querySelector('form')";
+    let sign_in = format!("{form}.elements.token.value = '{}'; {form}.requestSubmit()", server.operator.reveal());
+    browser.run(&sign_in).await;
+    browser.wait("document.querySelector('.stream')?.innerText.includes('Live')").await;
+
+    let port = server.server.addresses().http.parse::<std::net::SocketAddr>().expect("an address").port();
+    let directory = server.stop().await;
+    browser.wait("document.querySelector('.stream')?.innerText.includes('Not live')").await;
+    let server = TestServer::start_in(directory, |config| config.http.set_port(port)).await;
+    // Sessions end with the server; the page finds it and asks to sign in again.
+    browser.wait("document.querySelector('label')?.innerText === 'Operator token'").await;
+    browser.run(&sign_in).await;
+    browser.wait("document.querySelector('.stream')?.innerText.includes('Live')").await;
+    server.stop().await;
+}

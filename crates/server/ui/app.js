@@ -239,16 +239,20 @@ const noRobots = () => html`
     ${command('task-agent run')}
   </div>`;
 
+/** What moves on each second is for the eye only: read aloud, it would never stop. */
 function streamState(now) {
   const { state, retry_at } = page.stream;
   if (state === 'open' && page.fleet.isLoaded) return sign(true, 'Live');
   const since = page.heardAt ? `, shown as of ${ago(page.heardAt, now)}` : '';
-  if (state !== 'waiting') return sign(false, `Connecting${since}`);
+  if (state !== 'waiting') return sign(false, html`Connecting<span aria-hidden="true">${since}</span>`);
   const seconds = Math.max(0, Math.ceil((retry_at - Date.now()) / 1000));
-  return sign(false, html`<span class="bad">Not live${since}; trying again in ${plural(seconds, 'second')}</span>`);
+  return sign(false, html`<span class="bad">Not live<span aria-hidden="true">${since}; trying again in ${plural(seconds, 'second')}</span></span>`);
 }
 
-addEventListener('hashchange', () => { const token = tokenOfLink(); if (token) signIn(token); });
+addEventListener('hashchange', () => {
+  const token = tokenOfLink();
+  if (token) signIn(token);
+});
 addEventListener('scroll', () => change(() => {}), { passive: true });
 addEventListener('resize', () => change(() => {}));
 addEventListener('keydown', (event) => {

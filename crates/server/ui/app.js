@@ -228,6 +228,7 @@ function fleetView(sight) {
 
 function robotCount({ robots, online, shown, filter, isLoaded }) {
   if (!isLoaded) return '';
+  if (!robots.size) return '0';
   return filter ? `${number(shown.length)} of ${number(robots.size)}` : `${number(robots.size)}, ${number(online)} online`;
 }
 

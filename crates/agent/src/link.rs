@@ -5,16 +5,16 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use task_proto::Generation;
 use task_proto::api::ReportReply;
 use task_proto::envelope::Envelope;
 use task_proto::report::Report;
 use tokio::sync::{Notify, mpsc, watch};
+use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
 use crate::effects::chain;
 use crate::plan::backoff_ms;
-use crate::server::{Server, ServerError};
+use crate::server::{Sent, Server, ServerError};
 
 /// The longest wait before a report is posted again.
 const MAX_POST_BACKOFF_MS: u64 = 60 * 1000;
@@ -46,15 +46,15 @@ pub enum Heard {
     },
 }
 
-/// What driver and link share. The driver writes reports and the known generation, the link the rest.
+/// What driver and link share. The driver writes reports and whether it keeps to its state, the link the rest.
 #[derive(Clone)]
 pub struct Shared {
     /// The newest report.
     pub reports: watch::Sender<Option<Arc<Report>>>,
     /// The sequence number of the newest report that is stored.
     pub confirmed: watch::Sender<u64>,
-    /// The generation the robot has; `None` asks for the state whatever its generation.
-    pub known: watch::Sender<Option<Generation>>,
+    /// Whether the robot keeps to the state it has for some time; otherwise the server is asked for all of it again.
+    pub settled: watch::Sender<bool>,
     /// Whether a session is up.
     pub mqtt_up: watch::Sender<bool>,
     /// Asks for a poll now.
@@ -80,7 +80,7 @@ impl Shared {
         Self {
             reports: watch::Sender::new(None),
             confirmed: watch::Sender::new(0),
-            known: watch::Sender::new(None),
+            settled: watch::Sender::new(false),
             mqtt_up: watch::Sender::new(false),
             poll: Arc::default(),
             post: Arc::default(),
@@ -92,23 +92,30 @@ impl Shared {
 /// Polls for the desired state, until the agent ends.
 pub async fn poll(server: Server, shared: Shared, intervals: Intervals, heard: mpsc::Sender<Heard>) {
     let mut mqtt_up = shared.mqtt_up.subscribe();
+    let mut tag = None;
     loop {
-        let known = *shared.known.borrow();
+        let known = tag.as_ref().filter(|_| *shared.settled.borrow());
         let outcome = server.desired(known).await;
+        let asked_at = Instant::now();
+        let spread = spread();
         let least = match &outcome {
             Err(ServerError::TokenRefused(_)) => REFUSED_POLL.min(intervals.slow),
             Err(ServerError::Busy { retry_after: Some(wait), .. }) => (*wait).min(intervals.slow),
             _ => Duration::ZERO,
         };
+        if let Ok(Some(sent)) = &outcome {
+            tag.clone_from(&sent.tag);
+        }
         if heard.send(heard_of(outcome)).await.is_err() {
             return;
         }
         loop {
             let up = *mqtt_up.borrow_and_update();
-            let interval = jittered(if up { intervals.slow } else { intervals.fast }).max(least);
+            let interval = (if up { intervals.slow } else { intervals.fast }).mul_f64(spread).max(least);
             tokio::select! {
-                // Cancel-safe: a timer that is made anew each time.
-                () = tokio::time::sleep(interval) => {
+                // Cancel-safe: a timer that is made anew for the same time, so that a session that comes and goes does
+                // not put polling off for ever.
+                () = tokio::time::sleep_until(asked_at + interval) => {
                     // A report over HTTP brings the name and labels the server holds, which MQTT does not.
                     shared.post.notify_one();
                     break;
@@ -124,9 +131,9 @@ pub async fn poll(server: Server, shared: Shared, intervals: Intervals, heard: m
     }
 }
 
-fn heard_of(outcome: Result<Option<Envelope>, ServerError>) -> Heard {
+fn heard_of(outcome: Result<Option<Sent>, ServerError>) -> Heard {
     match outcome {
-        Ok(Some(envelope)) => Heard::Desired(Box::new(envelope)),
+        Ok(Some(sent)) => Heard::Desired(Box::new(sent.envelope)),
         Ok(None) => Heard::Unchanged,
         Err(ServerError::TokenRefused(_)) => Heard::TokenRefused,
         Err(ServerError::Refused { code, message }) => Heard::Withheld { code, text: message },
@@ -188,7 +195,7 @@ pub async fn post(server: Server, shared: Shared, heard: mpsc::Sender<Heard>) {
     }
 }
 
-/// Between half and one and a half of the interval, so that a fleet that began together does not poll together.
-fn jittered(interval: Duration) -> Duration {
-    interval.mul_f64(0.5 + rand::random::<f64>())
+/// Between half and one and a half, so that a fleet that began together does not poll together.
+fn spread() -> f64 {
+    0.5 + rand::random::<f64>()
 }

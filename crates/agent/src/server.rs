@@ -3,14 +3,14 @@
 
 use std::time::Duration;
 
-use reqwest::header::{ETAG, HeaderMap, IF_NONE_MATCH, RETRY_AFTER};
+use reqwest::header::{ETAG, HeaderMap, HeaderValue, IF_NONE_MATCH, RETRY_AFTER};
 use reqwest::{Method, StatusCode, Url};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+use task_proto::RobotId;
 use task_proto::api::{EnrollRequest, EnrollResponse, ErrorBody, ReportReply};
 use task_proto::envelope::Envelope;
 use task_proto::report::Report;
-use task_proto::{Generation, RobotId};
 
 /// The longest answer that is read.
 const MAX_ANSWER_BYTES: usize = 8 * 1024 * 1024;
@@ -58,6 +58,15 @@ pub struct Server {
     token: String,
 }
 
+/// A desired state as the server sent it.
+#[derive(Debug)]
+pub struct Sent {
+    /// The signed state.
+    pub envelope: Envelope,
+    /// The server's mark for just these bytes. It means something only to the server.
+    pub tag: Option<HeaderValue>,
+}
+
 /// The one HTTP client of the agent.
 pub fn client() -> Result<reqwest::Client, reqwest::Error> {
     // The second call in a process finds it installed: that is fine.
@@ -87,15 +96,14 @@ impl Server {
         Self { client, base, robot, token }
     }
 
-    /// The signed desired state; `None` if it still has the generation `known`.
-    pub async fn desired(&self, known: Option<Generation>) -> Result<Option<Envelope>, ServerError> {
+    /// The signed desired state; `None` if it is still the one that was sent with the tag `known`.
+    pub async fn desired(&self, known: Option<&HeaderValue>) -> Result<Option<Sent>, ServerError> {
         let url = at(&self.base, &format!("robots/{}/desired", self.robot));
         let answer = send::<()>(&self.client, Method::GET, url, &self.token, None, known).await?;
         if answer.status == StatusCode::NOT_MODIFIED {
             return Ok(None);
         }
-        tracing::debug!(etag = ?answer.headers.get(ETAG), "the server sent a desired state");
-        parse(&answer.body).map(Some)
+        Ok(Some(Sent { envelope: parse(&answer.body)?, tag: answer.headers.get(ETAG).cloned() }))
     }
 
     /// Delivers a report; once this returns it is stored.
@@ -124,14 +132,14 @@ async fn send<B: Serialize>(
     url: Url,
     token: &str,
     body: Option<&B>,
-    known: Option<Generation>,
+    known: Option<&HeaderValue>,
 ) -> Result<Answer, ServerError> {
     let mut request = client.request(method, url).bearer_auth(token);
     if let Some(body) = body {
         request = request.json(body);
     }
-    if let Some(generation) = known {
-        request = request.header(IF_NONE_MATCH, format!("\"{generation}\""));
+    if let Some(tag) = known {
+        request = request.header(IF_NONE_MATCH, tag);
     }
     let mut response = request.send().await.map_err(ServerError::Unreachable)?;
     let (status, headers) = (response.status(), response.headers().clone());

@@ -33,7 +33,7 @@ pub struct Config {
     pub public_mqtt_host: Option<String>,
     /// The MQTT port robots are told; absent: the one that is bound.
     pub public_mqtt_port: Option<u16>,
-    /// After how long a silent robot that polls counts as offline, and robots are told to poll at a third of it.
+    /// After how long a silent robot that polls counts as offline; robots poll every 10 s unless told otherwise.
     pub presence_timeout: Duration,
     /// How blobs are read.
     pub blob_read: BlobRead,

@@ -105,8 +105,8 @@ async fn enroll(arguments: Arguments) -> anyhow::Result<ExitCode> {
 /// The server must hold the key that the token pins: a desired state that it signed shows it.
 async fn check_key(server: &Server, response: &EnrollResponse, key: &PublicKey) -> anyhow::Result<()> {
     match server.desired(None).await {
-        Ok(Some(envelope)) => {
-            admission::open(&envelope, key, &response.robot_id)
+        Ok(Some(sent)) => {
+            admission::open(&sent.envelope, key, &response.robot_id)
                 .context("the server does not hold the key that the enrolment token names")?;
             Ok(())
         }

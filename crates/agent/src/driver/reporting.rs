@@ -20,8 +20,8 @@ impl<E: Effects> Driver<E> {
             self.seq = report.seq;
             self.shared.reports.send_replace(Some(Arc::new(report)));
         }
-        let known = self.known_generation();
-        self.shared.known.send_if_modified(|last| std::mem::replace(last, known) != known);
+        let settled = self.is_settled();
+        self.shared.settled.send_if_modified(|last| std::mem::replace(last, settled) != settled);
     }
 
     fn report(&self) -> Report {
@@ -59,13 +59,13 @@ impl<E: Effects> Driver<E> {
         conditions
     }
 
-    /// The generation to name when asking for the desired state: none once half of its lifetime is over, so that the
-    /// server sends it signed anew.
-    fn known_generation(&self) -> Option<Generation> {
-        let state = self.desired.as_ref()?;
+    /// Whether the server need not send what it has sent before: not once half of the state's lifetime is over, so that
+    /// the server sends it signed anew, and not while the robot refuses what it was sent.
+    fn is_settled(&self) -> bool {
+        let Some(state) = &self.desired else { return false };
         let half_ms = state.issued_at_ms + state.expires_at_ms.saturating_sub(state.issued_at_ms) / 2;
         let refused = self.conditions.contains_key("state_refused");
-        (!refused && self.effects.now().wall_ms < half_ms).then_some(state.generation)
+        !refused && self.effects.now().wall_ms < half_ms
     }
 }
 

@@ -23,6 +23,9 @@ use tokio_util::sync::CancellationToken;
 const PATIENCE: Duration = Duration::from_secs(20);
 const REFUSAL: &str = r#"{"error":{"code":"unauthorized","message":"no such token"}}"#;
 
+/// A tag as the server gives them: more than the generation, and for nobody else to understand.
+const TAG: &str = "\"1-0123456789abcdef\"";
+
 /// One answer: status, content type, body.
 type Canned = (u16, &'static str, String);
 
@@ -53,7 +56,7 @@ async fn answer_canned(State(fake): State<Arc<Fake>>, headers: HeaderMap) -> Res
     let known = headers.get(header::IF_NONE_MATCH).map(|value| value.to_str().unwrap().to_owned());
     fake.asked_with.lock().unwrap().push(known);
     let (status, kind, body) = fake.answer.lock().unwrap().clone();
-    let headers = [(header::CONTENT_TYPE, kind), (header::RETRY_AFTER, "7")];
+    let headers = [(header::CONTENT_TYPE, kind), (header::RETRY_AFTER, "7"), (header::ETAG, TAG)];
     (StatusCode::from_u16(status).unwrap(), headers, body).into_response()
 }
 
@@ -92,8 +95,7 @@ async fn only_the_servers_own_no_is_a_refusal() {
     fake.set((409, "application/json", REFUSAL.replace("unauthorized", "diverged")));
     assert!(matches!(server.desired(None).await, Err(ServerError::Refused { code, .. }) if code == "diverged"));
     fake.set((304, "application/json", String::new()));
-    assert!(server.desired(Some(Generation(4))).await.unwrap().is_none());
-    assert_eq!(fake.asked_with.lock().unwrap().last().unwrap().as_deref(), Some("\"4\""));
+    assert!(server.desired(None).await.unwrap().is_none());
 }
 
 #[tokio::test]
@@ -104,22 +106,22 @@ async fn altered_foreign_and_old_states_are_refused() {
     let admit = |envelope: &Envelope, accepted: Option<&DesiredState>| {
         admission::admit(envelope, &key.public_key(), &robot, accepted, 2)
     };
-    let accepted = admit(&server.desired(None).await.unwrap().unwrap(), None).unwrap();
+    let accepted = admit(&server.desired(None).await.unwrap().unwrap().envelope, None).unwrap();
     assert_eq!(accepted.generation, Generation(3));
 
     let (status, kind, body) = sealed(&state(&robot, 4), &key);
     let at = body.find("payload\":\"").unwrap() + 20;
     let other = if &body[at..=at] == "A" { "B" } else { "A" };
     fake.set((status, kind, format!("{}{other}{}", &body[..at], &body[at + 1..])));
-    let altered = admit(&server.desired(None).await.unwrap().unwrap(), Some(&accepted));
+    let altered = admit(&server.desired(None).await.unwrap().unwrap().envelope, Some(&accepted));
     assert!(matches!(altered, Err(Refused::Signature(_))), "{altered:?}");
 
     fake.set(sealed(&state(&RobotId::random(), 4), &key));
-    let foreign = admit(&server.desired(None).await.unwrap().unwrap(), Some(&accepted));
+    let foreign = admit(&server.desired(None).await.unwrap().unwrap().envelope, Some(&accepted));
     assert!(matches!(foreign, Err(Refused::OtherRobot(_))));
 
     fake.set(sealed(&state(&robot, 2), &key));
-    let old = admit(&server.desired(None).await.unwrap().unwrap(), Some(&accepted));
+    let old = admit(&server.desired(None).await.unwrap().unwrap().envelope, Some(&accepted));
     assert!(matches!(old, Err(Refused::Stale { .. })));
 }
 
@@ -179,5 +181,32 @@ async fn polling_goes_on_after_every_kind_of_answer() {
     }
     shared.shutdown.cancel();
     drop(messages);
+    polling.await.unwrap();
+}
+
+#[tokio::test]
+async fn a_state_is_sent_once_and_again_only_to_a_robot_that_does_not_keep_to_it() {
+    let (key, robot) = (SigningKey::random(), RobotId::random());
+    let (fake, url) = Fake::start(sealed(&state(&robot, 1), &key)).await;
+    let shared = Shared::new(CancellationToken::new());
+    let (heard, mut messages) = mpsc::channel(1);
+    let never = Duration::from_secs(3600);
+    let polling =
+        tokio::spawn(link::poll(server(&url, &robot), shared.clone(), Intervals { slow: never, fast: never }, heard));
+    let mut next = async || tokio::time::timeout(PATIENCE, messages.recv()).await.unwrap().unwrap();
+    assert!(matches!(next().await, Heard::Desired(_)));
+
+    shared.settled.send_replace(true);
+    fake.set((304, "application/json", String::new()));
+    shared.poll.notify_one();
+    assert!(matches!(next().await, Heard::Unchanged));
+
+    // As when half of its lifetime is over.
+    shared.settled.send_replace(false);
+    fake.set(sealed(&state(&robot, 1), &key));
+    shared.poll.notify_one();
+    assert!(matches!(next().await, Heard::Desired(_)));
+    assert_eq!(*fake.asked_with.lock().unwrap(), [None, Some(TAG.to_owned()), None]);
+    shared.shutdown.cancel();
     polling.await.unwrap();
 }

@@ -88,20 +88,21 @@ impl Underlays {
     }
 }
 
-/// The distribution a setup file belongs to: what its installation says, else the directory's name below `ros`, else
-/// the ROS wheels in its virtual environment.
+/// The distribution a setup file belongs to: what its installation says, else the ROS wheels in its virtual environment
+/// (which may well be called `ros`), else the directory's name below `ros`.
 fn distro_of(setup: &Path) -> Option<String> {
     let dir = setup.parent()?;
     let said = fs::read_to_string(dir.join("share/ros_environment/environment/1.ros_distro.dsv")).ok();
     if let Some(distro) = said.as_deref().and_then(|text| text.trim().strip_prefix("set;ROS_DISTRO;")) {
         return Some(distro.to_owned());
     }
-    if dir.parent()?.file_name() == Some(OsStr::new("ros")) {
-        return dir.file_name()?.to_str().map(str::to_owned);
-    }
     let pythons = children(&dir.parent()?.join("lib"));
-    let installed = pythons.iter().flat_map(|python| children(&python.join("site-packages")));
-    installed.filter_map(|path| wheel_distro(path.file_name()?.to_str()?)).next()
+    let mut installed = pythons.iter().flat_map(|python| children(&python.join("site-packages")));
+    if let Some(distro) = installed.find_map(|path| wheel_distro(path.file_name()?.to_str()?)) {
+        return Some(distro);
+    }
+    let is_below_ros = dir.parent()?.file_name() == Some(OsStr::new("ros"));
+    is_below_ros.then(|| dir.file_name()?.to_str().map(str::to_owned)).flatten()
 }
 
 /// `ros_kilted_rclpy-9.1.2.dist-info` is of `kilted`.
@@ -143,8 +144,10 @@ mod tests {
     #[test]
     fn a_virtual_environment_is_an_underlay_and_a_missing_file_is_named() {
         let temp = tempfile::tempdir().unwrap();
-        let activate = touch(temp.path().join("bin/activate"));
-        touch(temp.path().join("lib/python3.11/site-packages/ros_kilted_rclpy-9.1.2.dist-info/METADATA"));
+        // Its name must not be taken for the place where distributions are installed.
+        let venv = temp.path().join("ros");
+        let activate = touch(venv.join("bin/activate"));
+        touch(venv.join("lib/python3.11/site-packages/ros_kilted_rclpy-9.1.2.dist-info/METADATA"));
         let underlays = Underlays::find(std::slice::from_ref(&activate), Path::new(SYSTEM_ROOT));
         assert_eq!(underlays.distros(), ["kilted"]);
         assert_eq!(underlays.for_task(&[]), Ok(vec![activate]));

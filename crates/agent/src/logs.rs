@@ -10,6 +10,9 @@ use crate::run_dir::LogSpec;
 
 const READ_BYTES: usize = 64 * 1024;
 
+/// Stands before each run's output.
+const RUN_MARK: &str = "[taskd: started]\n";
+
 /// A log file that is rotated by size.
 #[derive(Debug)]
 pub struct RotatedLog {
@@ -24,7 +27,7 @@ struct Current {
     size: u64,
 }
 
-/// The last lines of the log at `path`, at most `max_bytes` of them; empty when there is no log.
+/// The last lines of the last run in the log at `path`, at most `max_bytes` of them; empty when there is no log.
 pub fn last_lines(path: &Path, max_bytes: u64) -> String {
     let read = || {
         let mut file = File::open(path)?;
@@ -34,7 +37,8 @@ pub fn last_lines(path: &Path, max_bytes: u64) -> String {
         file.take(max_bytes).read_to_end(&mut bytes)?;
         // What was cut in the middle of a line is not worth showing, unless there is nothing else.
         let cut = if begin == 0 { 0 } else { bytes.iter().position(|byte| *byte == b'\n').map_or(0, |at| at + 1) };
-        Ok::<_, io::Error>(String::from_utf8_lossy(&bytes[cut..]).into_owned())
+        let text = String::from_utf8_lossy(&bytes[cut..]);
+        Ok::<_, io::Error>(text.rsplit_once(RUN_MARK).map_or(&*text, |(_, last_run)| last_run).to_owned())
     };
     read().unwrap_or_default()
 }
@@ -45,8 +49,9 @@ impl RotatedLog {
         Self { spec, current: None, dropped_bytes: 0 }
     }
 
-    /// Copies `output` into the log until it ends.
+    /// Copies one run's `output` into the log until it ends.
     pub fn copy_from(&mut self, mut output: impl Read) {
+        self.write(RUN_MARK.as_bytes());
         let mut buffer = vec![0; READ_BYTES];
         loop {
             match output.read(&mut buffer) {
@@ -151,7 +156,7 @@ mod tests {
         let temp = tempfile::tempdir().expect("temp dir");
         let path = temp.path().join("task.log");
         let mut log = RotatedLog::new(LogSpec { path: path.clone(), max_bytes: 10, files: 3 });
-        log.copy_from(&b"one\ntwo\nthree\nfour\nfive\nsix\n"[..]);
+        log.write(b"one\ntwo\nthree\nfour\nfive\nsix\n");
         assert_eq!(read(path.clone()), "six\n");
         assert_eq!(read(log.aged(1)), "four\nfive\n");
         assert_eq!(read(log.aged(2)), "three\n");
@@ -187,6 +192,11 @@ mod tests {
         assert_eq!(last_lines(&path, 100), "one\ntwo\nthree\n");
         assert_eq!(last_lines(&path, 8), "three\n");
         assert_eq!(last_lines(&path, 3), "");
+        std::fs::write(&path, "").unwrap();
+        for run in ["first\nno end of line", "second\n"] {
+            RotatedLog::new(LogSpec::at(path.clone())).copy_from(run.as_bytes());
+        }
+        assert_eq!(last_lines(&path, 100), "second\n", "an earlier run's lines say nothing about this one");
     }
 
     #[test]

@@ -83,7 +83,7 @@ fn task_row(record: &TaskRecord) -> String {
         "{:<24} {:<14} {phase:<11} {pid:<9} {}",
         order.task.as_str(),
         order.package.version.as_str(),
-        failure.lines().next().unwrap_or_default()
+        failure.lines().collect::<Vec<_>>().join(" ")
     );
     row.trim_end().to_owned()
 }

@@ -1,0 +1,131 @@
+//! Packages in the registry: what is checked, who may read what, and what is collected when.
+
+use reqwest::{Method, StatusCode};
+use serde_json::{Value, json};
+use task_proto::oci::{ImageManifest, MANIFEST_TYPE};
+use task_proto::{Digest, RobotId};
+use taskd::blobs::BlobSettings;
+use taskd::collector::Collected;
+use taskd::http::auth::Caller;
+
+use crate::database::{TestDatabase, on_both_databases};
+use crate::fleet::{Fleet, order_of, random_key};
+use crate::registry::{GRACE, NOW_MS, TestRegistry, operator, serve};
+
+fn task(name: &str) -> Value {
+    json!({
+        "name": name, "version": "1.0.0", "run": { "exec": ["true"] },
+        "content": { "tar_digest": Digest::of(b""), "tar_size": 0, "entries": 0 },
+    })
+}
+
+#[tokio::test]
+async fn a_task_package_is_checked_and_listed() {
+    let registry = TestRegistry::start().await;
+    let content = registry.push_blob("talker", b"content").await;
+    let mut no_command = task("talker");
+    no_command["run"] = json!({});
+    for (config, reason) in [
+        (task("listener"), "name: \"listener\" must be the repository's name"),
+        (no_command, "run: give either"),
+        (json!({ "name": "talker" }), "missing field"),
+    ] {
+        let config = registry.push_blob("talker", config.to_string().as_bytes()).await;
+        let package = ImageManifest::package(config, content);
+        let answer = registry.put_manifest("/v2/talker/manifests/1.0.0", MANIFEST_TYPE, &package).await;
+        let body: Value = answer.json().await.expect("an error body");
+        assert_eq!(body["errors"][0]["code"], "MANIFEST_INVALID");
+        assert!(body["errors"][0]["message"].as_str().expect("text").contains(reason), "{body} for {reason}");
+    }
+    assert_eq!(registry.registry.store.packages().await.expect("packages"), []);
+
+    let config = registry.push_blob("talker", task("talker").to_string().as_bytes()).await;
+    let package = ImageManifest::package(config, content);
+    for _ in 0..2 {
+        let answer = registry.put_manifest("/v2/talker/manifests/1.0.0", MANIFEST_TYPE, &package).await;
+        assert_eq!(answer.status(), StatusCode::CREATED);
+    }
+    let packages = registry.registry.store.packages().await.expect("packages");
+    let [view] = &packages[..] else { panic!("{packages:?}") };
+    assert_eq!((view.package.config, view.package.content), (config, content));
+    assert_eq!((view.pushed_at_ms, view.package.version.as_str()), (NOW_MS, "1.0.0"));
+    let found = registry.registry.store.package(&view.package.name, &view.package.manifest.digest).await;
+    assert_eq!(found.expect("a package").as_ref(), Some(view));
+
+    let manifest = format!("/v2/talker/manifests/{}", view.package.manifest.digest);
+    assert_eq!(registry.status(Method::DELETE, &manifest).await, StatusCode::ACCEPTED);
+    assert_eq!(registry.registry.store.packages().await.expect("packages"), []);
+}
+
+async fn a_package_in_use_outlives_its_manifest(database: TestDatabase) {
+    let data = tempfile::tempdir().expect("a directory");
+    let store = database.store.clone();
+    let registry = TestRegistry::start_on(store, data, BlobSettings::default(), Some(operator())).await;
+    let config = registry.push_blob("talker", task("talker").to_string().as_bytes()).await;
+    let content = registry.push_blob("talker", b"content").await;
+    let package = ImageManifest::package(config, content);
+    let answer = registry.put_manifest("/v2/talker/manifests/1.0.0", MANIFEST_TYPE, &package).await;
+    assert_eq!(answer.status(), StatusCode::CREATED);
+    let tags: Value = registry.get("/v2/talker/tags/list").await.json().await.expect("JSON");
+    assert_eq!(tags["tags"], json!(["1.0.0"]));
+
+    let fleet = Fleet::new(database);
+    let robots = fleet.enroll(1).await;
+    let ordered = registry.registry.store.packages().await.expect("packages").remove(0);
+    fleet.actions.create_deployment(&random_key(), &order_of(&ordered), &ordered).await.expect("ordered");
+    let robot = serve(registry.registry.clone(), Some(Caller::Robot(robots[0].id.clone()))).await;
+    let stranger = serve(registry.registry.clone(), Some(Caller::Robot(RobotId::random()))).await;
+
+    let manifest = ordered.package.manifest.digest;
+    let path = format!("/v2/talker/manifests/{manifest}");
+    assert_eq!(registry.status(Method::DELETE, &path).await, StatusCode::ACCEPTED);
+    assert_eq!(registry.status(Method::GET, &path).await, StatusCode::NOT_FOUND);
+    let loose = registry.push_blob("talker", b"loose").await.digest;
+    let year_ms = 365 * 24 * 3_600_000;
+    assert_eq!(registry.collect(NOW_MS + year_ms).await.blobs, 1);
+    for (digest, expected) in [
+        (manifest, StatusCode::OK),
+        (config.digest, StatusCode::OK),
+        (content.digest, StatusCode::OK),
+        (loose, StatusCode::FORBIDDEN),
+    ] {
+        let path = format!("/v2/talker/blobs/{digest}");
+        assert_eq!(registry.status(Method::GET, &format!("{robot}{path}")).await, expected, "{digest}");
+        assert_eq!(registry.status(Method::GET, &format!("{stranger}{path}")).await, StatusCode::FORBIDDEN);
+    }
+}
+
+on_both_databases!(a_package_in_use_outlives_its_manifest);
+
+#[tokio::test]
+async fn what_nothing_refers_to_is_collected_after_its_grace() {
+    let registry = TestRegistry::start().await;
+    let grace_ms = u64::try_from(GRACE.as_millis()).expect("small");
+    let manifest = registry.push_image("a", "kept").await;
+    let loose = registry.push_blob("a", b"loose").await.digest;
+    let blob = format!("/v2/a/blobs/{loose}");
+    assert_eq!(registry.collect(NOW_MS + grace_ms).await, Collected { uploads: 0, blobs: 0 });
+
+    // Somebody who is about to push asks for it: the grace begins anew.
+    registry.registry.clock.advance_ms(grace_ms);
+    assert_eq!(registry.status(Method::HEAD, &blob).await, StatusCode::OK);
+    assert_eq!(registry.collect(NOW_MS + grace_ms + 1).await.blobs, 0);
+    assert_eq!(registry.collect(NOW_MS + 2 * grace_ms + 1).await.blobs, 1);
+    assert_eq!(registry.status(Method::GET, &blob).await, StatusCode::NOT_FOUND);
+    assert_eq!(registry.status(Method::GET, "/v2/a/manifests/kept").await, StatusCode::OK);
+
+    // A deleted manifest, its config and its layer go after a grace of their own.
+    let path = format!("/v2/a/manifests/{manifest}");
+    assert_eq!(registry.status(Method::DELETE, &path).await, StatusCode::ACCEPTED);
+    assert_eq!(registry.collect(NOW_MS + 2 * grace_ms).await.blobs, 0);
+    assert_eq!(registry.collect(NOW_MS + 2 * grace_ms + 1).await.blobs, 3);
+}
+
+#[tokio::test]
+async fn uploads_that_were_given_up_are_collected() {
+    let registry = TestRegistry::start().await;
+    let upload = registry.begin("a").await;
+    // The file's time is the machine's, which is before the test's.
+    assert_eq!(registry.collect(NOW_MS).await, Collected { uploads: 1, blobs: 0 });
+    assert_eq!(registry.status(Method::GET, &upload).await, StatusCode::NOT_FOUND);
+}

@@ -1,0 +1,156 @@
+//! A registry over a real listener, and a client that says what it wants of it.
+
+use std::time::Duration;
+
+use axum::Router;
+use axum::extract::Request;
+use axum::middleware::{map_request, map_request_with_state};
+use axum::routing::any;
+use reqwest::{Client, Method, RequestBuilder, Response, StatusCode};
+use serde_json::{Value, json};
+use task_proto::Digest;
+use task_proto::desired::BlobRef;
+use task_proto::oci::MANIFEST_TYPE;
+use taskd::blobs::{BlobSettings, Blobs};
+use taskd::clock::Clock;
+use taskd::collector::{self, Collected};
+use taskd::http::auth::Caller;
+use taskd::http::drain::drain_unread;
+use taskd::http::oci::{self, Registry};
+use taskd::store::{Store, sqlite_url};
+use tempfile::TempDir;
+
+pub const GRACE: Duration = Duration::from_secs(3600);
+/// Past what any file's time can be when a test runs.
+pub const NOW_MS: u64 = 4_000_000_000_000;
+
+pub struct TestRegistry {
+    pub base: String,
+    pub client: Client,
+    pub registry: Registry,
+    pub data: TempDir,
+}
+
+impl TestRegistry {
+    /// A registry whose every caller is an operator.
+    pub async fn start() -> Self {
+        Self::start_with(BlobSettings::default(), Some(operator())).await
+    }
+
+    pub async fn start_with(settings: BlobSettings, caller: Option<Caller>) -> Self {
+        let data = tempfile::tempdir().expect("a directory");
+        let store = Store::open(&sqlite_url(&data.path().join("taskd.db"))).await.expect("a store");
+        Self::start_on(store, data, settings, caller).await
+    }
+
+    pub async fn start_on(store: Store, data: TempDir, settings: BlobSettings, caller: Option<Caller>) -> Self {
+        let blobs = Blobs::open(data.path(), settings).expect("a blob store");
+        let registry = Registry { store, blobs, clock: Clock::fixed(NOW_MS) };
+        Self { base: serve(registry.clone(), caller).await, client: client(), registry, data }
+    }
+
+    pub fn ask(&self, method: Method, path: &str) -> RequestBuilder {
+        let url = if path.starts_with('/') { format!("{}{path}", self.base) } else { path.to_owned() };
+        self.client.request(method, url)
+    }
+
+    pub async fn get(&self, path: &str) -> Response {
+        self.ask(Method::GET, path).send().await.expect("an answer")
+    }
+
+    pub async fn status(&self, method: Method, path: &str) -> StatusCode {
+        self.ask(method, path).send().await.expect("an answer").status()
+    }
+
+    pub async fn begin(&self, repository: &str) -> String {
+        let path = format!("/v2/{repository}/blobs/uploads/");
+        let answer = self.ask(Method::POST, &path).send().await.expect("an answer");
+        assert_eq!(answer.status(), StatusCode::ACCEPTED);
+        header(&answer, "location")
+    }
+
+    pub async fn push_blob(&self, repository: &str, bytes: &[u8]) -> BlobRef {
+        let digest = Digest::of(bytes);
+        let path = format!("/v2/{repository}/blobs/uploads/?digest={digest}");
+        let answer = self.ask(Method::POST, &path).body(bytes.to_vec()).send().await.expect("an answer");
+        assert_eq!(answer.status(), StatusCode::CREATED);
+        BlobRef { digest, size: bytes.len() as u64 }
+    }
+
+    pub async fn put_manifest(&self, path: &str, media_type: &str, manifest: &impl serde::Serialize) -> Response {
+        let body = serde_json::to_vec(manifest).expect("JSON");
+        self.ask(Method::PUT, path).header("content-type", media_type).body(body).send().await.expect("an answer")
+    }
+
+    /// Pushes an image of two small blobs, tagged `tag`.
+    pub async fn push_image(&self, repository: &str, tag: &str) -> Digest {
+        let config = self.push_blob(repository, b"{}").await;
+        let layer = self.push_blob(repository, tag.as_bytes()).await;
+        let image = image(config, layer);
+        let answer = self.put_manifest(&format!("/v2/{repository}/manifests/{tag}"), MANIFEST_TYPE, &image).await;
+        assert_eq!(answer.status(), StatusCode::CREATED);
+        header(&answer, "docker-content-digest").parse().expect("a digest")
+    }
+
+    pub async fn collect(&self, now_ms: u64) -> Collected {
+        collector::collect(&self.registry.store, &self.registry.blobs, now_ms, GRACE).await.expect("collected")
+    }
+}
+
+/// Serves a registry to one caller and says where.
+pub async fn serve(registry: Registry, caller: Option<Caller>) -> String {
+    let router = Router::new()
+        .route("/v2/", any(oci::version))
+        .route("/v2/{*path}", any(oci::dispatch))
+        .with_state(registry)
+        .layer(map_request_with_state(caller, let_in))
+        .layer(map_request(drain_unread));
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("a port");
+    let base = format!("http://{}", listener.local_addr().expect("an address"));
+    tokio::spawn(async move { axum::serve(listener, router).await });
+    base
+}
+
+pub fn client() -> Client {
+    // Another test may have installed it before.
+    let _ = rustls::crypto::ring::default_provider().install_default();
+    Client::new()
+}
+
+pub async fn let_in(
+    axum::extract::State(caller): axum::extract::State<Option<Caller>>,
+    mut request: Request,
+) -> Request {
+    if let Some(caller) = caller {
+        request.extensions_mut().insert(caller);
+    }
+    request
+}
+
+pub fn operator() -> Caller {
+    Caller::Operator
+}
+
+pub fn image(config: BlobRef, layer: BlobRef) -> Value {
+    json!({
+        "schemaVersion": 2,
+        "mediaType": MANIFEST_TYPE,
+        "config": { "mediaType": "application/vnd.example.config", "digest": config.digest, "size": config.size },
+        "layers": [{ "mediaType": "application/vnd.example.layer", "digest": layer.digest, "size": layer.size }],
+    })
+}
+
+pub fn header(answer: &Response, name: &str) -> String {
+    answer.headers().get(name).unwrap_or_else(|| panic!("no {name}")).to_str().expect("text").to_owned()
+}
+
+/// The answer's status and its first error code.
+pub async fn refusal(answer: Response) -> (u16, String) {
+    let status = answer.status().as_u16();
+    let body: Value = answer.json().await.expect("an error body");
+    (status, body["errors"][0]["code"].as_str().expect("a code").to_owned())
+}
+
+pub fn refused(status: u16, code: &str) -> (u16, String) {
+    (status, code.to_owned())
+}

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use clap::{Parser, Subcommand};
+use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use taskd::clock::Clock;
 use taskd::commands;
 use taskd::config::{Config, ServeFlags};
@@ -55,6 +56,7 @@ async fn serve(flags: &ServeFlags) -> anyhow::Result<ExitCode> {
         .with_ansi(std::io::stderr().is_terminal())
         .init();
     let config = Config::load(flags, std::env::vars_os())?;
+    allow_open_files(config.max_http_connections + config.max_mqtt_connections);
     // Installed before anything is started, so that an early signal stops it softly as well.
     let mut signals = Signals::install().context("signals can't be caught")?;
     let server = Server::start(config, Clock::system()).await?;
@@ -70,6 +72,23 @@ async fn serve(flags: &ServeFlags) -> anyhow::Result<ExitCode> {
     tokio::select! {
         () = server.stop() => Ok(code),
         () = signals.next() => Ok(ExitCode::FAILURE),
+    }
+}
+
+/// Lets the process have as many open files as the system grants it: usually 1,024 are free to use, and each robot takes one.
+fn allow_open_files(connections: usize) {
+    let granted = getrlimit(Resource::RLIMIT_NOFILE).and_then(|(allowed, most)| {
+        if allowed < most {
+            setrlimit(Resource::RLIMIT_NOFILE, most, most)?;
+        }
+        Ok(most)
+    });
+    match granted {
+        Ok(files) if files < connections as u64 => {
+            tracing::warn!(files, connections, "fewer files may be open than connections are allowed; see ulimit -n");
+        }
+        Ok(_) => {}
+        Err(error) => tracing::warn!(%error, "the limit on open files can't be raised"),
     }
 }
 

@@ -10,7 +10,7 @@ use axum::extract::State;
 use axum::response::sse::{Event as SentEvent, KeepAlive, Sse};
 use futures_util::{Stream, StreamExt as _};
 use task_proto::RobotId;
-use task_proto::api::{Event, RobotView};
+use task_proto::api::Event;
 use tokio::sync::{Semaphore, broadcast};
 use tokio_stream::wrappers::BroadcastStream;
 use tokio_util::sync::CancellationToken;
@@ -29,8 +29,6 @@ const GATHER: Duration = Duration::from_millis(200);
 const BACKLOG: usize = 16 * 1024;
 /// The most listeners at once.
 const MOST_LISTENERS: usize = 512;
-/// From this many changed robots on, all are read in one go.
-const READ_ALL_FROM: usize = 64;
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
 
 /// An event as it goes to every listener: written once.
@@ -113,7 +111,8 @@ impl EventFeed {
             }
         }
         let now_ms = source.clock.now_ms();
-        for mut robot in changed_robots(&source.store, &robots).await? {
+        let robots: Vec<RobotId> = robots.into_iter().collect();
+        for mut robot in source.store.robots_among(&robots).await? {
             complete_robot(&mut robot, &source.presence, now_ms);
             self.send(&Event::Robot { robot: Box::new(robot) });
         }
@@ -133,19 +132,6 @@ impl Default for EventFeed {
     fn default() -> Self {
         Self::new()
     }
-}
-
-async fn changed_robots(store: &Store, changed: &BTreeSet<RobotId>) -> Result<Vec<RobotView>, StoreError> {
-    if changed.len() >= READ_ALL_FROM {
-        let mut robots = store.robots().await?;
-        robots.retain(|robot| changed.contains(&robot.id));
-        return Ok(robots);
-    }
-    let mut robots = Vec::with_capacity(changed.len());
-    for id in changed {
-        robots.extend(store.robot(id).await?);
-    }
-    Ok(robots)
 }
 
 fn name_of(event: &Event) -> &'static str {

@@ -83,7 +83,7 @@ CREATE TABLE assignments (
     PRIMARY KEY (deployment_id, robot_id)
 );
 CREATE UNIQUE INDEX assignments_desired ON assignments (robot_id, task) WHERE desired = 1;
-CREATE INDEX assignments_by_robot ON assignments (robot_id);
+CREATE INDEX assignments_live ON assignments (robot_id) WHERE desired = 1 OR ended = 0;
 CREATE INDEX assignments_open ON assignments (robot_id) WHERE ended = 0;
 CREATE INDEX assignments_waiting ON assignments (deployment_id, place) WHERE released = 0 AND ended = 0;
 CREATE INDEX assignments_expiring ON assignments (expires_at_ms) WHERE ended = 0;

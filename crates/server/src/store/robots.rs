@@ -224,11 +224,12 @@ const ROBOT_ROWS: &str = "SELECT r.id, r.name, r.mac, r.labels, r.enrolled_at_ms
          r.report, r.last_seen_ms
      FROM robots r WHERE r.removed_at_ms IS NULL";
 
-/// What each robot should have, and what it is still getting rid of.
+/// What each robot should have, and what it is still getting rid of. The first condition is that of an index, word for
+/// word: without it all that was ever ordered would be read.
 const TASK_ROWS: &str = "SELECT a.robot_id, a.task, a.deployment_id, a.wanted, a.run, a.phase, a.progress, a.failure,
          d.version
      FROM assignments a JOIN deployments d ON d.id = a.deployment_id
-     WHERE (a.desired = 1 OR (a.ended = 0 AND a.released = 1))";
+     WHERE (a.desired = 1 OR a.ended = 0) AND (a.desired = 1 OR a.released = 1)";
 
 fn matching(rows: Vec<sqlx::any::AnyRow>, selector: &Selector) -> Result<Vec<KnownRobot>, StoreError> {
     let mut robots = rows.iter().map(known_robot).collect::<Result<Vec<_>, _>>()?;

@@ -6,8 +6,9 @@ use std::str::FromStr;
 
 use super::StoreError;
 
-/// The most rows one statement carries; with [`groups`], a statement comes in few lengths, so its plan is reused.
-const MAX_ROWS: usize = 512;
+/// The most rows one statement carries; with [`groups`], a statement comes in few lengths, so its plan is reused. More would
+/// be slower: for each parameter SQLite looks through the names of all.
+const MAX_ROWS: usize = 64;
 
 /// A stored number, which is never negative.
 pub(super) fn number(stored: i64) -> u64 {
@@ -52,10 +53,10 @@ pub(super) fn id<T: FromStr>(column: &'static str, text: &str) -> Result<T, Stor
     text.parse().map_err(|_| StoreError::Unreadable { column })
 }
 
-/// Cuts rows into groups of 512, 64, 8 and 1.
+/// Cuts rows into groups of 64, 8 and 1.
 pub(super) fn groups<T>(mut rows: &[T]) -> impl Iterator<Item = &[T]> {
     std::iter::from_fn(move || {
-        let size = [MAX_ROWS, MAX_ROWS / 8, MAX_ROWS / 64, 1].into_iter().find(|&size| size <= rows.len())?;
+        let size = [MAX_ROWS, MAX_ROWS / 8, 1].into_iter().find(|&size| size <= rows.len())?;
         let (group, rest) = rows.split_at(size);
         rows = rest;
         Some(group)
@@ -82,9 +83,9 @@ mod tests {
 
     #[test]
     fn groups_cover_all_rows_in_few_lengths() {
-        let rows: Vec<u32> = (0..1_100).collect();
+        let rows: Vec<u32> = (0..139).collect();
         let lengths: Vec<usize> = groups(&rows).map(<[u32]>::len).collect();
-        assert_eq!(lengths, [512, 512, 64, 8, 1, 1, 1, 1]);
+        assert_eq!(lengths, [64, 64, 8, 1, 1, 1]);
         assert_eq!(groups(&rows).flatten().copied().collect::<Vec<_>>(), rows);
     }
 

@@ -43,6 +43,8 @@ pub struct Config {
     pub max_http_connections: usize,
     /// The most MQTT connections at once; more are refused.
     pub max_mqtt_connections: usize,
+    /// The most connections of one address that have said nothing yet, at each listener; the oldest is closed for a further one.
+    pub max_silent_per_address: usize,
     /// The most bytes one blob may have.
     pub max_blob_bytes: u64,
 }
@@ -262,6 +264,12 @@ const SETTINGS: &[Setting] = &[
         set: |config, text| count(text, 1_000_000).map(|n| config.max_mqtt_connections = n as usize),
     },
     Setting {
+        name: "max-silent-per-address",
+        value_name: "N",
+        help: "Most connections of one address that have sent nothing yet [default: 2048]",
+        set: |config, text| count(text, 1_000_000).map(|n| config.max_silent_per_address = n as usize),
+    },
+    Setting {
         name: "max-blob-bytes",
         value_name: "BYTES",
         help: "Most bytes of one blob [default: 17179869184]",
@@ -296,6 +304,7 @@ impl Config {
             blob_grace: DAY,
             max_http_connections: 20_000,
             max_mqtt_connections: 20_000,
+            max_silent_per_address: 2048,
             max_blob_bytes: 16 << 30,
         }
     }

@@ -2,6 +2,7 @@
 
 pub mod actions;
 pub mod advance;
+pub mod anteroom;
 pub mod blobs;
 pub mod broker;
 pub mod changes;

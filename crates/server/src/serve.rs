@@ -122,7 +122,7 @@ impl Server {
         };
         start_tasks(&tasks, &app, config.blob_grace);
         let router = crate::http::router(app);
-        let http = listener::serve(http, router, config.max_http_connections, stop.clone(), REQUEST_PATIENCE);
+        let http = listener::serve(http, router, http_limits(&config), stop.clone(), REQUEST_PATIENCE);
         let addresses =
             Addresses { http: reachable(http_address).to_string(), mqtt: reachable(broker.local_addr()).to_string() };
         data.publish(&addresses)?;
@@ -260,8 +260,19 @@ fn blob_settings(config: &Config) -> BlobSettings {
     BlobSettings { reading: config.blob_read, max_blob_bytes: config.max_blob_bytes, ..BlobSettings::default() }
 }
 
+fn http_limits(config: &Config) -> listener::Limits {
+    listener::Limits {
+        max_connections: config.max_http_connections,
+        max_silent_per_address: config.max_silent_per_address,
+    }
+}
+
 fn broker_config(config: &Config) -> BrokerConfig {
-    let limits = Limits { max_connections: config.max_mqtt_connections, ..Limits::default() };
+    let limits = Limits {
+        max_connections: config.max_mqtt_connections,
+        max_silent_per_address: config.max_silent_per_address,
+        ..Limits::default()
+    };
     BrokerConfig { listen: config.mqtt, prefix: config.topic_prefix.clone(), limits }
 }
 

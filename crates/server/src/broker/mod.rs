@@ -114,6 +114,8 @@ pub struct BrokerConfig {
 pub struct Limits {
     /// Connections at a time, those not yet admitted included.
     pub max_connections: usize,
+    /// Those of one address that have not sent CONNECT yet; a further one takes the place of the oldest.
+    pub max_silent_per_address: usize,
     /// Operators among them.
     pub max_operators: usize,
     /// The largest packet of an admitted client, in bytes after the fixed header.
@@ -140,6 +142,7 @@ impl Default for Limits {
     fn default() -> Self {
         Self {
             max_connections: 20_000,
+            max_silent_per_address: 2048,
             max_operators: 256,
             max_packet_bytes: 256 * 1024,
             max_filters: 64,

@@ -4,9 +4,9 @@ use std::convert::Infallible;
 use std::io;
 use std::net::SocketAddr;
 use std::pin::Pin;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Context, Poll, ready};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use axum::Router;
 use axum::body::Body;
@@ -26,6 +26,8 @@ use tokio::time::Sleep;
 use tokio_util::sync::CancellationToken;
 use tower::ServiceExt as _;
 
+use crate::anteroom::{Anteroom, Place};
+
 /// How long a request's head may take, also the first one of a connection, and how long one is kept without a request.
 const HEAD_TIMEOUT: Duration = Duration::from_secs(20);
 /// How long a client may pause within a body it sends.
@@ -37,15 +39,19 @@ const MOST_HEAD_BYTES: usize = 64 * 1024;
 /// Pause after an accept that failed because of us, for example for want of file descriptors.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
+/// How many connections there may be.
+#[derive(Debug, Clone, Copy)]
+pub struct Limits {
+    /// At a time; more wait in the listener's backlog.
+    pub max_connections: usize,
+    /// Those of one address that have not sent a request yet; a further one takes the place of the oldest.
+    pub max_silent_per_address: usize,
+}
+
 /// Serves until `stop`, then lets requests under way end, for at most `patience`.
-pub async fn serve(
-    listener: TcpListener,
-    router: Router,
-    max_connections: usize,
-    stop: CancellationToken,
-    patience: Duration,
-) {
-    let places = Arc::new(Semaphore::new(max_connections));
+pub async fn serve(listener: TcpListener, router: Router, limits: Limits, stop: CancellationToken, patience: Duration) {
+    let places = Arc::new(Semaphore::new(limits.max_connections));
+    let anteroom = Anteroom::new(limits.max_silent_per_address);
     let graceful = GracefulShutdown::new();
     let abort = CancellationToken::new();
     loop {
@@ -54,12 +60,15 @@ pub async fn serve(
             accepted = accept(&listener, &places) => accepted,
         };
         let (stream, peer, place) = accepted;
-        let connection = graceful.watch(connection(stream, peer, router.clone()));
+        let silent = anteroom.enter(peer.ip(), Instant::now());
+        let leave = silent.leave().clone();
+        let connection = graceful.watch(connection(stream, peer, silent, router.clone()));
         let abort = abort.clone();
         tokio::spawn(async move {
             // A client that breaks off or dawdles is no event worth a line in the log.
             let _ = tokio::select! {
                 ended = connection => ended,
+                () = leave.cancelled() => Ok(()),
                 () = abort.cancelled() => Ok(()),
             };
             drop(place);
@@ -98,6 +107,7 @@ fn is_the_clients_fault(error: &io::Error) -> bool {
 fn connection(
     stream: TcpStream,
     peer: SocketAddr,
+    silent: Place,
     router: Router,
 ) -> http1::Connection<
     TokioIo<PatientStream>,
@@ -105,7 +115,9 @@ fn connection(
 > {
     // Answers are small and wanted at once; a failure here costs only latency.
     let _ = stream.set_nodelay(true);
+    let silent = Mutex::new(Some(silent));
     let service = hyper::service::service_fn(move |request: Request<Incoming>| {
+        drop(silent.lock().unwrap_or_else(PoisonError::into_inner).take());
         let mut request = request.map(|body| Body::new(PatientBody::new(body)));
         request.extensions_mut().insert(ConnectInfo(peer));
         router.clone().oneshot(request)

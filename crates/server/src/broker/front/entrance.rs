@@ -3,7 +3,7 @@
 
 use std::net::SocketAddr;
 use std::sync::{Mutex, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bytes::BytesMut;
 use rumqttd::protocol::{ConnAck, ConnectReturnCode, Packet};
@@ -76,9 +76,14 @@ where
     S: AsyncRead + AsyncWrite + Unpin,
 {
     let mut input = BytesMut::new();
-    let connect = timeout(context.limits.connect_timeout, read_connect(stream, &mut input))
-        .await
-        .unwrap_or(Err(Rejection::Silent("sends no CONNECT in time")))?;
+    let place = context.anteroom.enter(peer.ip(), Instant::now());
+    let connect = tokio::select! {
+        connect = timeout(context.limits.connect_timeout, read_connect(stream, &mut input)) => {
+            connect.unwrap_or(Err(Rejection::Silent("sends no CONNECT in time")))?
+        }
+        () = place.leave().cancelled() => return Err(Rejection::Silent("gives way to a newcomer from its address")),
+    };
+    drop(place);
     if connect.client_id.is_empty() && !connect.clean_session {
         return Err(answer(ConnectReturnCode::ClientIdentifierNotValid, "an empty client id without a clean session"));
     }

@@ -25,6 +25,7 @@ use tokio_util::task::TaskTracker;
 
 use super::router::Router;
 use super::{BrokerConfig, BrokerError, Gatekeeper, Inbox, Limits, NotConnected};
+use crate::anteroom::Anteroom;
 pub(super) use entrance::{CANARY_ID, CanaryPass};
 use takeover::Seats;
 
@@ -44,6 +45,8 @@ struct Context {
     router: Arc<Router>,
     seats: Arc<Seats>,
     canary_pass: Arc<CanaryPass>,
+    /// Who has not sent CONNECT yet.
+    anteroom: Arc<Anteroom>,
     stop: CancellationToken,
 }
 
@@ -58,6 +61,7 @@ impl Front {
         let listen = |source| BrokerError::Listen { address: config.listen, source };
         let listener = TcpListener::bind(config.listen).await.map_err(listen)?;
         let local_addr = listener.local_addr().map_err(listen)?;
+        let anteroom = Anteroom::new(config.limits.max_silent_per_address);
         let context = Arc::new(Context {
             prefix: config.prefix,
             limits: config.limits,
@@ -66,6 +70,7 @@ impl Front {
             router,
             seats: Arc::default(),
             canary_pass: Arc::default(),
+            anteroom,
             stop: CancellationToken::new(),
         });
         let front = Arc::new(Self { local_addr, context, sessions: TaskTracker::new() });

@@ -3,6 +3,7 @@
 pub mod actions;
 pub mod advance;
 pub mod anteroom;
+pub mod backlog;
 pub mod blobs;
 pub mod broker;
 pub mod changes;

@@ -6,13 +6,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use task_proto::api::MqttEndpoint;
-use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 use tokio::time::{Interval, MissedTickBehavior};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use crate::actions::{ActionSettings, Actions};
+use crate::backlog::listen;
 use crate::blobs::{BlobError, BlobSettings, Blobs};
 use crate::broker::{Broker, BrokerConfig, BrokerError, Health, Limits};
 use crate::changes::{Change, Changes};
@@ -90,8 +90,7 @@ impl Server {
                 .await?;
         register_operator(&store, &data, &clock).await?;
         let blobs = Blobs::open(data.path(), blob_settings(&config))?;
-        let http = TcpListener::bind(config.http).await;
-        let http = http.map_err(|source| ServeError::Listen { address: config.http, source })?;
+        let http = listen(config.http).map_err(|source| ServeError::Listen { address: config.http, source })?;
         let http_address = http.local_addr().map_err(|source| ServeError::Listen { address: config.http, source })?;
 
         let changes = Changes::new();

@@ -19,13 +19,13 @@ use std::time::Duration;
 use bytes::Bytes;
 use task_proto::RobotId;
 use task_proto::topic::TopicPrefix;
-use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use super::router::Router;
 use super::{BrokerConfig, BrokerError, Gatekeeper, Inbox, Limits, NotConnected};
 use crate::anteroom::Anteroom;
+use crate::backlog::listen;
 pub(super) use entrance::{CANARY_ID, CanaryPass};
 use takeover::Seats;
 
@@ -58,9 +58,9 @@ impl Front {
         inbox: Arc<dyn Inbox>,
         router: Arc<Router>,
     ) -> Result<Arc<Self>, BrokerError> {
-        let listen = |source| BrokerError::Listen { address: config.listen, source };
-        let listener = TcpListener::bind(config.listen).await.map_err(listen)?;
-        let local_addr = listener.local_addr().map_err(listen)?;
+        let failed = |source| BrokerError::Listen { address: config.listen, source };
+        let listener = listen(config.listen).map_err(failed)?;
+        let local_addr = listener.local_addr().map_err(failed)?;
         let anteroom = Anteroom::new(config.limits.max_silent_per_address);
         let context = Arc::new(Context {
             prefix: config.prefix,

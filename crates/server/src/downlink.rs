@@ -4,19 +4,18 @@
 use std::sync::Arc;
 
 use bytes::Bytes;
-use futures_util::StreamExt as _;
 use task_proto::RobotId;
 use task_proto::desired::{Doorbell, MAX_PUSHED_ENVELOPE_BYTES};
 use tokio_util::sync::CancellationToken;
 
-use crate::actions::{ActionError, Actions, Desired};
+use crate::actions::{Actions, Desired};
 use crate::broker::Broker;
 use crate::changes::Changes;
 use crate::clock::Clock;
 use crate::presence::Presence;
 
-/// States read and signed at the same time. It bounds what an order for thousands of robots takes from everybody else.
-const AT_ONCE: usize = 8;
+/// States read in one go and signed without a pause.
+const AT_ONCE: usize = 64;
 
 /// What ringing needs.
 pub struct Downlink {
@@ -35,8 +34,11 @@ impl Downlink {
     pub async fn run(self, changes: Changes, stop: CancellationToken) {
         let ringing = async {
             loop {
-                let robots = futures_util::stream::iter(changes.take_rings().await);
-                robots.for_each_concurrent(AT_ONCE, |robot| self.ring(robot)).await;
+                let mut robots: Vec<RobotId> = changes.take_rings().await.into_iter().collect();
+                robots.retain(|robot| self.is_to_be_told(robot));
+                for robots in robots.chunks(AT_ONCE) {
+                    self.ring(robots).await;
+                }
             }
         };
         // Cut off half-way, the rest is rung on its next connect.
@@ -46,20 +48,27 @@ impl Downlink {
         }
     }
 
-    async fn ring(&self, robot: RobotId) {
+    fn is_to_be_told(&self, robot: &RobotId) -> bool {
         let now_ms = self.clock.now_ms();
-        let is_connected = self.presence.get(&robot, now_ms).is_some_and(|sighting| sighting.connection.is_some());
-        if !is_connected || self.presence.is_duplicate(&robot, now_ms) {
-            return;
-        }
-        match self.actions.desired(&robot).await {
-            Ok(desired) => match payload(&desired) {
+        let is_connected = self.presence.get(robot, now_ms).is_some_and(|sighting| sighting.connection.is_some());
+        is_connected && !self.presence.is_duplicate(robot, now_ms)
+    }
+
+    async fn ring(&self, robots: &[RobotId]) {
+        let states = match self.actions.desired_of(robots).await {
+            Ok(states) => states,
+            Err(error) => {
+                let robots = robots.len();
+                tracing::warn!(robots, %error, "desired states could not be read; the robots ask again");
+                return;
+            }
+        };
+        for (robot, desired) in states {
+            match payload(&desired) {
                 // It may have left meanwhile.
                 Ok(payload) => drop(self.broker.ring(&robot, payload)),
                 Err(error) => tracing::error!(%robot, %error, "a desired state could not be written"),
-            },
-            Err(ActionError::Diverged(_) | ActionError::RobotNotFound(_)) => {}
-            Err(error) => tracing::warn!(%robot, %error, "a desired state could not be read; the robot asks again"),
+            }
         }
     }
 }

@@ -8,6 +8,7 @@ use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope};
 use task_proto::{Generation, RobotId};
 
 use super::{ActionError, Actions};
+use crate::store::DesiredTasks;
 
 /// The most signed states that are kept. At the limit all are forgotten: signing again is cheap.
 const MAX_KEPT: usize = 16 * 1024;
@@ -48,31 +49,38 @@ impl Envelopes {
 impl Actions {
     /// What `robot` should be running, signed. Refused as `diverged` while the robot is ahead of the database.
     pub async fn desired(&self, robot: &RobotId) -> Result<Desired, ActionError> {
-        let not_found = || ActionError::RobotNotFound(robot.to_string());
-        let (generation, observed) = self.store.generations(robot).await?.ok_or_else(not_found)?;
-        if observed > generation {
-            return Err(ActionError::Diverged(robot.clone()));
+        let found = self.store.desired_tasks(std::slice::from_ref(robot)).await?.pop();
+        self.sign(found.ok_or_else(|| ActionError::RobotNotFound(robot.to_string()))?)
+    }
+
+    /// The same for many robots; those that were removed or are diverged are left out.
+    pub async fn desired_of(&self, robots: &[RobotId]) -> Result<Vec<(RobotId, Desired)>, ActionError> {
+        let found = self.store.desired_tasks(robots).await?;
+        let signed = found.into_iter().filter_map(|found| Some((found.robot.clone(), self.sign(found).ok()?)));
+        Ok(signed.collect())
+    }
+
+    fn sign(&self, found: DesiredTasks) -> Result<Desired, ActionError> {
+        let DesiredTasks { robot, generation, observed_generation, tasks } = found;
+        if observed_generation > generation {
+            return Err(ActionError::Diverged(robot));
         }
         let now_ms = self.clock.now_ms();
-        let signed_since_ms = now_ms.saturating_sub(self.settings.desired_lifetime_ms / 2);
-        if let Some(desired) = self.envelopes.get(robot, generation, signed_since_ms) {
+        let lifetime_ms = self.settings.desired_lifetime_ms;
+        if let Some(desired) = self.envelopes.get(&robot, generation, now_ms.saturating_sub(lifetime_ms / 2)) {
             return Ok(desired);
-        }
-        let found = self.store.desired_tasks(robot).await?.ok_or_else(not_found)?;
-        if found.observed_generation > found.generation {
-            return Err(ActionError::Diverged(robot.clone()));
         }
         let state = DesiredState {
             robot_id: robot.clone(),
-            generation: found.generation,
+            generation,
             issued_at_ms: now_ms,
-            expires_at_ms: now_ms + self.settings.desired_lifetime_ms,
-            tasks: found.tasks,
+            expires_at_ms: now_ms + lifetime_ms,
+            tasks,
         };
         let payload = serde_json::to_vec(&state).expect("a desired state always has a JSON form");
         let envelope = Envelope::seal(DESIRED_STATE_TYPE, &payload, &self.key);
-        let desired = Desired { generation: found.generation, envelope };
-        self.envelopes.keep(robot, now_ms, &desired);
+        let desired = Desired { generation, envelope };
+        self.envelopes.keep(&robot, now_ms, &desired);
         Ok(desired)
     }
 }

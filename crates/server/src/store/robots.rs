@@ -29,6 +29,8 @@ pub struct KnownRobot {
 /// What a robot should have, read at one moment.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DesiredTasks {
+    /// Whose they are.
+    pub robot: RobotId,
     /// The number of this state.
     pub generation: Generation,
     /// The generation the robot last reported.
@@ -90,35 +92,40 @@ impl Store {
         rows.iter().map(|row| id("assignments.robot_id", row)).collect()
     }
 
-    /// The generation `robot` should have and the one it last reported; `None` if there is no such robot.
-    pub async fn generations(&self, robot: &RobotId) -> Result<Option<(Generation, Generation)>, StoreError> {
-        let row: Option<(i64, i64)> = sqlx::query_as(
-            "SELECT generation, observed_generation FROM robots WHERE id = $1 AND removed_at_ms IS NULL",
-        )
-        .bind(robot.as_str())
-        .fetch_optional(&self.reads)
-        .await?;
-        Ok(row.map(|(generation, observed)| (Generation(number(generation)), Generation(number(observed)))))
-    }
-
-    /// What `robot` should have; `None` if there is no such robot.
-    pub async fn desired_tasks(&self, robot: &RobotId) -> Result<Option<DesiredTasks>, StoreError> {
-        // One statement, so that generation and tasks belong together.
-        let rows = sqlx::query(
-            "SELECT r.generation, r.observed_generation, a.task, a.deployment_id, a.wanted, a.run, d.package, d.delivery
-             FROM robots r
-             LEFT JOIN assignments a ON a.robot_id = r.id AND a.desired = 1
-             LEFT JOIN deployments d ON d.id = a.deployment_id
-             WHERE r.id = $1 AND r.removed_at_ms IS NULL ORDER BY a.task",
-        )
-        .bind(robot.as_str())
-        .fetch_all(&self.reads)
-        .await?;
-        let Some(first) = rows.first() else { return Ok(None) };
-        let generation = Generation(number(first.try_get("generation")?));
-        let observed_generation = Generation(number(first.try_get("observed_generation")?));
-        let tasks = rows.iter().map(desired_task).filter_map(Result::transpose).collect::<Result<_, _>>()?;
-        Ok(Some(DesiredTasks { generation, observed_generation, tasks }))
+    /// What each of `robots` should have; those that are not registered are left out.
+    pub async fn desired_tasks(&self, robots: &[RobotId]) -> Result<Vec<DesiredTasks>, StoreError> {
+        let mut found: Vec<DesiredTasks> = Vec::with_capacity(robots.len());
+        for group in groups(robots) {
+            // One statement, so that generation and tasks belong together.
+            let sql = format!(
+                "SELECT r.id, r.generation, r.observed_generation, a.task, a.deployment_id, a.wanted, a.run, d.package,
+                     d.delivery
+                 FROM robots r
+                 LEFT JOIN assignments a ON a.robot_id = r.id AND a.desired = 1
+                 LEFT JOIN deployments d ON d.id = a.deployment_id
+                 WHERE r.removed_at_ms IS NULL AND r.id IN ({}) ORDER BY r.id, a.task",
+                values(1, group.len(), &["TEXT"])
+            );
+            let mut query = sqlx::query(AssertSqlSafe(sql));
+            for robot in group {
+                query = query.bind(robot.as_str());
+            }
+            for row in query.fetch_all(&self.reads).await? {
+                let robot = id("robots.id", row.try_get("id")?)?;
+                if found.last().is_none_or(|last| last.robot != robot) {
+                    found.push(DesiredTasks {
+                        robot,
+                        generation: Generation(number(row.try_get("generation")?)),
+                        observed_generation: Generation(number(row.try_get("observed_generation")?)),
+                        tasks: Vec::new(),
+                    });
+                }
+                if let (Some(last), Some(task)) = (found.last_mut(), desired_task(&row)?) {
+                    last.tasks.push(task);
+                }
+            }
+        }
+        Ok(found)
     }
 
     /// Whether `digest` belongs to a package that `robot` should have.

@@ -21,6 +21,8 @@ use crate::script;
 
 /// How long the processes of a build may take to be gone.
 const KILL_TIMEOUT: Duration = Duration::from_secs(10);
+/// How long the rest of the output may take once no known process of the build is left.
+const DRAIN_TIMEOUT: Duration = Duration::from_secs(5);
 /// The end of the output that goes into a failure's text, which a report cuts at 4096 characters.
 const TAIL_BYTES: usize = 3500;
 
@@ -204,7 +206,11 @@ async fn run(
     };
     // The output ends when the last process that could write any has.
     containment.end(KILL_TIMEOUT).await?;
-    let tail = copying.await.map_err(|error| failed(&order.log)(error.into()))?;
+    let Ok(copied) = tokio::time::timeout(DRAIN_TIMEOUT, copying).await else {
+        // One that cleared its environment got away and holds the output open.
+        return Ok((status.map(ExitStatus::from), b"a process of the build got away and still writes".to_vec()));
+    };
+    let tail = copied.map_err(|error| failed(&order.log)(error.into()))?;
     Ok((status.map(ExitStatus::from), tail))
 }
 

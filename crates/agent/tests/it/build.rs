@@ -254,3 +254,16 @@ async fn a_build_that_is_dropped_or_takes_too_long_leaves_nothing() {
     assert_eq!(error.code(), Some(FailureCode::DEADLINE_EXCEEDED));
     assert_eq!(build.processes(), 0);
 }
+
+#[tokio::test]
+async fn a_process_that_got_away_from_a_build_holds_nobody_up() {
+    let build = TestBuild::with_colcon(
+        "env -i setsid bash -c 'echo $$ > escaped.tmp; mv escaped.tmp escaped; exec sleep 1000' & \
+         until [ -e escaped ]; do :; done; exit 3",
+    );
+    let error = build.run().await.expect_err("colcon failed");
+    let pid = std::fs::read_to_string(build.order.version.root().join("escaped")).expect("its pid");
+    let escaped = process::ProcessIdentity::of(pid.trim().parse().expect("a pid")).expect("process table");
+    escaped.expect("it still lives").signal(nix::sys::signal::Signal::SIGKILL).expect("killed");
+    assert!(matches!(error, BuildError::Failed { status: ExitStatus::Code(3), .. }), "{error:?}");
+}

@@ -1,6 +1,7 @@
 //! The robot's property file, `agent.toml` in the data directory, and the `TASK_AGENT_*` variables above it:
 //! environment > file > defaults. Unknown keys are refused by name. It is read once, at start; it never holds a secret.
 
+use std::ffi::OsString;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -146,13 +147,15 @@ impl Settings {
 
 impl Config {
     /// The settings of `data_dir` under `variables`, normally the process's environment.
-    pub fn load(data_dir: &Path, variables: impl Iterator<Item = (String, String)>) -> Result<Self, ConfigError> {
+    pub fn load(data_dir: &Path, variables: impl Iterator<Item = (OsString, OsString)>) -> Result<Self, ConfigError> {
         let path = data_dir.join(FILE_NAME);
         let mut table = read_table(&path)?;
         // The file first, alone, so that an error names where it is.
         let _: Settings = deserialize(table.clone(), &path.display().to_string())?;
         for (name, value) in variables {
-            if !name.starts_with(VARIABLE_PREFIX) || OTHER_VARIABLES.contains(&name.as_str()) {
+            // Others may hold any bytes. In a setting's value a wrong character becomes one that its type refuses.
+            let (name, value) = (name.to_string_lossy(), value.to_string_lossy());
+            if !name.starts_with(VARIABLE_PREFIX) || OTHER_VARIABLES.contains(&&*name) {
                 continue;
             }
             override_by(&mut table, &name, &value)?;
@@ -258,12 +261,16 @@ fn invalid(origin: &str, error: &dyn std::fmt::Display) -> ConfigError {
 
 #[cfg(test)]
 mod tests {
+    use std::os::unix::ffi::OsStringExt as _;
+
     use super::*;
 
     fn load(file: &str, variables: &[(&str, &str)]) -> Result<Config, ConfigError> {
         let dir = tempfile::tempdir().expect("a directory");
         std::fs::write(dir.path().join(FILE_NAME), file).expect("written");
-        Config::load(dir.path(), variables.iter().map(|(name, value)| ((*name).to_owned(), (*value).to_owned())))
+        let strange = (OsString::from("STRANGE"), OsString::from_vec(vec![0xff]));
+        let variables = variables.iter().map(|(name, value)| (name.into(), value.into()));
+        Config::load(dir.path(), variables.chain([strange]))
     }
 
     #[test]

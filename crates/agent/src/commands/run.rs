@@ -8,8 +8,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context as _;
+use task_proto::InstanceId;
 use task_proto::report::Status;
-use task_proto::{Digest, InstanceId};
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
@@ -51,11 +51,10 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
 async fn drive(arguments: Arguments) -> anyhow::Result<()> {
     let data = Layout::new(&arguments.data.data)?;
     let identity = Identity::read(&data.identity())?;
-    let config = Config::load(data.root(), std::env::vars())?;
+    let config = Config::load(data.root(), std::env::vars_os())?;
     let _lock = lock(&data)?;
     let (ledger, lost) = open_ledger(&data)?;
-    let ordered: Vec<Digest> = ledger.tasks.values().map(|record| record.order.package.content.digest).collect();
-    data.clean_leftovers().and_then(|()| data.clean_parts(&ordered)).context("cannot clean the data directory")?;
+    data.clean_leftovers().context("cannot remove what an earlier agent left half done")?;
     let base = match &config.server {
         Some(server) => server.clone(),
         None => parse_server(&identity.server)?,

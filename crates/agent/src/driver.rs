@@ -9,11 +9,11 @@ use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 use std::time::Duration;
 
-use task_proto::desired::{DesiredState, DesiredTask};
+use task_proto::desired::{DesiredState, DesiredTask, Wanted};
 use task_proto::envelope::PublicKey;
 use task_proto::id::Labels;
 use task_proto::report::{Condition, Failure, FailureCode, Progress};
-use task_proto::{InstanceId, RobotId, RobotName, TaskName};
+use task_proto::{Digest, InstanceId, RobotId, RobotName, TaskName};
 use tokio::sync::{mpsc, watch};
 use tokio::task::{AbortHandle, Id, JoinSet};
 use tokio::time::Instant;
@@ -102,6 +102,8 @@ pub struct Driver<E> {
     conditions: BTreeMap<&'static str, String>,
     /// What the server withholds, in its words.
     withheld: Option<Condition>,
+    /// The contents whose gathered bytes were kept when they were last gone through; `None`: they are to be.
+    kept_parts: Option<Vec<Digest>>,
     seq: u64,
     started: Instant,
 }
@@ -154,6 +156,7 @@ impl<E: Effects> Driver<E> {
             held,
             conditions,
             withheld: None,
+            kept_parts: None,
             seq: 0,
             started: Instant::now(),
         }
@@ -203,6 +206,7 @@ impl<E: Effects> Driver<E> {
         }
         // Written before anything is done: if that fails nothing is, and the plan sees steps that never began.
         if self.save() {
+            self.keep_ordered_parts();
             for (task, step) in begin {
                 self.begin(task, step);
             }
@@ -341,6 +345,17 @@ impl<E: Effects> Driver<E> {
         }
     }
 
+    /// Deletes what was gathered of contents that are no longer ordered.
+    fn keep_ordered_parts(&mut self) {
+        let orders = self.ledger.tasks.values().map(|record| &record.order);
+        let ordered = orders.filter(|order| order.wanted == Wanted::Running);
+        let wanted: Vec<Digest> = ordered.map(|order| order.package.content.digest).collect();
+        if self.kept_parts.as_ref() != Some(&wanted) {
+            self.effects.keep_parts(&wanted);
+            self.kept_parts = Some(wanted);
+        }
+    }
+
     fn has_room(&self, begin: &[(TaskName, Step)]) -> bool {
         let under_way = self.under_way.keys().filter(|(_, lane)| *lane == Lane::Prepare).count();
         let planned = begin.iter().filter(|(_, step)| step.lane() == Lane::Prepare).count();
@@ -375,14 +390,22 @@ impl<E: Effects> Driver<E> {
         let (name, doing, stop) = (task.clone(), step.clone(), cancel.clone());
         let handle = self.steps.spawn(async move {
             let done = |()| None;
-            let outcome = match &doing {
-                Step::PullManifest(package) => effects.pull_manifest(package, &stop).await.map(done),
-                Step::PullContent(package) => effects.pull_content(package, &progress, &stop).await.map(done),
-                Step::Build(package) => effects.build(package, &stop).await.map(done),
-                Step::Start(run) => effects.start(&name, run).await.map(Some),
-                Step::Stop { process, stop_timeout_s } => effects.stop(&name, process, *stop_timeout_s).await.map(done),
-                Step::Prune { kept } => effects.prune(&name, kept, running.as_ref()).await.map(done),
-                Step::Remove => effects.remove(&name).await.map(done),
+            let work = async {
+                match &doing {
+                    Step::PullManifest(package) => effects.pull_manifest(package, &stop).await.map(done),
+                    Step::PullContent(package) => effects.pull_content(package, &progress, &stop).await.map(done),
+                    Step::Build(package) => effects.build(package, &stop).await.map(done),
+                    Step::Start(run) => effects.start(&name, run).await.map(Some),
+                    Step::Stop { process, stop_timeout_s } => {
+                        effects.stop(&name, process, *stop_timeout_s).await.map(done)
+                    }
+                    Step::Prune { kept } => effects.prune(&name, kept, running.as_ref()).await.map(done),
+                    Step::Remove => effects.remove(&name).await.map(done),
+                }
+            };
+            let outcome = match doing.deadline() {
+                Some(deadline) => tokio::time::timeout(deadline, work).await.unwrap_or_else(|_| Err(late(deadline))),
+                None => work.await,
             };
             (name, lane, outcome)
         });
@@ -429,6 +452,8 @@ impl<E: Effects> Driver<E> {
         (view.pull, view.progress) = (None, None);
         if under_way.cancel.is_cancelled() {
             view.prepared = None;
+            // It may have gathered more after its order was taken back.
+            self.kept_parts = None;
             return;
         }
         if let Err(error) = &outcome {
@@ -517,6 +542,12 @@ impl<E: Effects> Driver<E> {
         }
         !self.dirty
     }
+}
+
+/// A step that did not end in time. It is tried again: nothing is known of how far it came.
+fn late(deadline: Duration) -> StepFailure {
+    let text = format!("the step did not end within {} s", deadline.as_secs());
+    StepFailure { failure: Failure::new(FailureCode::DEADLINE_EXCEEDED, text), retry_after_ms: Some(0) }
 }
 
 #[cfg(test)]

@@ -3,9 +3,9 @@
 
 use std::future::Future;
 
-use task_proto::TaskName;
 use task_proto::desired::PackageRef;
 use task_proto::report::{HostFacts, Progress};
+use task_proto::{Digest, TaskName};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
@@ -60,6 +60,9 @@ pub trait Effects: Send + Sync + 'static {
     /// Resolves when a process that lived has ended. Dropping it does nothing to the process.
     fn process_ended(&self, task: &TaskName, process: &ProcessRecord) -> impl Future<Output = ()> + Send;
 
+    /// Deletes the gathered bytes of all contents but these.
+    fn keep_parts(&self, wanted: &[Digest]);
+
     /// Pulls the manifest.
     fn pull_manifest(
         &self,
@@ -97,7 +100,7 @@ pub trait Effects: Send + Sync + 'static {
     fn prune(
         &self,
         task: &TaskName,
-        kept: &[task_proto::Digest],
+        kept: &[Digest],
         running: Option<&ProcessRecord>,
     ) -> impl Future<Output = Result<(), StepFailure>> + Send;
 

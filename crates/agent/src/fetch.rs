@@ -3,7 +3,7 @@
 //! rest is asked for by Range.
 //!
 //! Invariants: a tree gets its place only when all its bytes had the ordered digest and are on the disk; the bytes of a
-//! pull that failed for their digest are gone. When a pull is dropped or cancelled nothing is left but the `.part`.
+//! pull that failed for good are gone. When a pull is dropped or cancelled nothing is left but the `.part`.
 //! The compressed bytes are not kept once the tree is there: it is what they were for, and a robot's disk is small.
 
 mod download;
@@ -158,6 +158,11 @@ impl FetchError {
         self.is_cut() || matches!(self, Self::NotTheServer(_) | Self::Busy { .. } | Self::Unauthorized)
     }
 
+    /// Whether it ends the pull for good.
+    fn is_final(&self) -> bool {
+        !self.is_retryable() && !matches!(self, Self::Cancelled)
+    }
+
     /// How long the server wants to be left alone.
     pub fn retry_after(&self) -> Option<Duration> {
         match self {
@@ -227,12 +232,19 @@ impl Fetcher {
         let turn = Arc::new(turn.ok_or(FetchError::Cancelled)?);
         let resumed = self.present(package)? > 0;
         let result = self.pull_content(package, manifest, progress, cancel, turn.clone()).await;
-        if !matches!(result, Err(FetchError::DigestMismatch { .. })) {
-            return result;
+        let result = match result {
+            // Perhaps only what a power cut left of the `.part` was wrong.
+            Err(FetchError::DigestMismatch { .. }) if resumed => {
+                self.discard(package)?;
+                self.pull_content(package, manifest, progress, cancel, turn).await
+            }
+            result => result,
+        };
+        if result.as_ref().is_err_and(FetchError::is_final) {
+            // Nobody comes back for these bytes, and where the disk is full the ledger needs their room.
+            self.discard(package)?;
         }
-        self.discard(package)?;
-        // Perhaps only what a power cut left of the `.part` was wrong.
-        if resumed { self.pull_content(package, manifest, progress, cancel, turn).await } else { result }
+        result
     }
 
     async fn pull_manifest(&self, package: &PackageRef) -> Result<Vec<u8>, FetchError> {

@@ -20,6 +20,8 @@
 //! A staged version takes over: the old process is stopped, `current` is swapped, the new one is started. Each half has
 //! at most one step under way ([`Lane`]); a process is only ever started by the second, so there are never two of a task.
 
+use std::time::Duration;
+
 use task_proto::desired::{DesiredTask, PackageRef, Wanted};
 use task_proto::report::{Failure, FailureCode, Phase};
 use task_proto::{Digest, TaskName};
@@ -121,6 +123,18 @@ impl Step {
         }
     }
 
+    /// How long it may take. A pull of a content watches over the flow of its bytes instead, since a large package on a
+    /// bad link takes its time, and a build over its own limits.
+    pub fn deadline(&self) -> Option<Duration> {
+        let seconds = match self {
+            Self::PullContent(_) | Self::Build(_) => return None,
+            Self::PullManifest(_) | Self::Start(_) => STEP_DEADLINE_S,
+            Self::Stop { stop_timeout_s, .. } => STEP_DEADLINE_S + 2 * u64::from(*stop_timeout_s),
+            Self::Prune { .. } | Self::Remove => DELETE_DEADLINE_S,
+        };
+        Some(Duration::from_secs(seconds))
+    }
+
     /// Whether it deletes versions, so that none may be prepared meanwhile.
     pub fn deletes(&self) -> bool {
         matches!(self, Self::Prune { .. } | Self::Remove)
@@ -138,6 +152,10 @@ impl Step {
     }
 }
 
+/// How long a step may take whose parts all have shorter limits of their own.
+const STEP_DEADLINE_S: u64 = 120;
+/// How long deleting may take: many small files on a slow card.
+const DELETE_DEADLINE_S: u64 = 600;
 /// A run that went on this long without ending is calm: its restarts are forgiven.
 pub const CALM_MS: u64 = 10 * 60 * 1000;
 /// A run that is restarted more often than this without a calm stretch has failed. At the longest backoff that is over an

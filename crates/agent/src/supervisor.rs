@@ -196,7 +196,7 @@ impl Supervisor {
     }
 }
 
-/// The run directory and who runs it, once no start is in progress.
+/// The run directory and who runs it, once no start is in progress; an error where one never ends.
 async fn read(path: &Path) -> Result<(RunDir, Option<Started>), SupervisorError> {
     let path = path.to_owned();
     let reading = tokio::task::spawn_blocking(move || {
@@ -205,7 +205,8 @@ async fn read(path: &Path) -> Result<(RunDir, Option<Started>), SupervisorError>
         let started = dir.started()?;
         Ok((dir, started))
     });
-    reading.await.map_err(|error| failed("read the run directory")(error.into()))?
+    let read = tokio::time::timeout(START_TIMEOUT, reading).await.map_err(|_| SupervisorError::NoAnswer)?;
+    read.map_err(|error| failed("read the run directory")(error.into()))?
 }
 
 fn failed(what: &'static str) -> impl Fn(io::Error) -> SupervisorError {

@@ -30,6 +30,7 @@ struct State {
     alive: BTreeSet<String>,
     started: Vec<(DeploymentId, u64)>,
     cancelled: u32,
+    kept_parts: Vec<Vec<Digest>>,
     ledgers: Vec<Ledger>,
     held: bool,
 }
@@ -81,6 +82,10 @@ impl Effects for Fake {
 
     async fn process_ended(&self, _task: &TaskName, _process: &ProcessRecord) {
         std::future::pending().await
+    }
+
+    fn keep_parts(&self, wanted: &[Digest]) {
+        self.state(|state| state.kept_parts.push(wanted.to_vec()));
     }
 
     async fn pull_manifest(&self, package: &PackageRef, _cancel: &CancellationToken) -> Result<(), StepFailure> {
@@ -261,17 +266,20 @@ async fn an_order_runs_and_its_withdrawal_removes_it() {
 #[tokio::test]
 async fn a_cancel_interrupts_a_pull_and_leaves_the_old_version_running() {
     let bench = Bench::new().await;
-    let old = order("1.0");
+    let (old, fake) = (order("1.0"), bench.fake.clone());
     bench.order(1, vec![old.clone()]).await;
     bench.phase(Phase::Running).await;
     bench.fake.slow.store(true, std::sync::atomic::Ordering::SeqCst);
     bench.order(2, vec![order("2.0")]).await;
     let fetching = bench.phase(Phase::Fetching).await;
     assert_eq!(fetching.tasks[0].active.as_ref().expect("the old one").version, old.package.version);
-    bench.order(3, vec![old]).await;
+    bench.order(3, vec![old.clone()]).await;
     bench.report(|report| report.observed_generation == Generation(3) && report.tasks[0].phase == Phase::Running).await;
     let (started, alive) = bench.fake.state(|state| (state.started.len(), state.alive.len()));
     assert_eq!((started, alive), (1, 1));
+    bench.end().await;
+    let kept = fake.state(|state| state.kept_parts.clone());
+    assert_eq!(kept.last(), Some(&vec![old.package.content.digest]), "what was gathered of 2.0 is deleted");
 }
 
 #[tokio::test]
@@ -299,6 +307,25 @@ async fn a_removed_robot_goes_on_and_begins_nothing_new() {
     assert_eq!(report.tasks[0].phase, Phase::Running);
     let ledger = bench.end().await;
     assert!(ledger.removed, "it is remembered over a restart");
+}
+
+#[tokio::test]
+async fn a_removed_robot_begins_nothing_after_a_restart_until_it_is_known_again() {
+    let bench = Bench::new().await;
+    bench.fake.state(|state| state.held = true);
+    bench.order(1, vec![order("1.0")]).await;
+    bench.phase(Phase::Deferred).await;
+    bench.say(Heard::TokenRefused).await;
+    bench.report(|report| has(report, "removed")).await;
+    let (fake, key, robot) = (bench.fake.clone(), SigningKey::from_bytes(bench.key.to_bytes()), bench.robot.clone());
+    let ledger = bench.end().await;
+
+    fake.state(|state| state.held = false);
+    let bench = Bench::with(fake, ledger, key, robot).await;
+    let report = bench.report(|report| has(report, "removed") && !has(report, "held")).await;
+    assert_eq!((report.start, bench.fake.state(|state| state.started.len())), (2, 0));
+    bench.say(Heard::Unchanged).await;
+    bench.phase(Phase::Running).await;
 }
 
 #[tokio::test]

@@ -56,11 +56,8 @@ pub struct Robot {
 }
 
 impl Robot {
-    /// The robot whose data is in `data`. What an agent that died left half done there is removed.
+    /// The robot whose data is in `data`.
     pub fn new(data: DataDir, fetcher: Fetcher, config: &Config, mac: MacAddress) -> Self {
-        if let Err(error) = clean(&data) {
-            tracing::warn!(error = %chain(&error), "what an earlier agent left half done can't be removed");
-        }
         let mut settings: BTreeMap<String, String> =
             ROS_VARIABLES.iter().filter_map(|name| Some(((*name).to_owned(), std::env::var(name).ok()?))).collect();
         settings.extend(config.ros_domain_id.map(|id| ("ROS_DOMAIN_ID".to_owned(), id.to_string())));
@@ -196,6 +193,12 @@ impl Effects for Robot {
         }
     }
 
+    fn keep_parts(&self, wanted: &[Digest]) {
+        if let Err(error) = self.data.clean_parts(wanted) {
+            tracing::warn!(%error, "bytes of packages that are no longer ordered can't be removed");
+        }
+    }
+
     async fn pull_manifest(&self, package: &PackageRef, cancel: &CancellationToken) -> Result<(), StepFailure> {
         self.fetcher.manifest(package, cancel).await.map(drop).map_err(fetch_failure)
     }
@@ -249,6 +252,10 @@ impl Effects for Robot {
         let record = serde_json::to_vec(run).map_err(|error| failed(&error))?;
         durable::create_dir_all(&run_dir).map_err(|error| failed(&error))?;
         durable::write(&run_dir.join(RUN_RECORD), &record, 0o600).map_err(|error| failed(&error))?;
+        // A start that seemed to fail may have come about after all: there are never two processes of a task.
+        for other in other_runs(&task_dir.run(), Some(&run_dir)) {
+            self.supervisor.stop(&other, Duration::ZERO).await.map_err(|error| failed(&error))?;
+        }
         let started = self.supervisor.start(&run_dir, &spec).await;
         let pid = started.map_err(|error| failed(&error))?.task.pid;
         // What earlier runs left is of no more use; that it can't be deleted is no reason not to run.
@@ -285,24 +292,15 @@ impl Effects for Robot {
     }
 }
 
-/// Removes half-done trees, and the gathered bytes of packages that are no longer ordered.
-fn clean(data: &DataDir) -> std::io::Result<()> {
-    data.clean_leftovers()?;
-    // A ledger that can't be read says nothing about what is ordered.
-    let Ok(ledger) = Ledger::peek(&data.ledger()) else { return Ok(()) };
-    let ordered = ledger.iter().flat_map(|ledger| ledger.tasks.values());
-    let wanted: Vec<Digest> = ordered.map(|record| record.order.package.content.digest).collect();
-    data.clean_parts(&wanted)
-}
-
 /// Deletes every run directory but one.
 fn forget_runs(runs: &Path, kept: Option<&Path>) -> std::io::Result<()> {
-    for entry in std::fs::read_dir(runs).into_iter().flatten().flatten() {
-        if Some(entry.path().as_path()) != kept {
-            durable::remove_dir_all(&entry.path())?;
-        }
-    }
-    Ok(())
+    other_runs(runs, kept).iter().try_for_each(|dir| durable::remove_dir_all(dir))
+}
+
+/// Every run directory but one.
+fn other_runs(runs: &Path, kept: Option<&Path>) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(runs).into_iter().flatten().flatten();
+    entries.map(|entry| entry.path()).filter(|path| Some(path.as_path()) != kept).collect()
 }
 
 async fn on_disk(work: impl FnOnce() -> std::io::Result<()> + Send + 'static) -> Result<(), StepFailure> {

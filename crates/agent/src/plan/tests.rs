@@ -473,3 +473,21 @@ fn on_boot_hold_leaves_a_service_down_after_a_reboot() {
     world.settle();
     assert_eq!((phase(&world), world.alive.len()), (Phase::Running, 1));
 }
+
+#[test]
+fn every_step_of_the_run_lane_has_a_deadline() {
+    let order = order(1, 1, 1, Wanted::Running);
+    let process =
+        ProcessRecord { dir: "run".to_owned(), boot_id: "boot".to_owned(), started_ms: 0, pid: None, ready: false };
+    let run = ActiveRun::of(&order, RunRules::from(&manifest(&Run::default())), 0);
+    let stop_timeout_s = 3600;
+    let steps = [
+        Step::Start(Box::new(run)),
+        Step::Stop { process, stop_timeout_s },
+        Step::Prune { kept: Vec::new() },
+        Step::Remove,
+    ];
+    assert!(steps.iter().all(|step| step.lane() == Lane::Run && step.deadline().is_some()));
+    let stop = steps[1].deadline().expect("checked");
+    assert!(stop > Duration::from_secs(2 * u64::from(stop_timeout_s)), "both signals have their time: {stop:?}");
+}

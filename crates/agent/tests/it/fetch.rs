@@ -420,6 +420,11 @@ async fn too_little_room_is_said_before_anything_travels() {
     assert_eq!(error.code(), Some(FailureCode::DISK_FULL));
     assert!(error.to_string().contains("in reserve"), "{error}");
     assert_eq!(site.asked(), [0; 0]);
+
+    // What an earlier try had gathered only takes up more of the room that is missing.
+    site.put_part(&site.content[..100]);
+    assert_eq!(site.pull().await.unwrap_err().code(), Some(FailureCode::DISK_FULL));
+    assert!(!site.part().exists());
 }
 
 #[tokio::test]

@@ -536,8 +536,11 @@ impl<E: Effects> Driver<E> {
                 self.conditions.remove("ledger_unwritable");
             }
             Err(error) => {
-                tracing::error!(error = %chain(&error), "nothing is begun");
-                self.conditions.insert("ledger_unwritable", chain(&error));
+                let text = chain(&error);
+                if self.conditions.get("ledger_unwritable") != Some(&text) {
+                    tracing::error!("nothing is begun until the ledger can be written: {text}");
+                }
+                self.conditions.insert("ledger_unwritable", text);
             }
         }
         !self.dirty

@@ -33,6 +33,7 @@ struct State {
     kept_parts: Vec<Vec<Digest>>,
     ledgers: Vec<Ledger>,
     held: bool,
+    disk_full: bool,
 }
 
 impl Fake {
@@ -47,6 +48,9 @@ impl Effects for Fake {
     }
 
     fn write_ledger(&self, ledger: &Ledger) -> Result<(), LedgerError> {
+        if self.state(|state| state.disk_full) {
+            return ledger.write(std::path::Path::new("/dev/null/ledger.json"));
+        }
         self.state(|state| state.ledgers.push(ledger.clone()));
         Ok(())
     }
@@ -339,6 +343,21 @@ async fn a_restarted_agent_adopts_what_runs_and_what_was_ordered() {
     let report = bench.phase(Phase::Running).await;
     assert_eq!((report.start, report.observed_generation), (2, Generation(1)));
     assert_eq!(bench.fake.state(|state| state.started.len()), 1, "nothing is started again");
+}
+
+#[tokio::test]
+async fn nothing_is_begun_until_the_ledger_can_be_written() {
+    let bench = Bench::new().await;
+    bench.fake.state(|state| state.disk_full = true);
+    bench.order(1, vec![order("1.0")]).await;
+    let report = bench.report(|report| has(report, "ledger_unwritable")).await;
+    let text = &report.conditions[0].text;
+    assert!(text.contains("/dev/null/ledger.json"), "{text}");
+    assert!(bench.fake.state(|state| state.manifests.is_empty()));
+    bench.fake.state(|state| state.disk_full = false);
+    let report = bench.phase(Phase::Running).await;
+    assert!(!has(&report, "ledger_unwritable"));
+    assert_eq!(bench.fake.state(|state| state.started.len()), 1);
 }
 
 #[tokio::test]

@@ -174,7 +174,8 @@ impl Blobs {
     }
 
     /// Appends a body that begins at byte `start` (wherever the upload stands, if absent). What came before an error or
-    /// before the caller gave up is kept, and the next chunk begins there. Returns the new offset.
+    /// before the caller gave up is kept, and the next chunk begins there; only a full disk ends the upload. Returns the
+    /// new offset.
     pub async fn append<S, E>(
         &self,
         repository: &RepositoryName,
@@ -201,7 +202,19 @@ impl Blobs {
             }
             if length > 0 {
                 // The lock travels with the work: if the caller is dropped here, the bytes still count as one piece.
-                upload = on_disk(move || upload.write(&chunks).map(|()| upload)).await?;
+                let written = on_disk(move || {
+                    let written = upload.write(&chunks);
+                    if matches!(written, Err(BlobError::DiskFull)) {
+                        // What is here already would keep the disk full, for the database as well. Best effort.
+                        let _ = upload.cancel();
+                    }
+                    written.map(|()| upload)
+                });
+                let written = written.await;
+                if matches!(written, Err(BlobError::DiskFull)) {
+                    self.shared.uploads.active().remove(id);
+                }
+                upload = written?;
             }
             match ended {
                 None => {}
@@ -290,4 +303,28 @@ where
         }
     }
     (chunks, None)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::BlobRead;
+
+    #[tokio::test]
+    async fn a_full_disk_ends_the_upload_and_frees_what_it_took() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let settings = BlobSettings { reading: BlobRead::Pread, ..BlobSettings::default() };
+        let blobs = Blobs::open(directory.path(), settings).expect("opens");
+        let repository: RepositoryName = "talker".parse().expect("a name");
+        let body = |bytes: &'static [u8]| futures_util::stream::iter([Ok::<_, io::Error>(Bytes::from_static(bytes))]);
+        let id = blobs.begin_upload(&repository).await.expect("begins");
+        blobs.append(&repository, &id, None, body(b"some")).await.expect("there is room");
+        let full = File::options().write(true).open("/dev/full").expect("Linux has it");
+        blobs.lock_upload(&repository, &id).expect("nobody writes").file = full;
+        let refused = blobs.append(&repository, &id, None, body(b"more")).await;
+        assert!(matches!(refused, Err(BlobError::DiskFull)), "{refused:?}");
+        let gone = blobs.upload_offset(&repository, &id).await;
+        assert!(matches!(gone, Err(BlobError::UploadUnknown)), "{gone:?}");
+        assert_eq!(fs::read_dir(&blobs.shared.uploads.directory).expect("there").count(), 0);
+    }
 }

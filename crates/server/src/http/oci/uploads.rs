@@ -43,7 +43,8 @@ pub(super) async fn begin(registry: &Registry, repository: &RepositoryName, part
         let id = registry.blobs.begin_upload(repository).await?;
         let appended = registry.blobs.append(repository, &id, Some(0), body.into_data_stream()).await;
         if let Err(error) = appended {
-            registry.blobs.cancel_upload(repository, &id).await?;
+            // Best effort, for the collector would find it; what the caller has to know is the error.
+            let _ = registry.blobs.cancel_upload(repository, &id).await;
             return Err(error.into());
         }
         return complete(registry, repository, &id, digest).await;

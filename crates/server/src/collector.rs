@@ -50,8 +50,7 @@ pub async fn run(store: Store, blobs: Blobs, clock: Clock, grace: Duration, stop
             Ok(Collected { uploads: 0, blobs: 0 }) => {}
             Ok(Collected { uploads, blobs }) => tracing::info!(uploads, blobs, "collected what nobody needs"),
             Err(error) => {
-                let cause = std::error::Error::source(&error).map(ToString::to_string);
-                tracing::warn!(%error, cause, "collecting failed");
+                tracing::warn!(error = &error as &dyn std::error::Error, "collecting failed");
             }
         }
     }

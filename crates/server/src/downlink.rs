@@ -59,7 +59,11 @@ impl Downlink {
             Ok(states) => states,
             Err(error) => {
                 let robots = robots.len();
-                tracing::warn!(robots, %error, "desired states could not be read; the robots ask again");
+                tracing::warn!(
+                    robots,
+                    error = &error as &dyn std::error::Error,
+                    "desired states could not be read; the robots ask again"
+                );
                 return;
             }
         };

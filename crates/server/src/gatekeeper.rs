@@ -22,7 +22,7 @@ impl StoreGatekeeper {
         let password = login.password.as_deref().ok_or(Refusal::BadCredentials)?;
         let token: Token = password.parse().map_err(|_| Refusal::BadCredentials)?;
         let holder = self.store.token_holder(&token, self.clock.now_ms()).await.map_err(|error| {
-            tracing::warn!(%error, "a login over MQTT could not be checked");
+            tracing::warn!(error = &error as &dyn std::error::Error, "a login over MQTT could not be checked");
             Refusal::Unavailable
         })?;
         match holder {

@@ -79,8 +79,11 @@ async fn write_all(mut submissions: mpsc::Receiver<Submission>, store: Store, cl
                 Ok(answers)
             }
             Err(error) => {
-                let error: &(dyn std::error::Error + 'static) = &error;
-                tracing::error!(error, reports = batch.len(), "reports were refused");
+                tracing::error!(
+                    error = &error as &dyn std::error::Error,
+                    reports = batch.len(),
+                    "reports were refused"
+                );
                 Err(ReportError::NotStored)
             }
         };
@@ -122,7 +125,11 @@ async fn write_with_retries(
     for _ in 1..TRIES {
         match write_batch(store, reports, clock.now_ms()).await {
             Ok(written) => return Ok(written),
-            Err(error) => tracing::warn!(%error, reports = reports.len(), "reports are tried again"),
+            Err(error) => tracing::warn!(
+                error = &error as &dyn std::error::Error,
+                reports = reports.len(),
+                "reports are tried again"
+            ),
         }
         tokio::time::sleep(pause).await;
         pause *= 2;

@@ -196,7 +196,10 @@ async fn expire_assignments(app: App) {
     let mut ticks = ticks(EXPIRY_INTERVAL);
     while next_tick(&mut ticks, &app.stop).await {
         if let Err(error) = app.actions.expire().await {
-            tracing::error!(%error, "assignments could not be looked through for expired ones");
+            tracing::error!(
+                error = &error as &dyn std::error::Error,
+                "assignments could not be looked through for expired ones"
+            );
         }
     }
 }

@@ -87,7 +87,10 @@ impl EventFeed {
                 continue;
             }
             if let Err(error) = self.send_all(&source, gathered).await {
-                tracing::warn!(error = %error, "events could not be read; listeners are told to fetch the lists");
+                tracing::warn!(
+                    error = &error as &dyn std::error::Error,
+                    "events could not be read; listeners are told to fetch the lists"
+                );
                 has_missed = true;
             }
             if has_missed {

@@ -76,7 +76,7 @@ async fn upload_blob(client: &Client, name: &str, blob: BlobRef, source: &Source
     let mut tried = 0;
     loop {
         tried += 1;
-        // Each try is an upload of its own: the server collects what a broken one left.
+        // Each try is an upload of its own: the server collects what a broken one left, and forgets all when it restarts.
         let session = client.send(|| client.request(Method::POST, &format!("/v2/{name}/blobs/uploads/"))).await?;
         let target = target(client, &session, blob)?;
         let request = client
@@ -90,17 +90,32 @@ async fn upload_blob(client: &Client, name: &str, blob: BlobRef, source: &Source
             Ok(response) => {
                 let status = response.status();
                 let error = client.refusal(response).await;
-                if !status.is_server_error() {
+                if is_final(status) {
                     return Err(error.into());
                 }
                 error
             }
             Err(source) => client.unreachable(source),
         };
+        // Perhaps only the answer was lost.
+        if exists(client, &format!("/v2/{name}/blobs/{}", blob.digest)).await? {
+            return Ok(());
+        }
         if tried >= UPLOAD_TRIES {
             return Err(error.into());
         }
     }
+}
+
+/// Whether another upload of the same bytes would be refused as well.
+fn is_final(status: StatusCode) -> bool {
+    matches!(
+        status,
+        StatusCode::UNAUTHORIZED
+            | StatusCode::FORBIDDEN
+            | StatusCode::PAYLOAD_TOO_LARGE
+            | StatusCode::INSUFFICIENT_STORAGE
+    )
 }
 
 /// Where the server wants the bytes: its `Location`, relative or absolute, with the digest added.
@@ -147,4 +162,61 @@ async fn put_manifest(client: &Client, packed: &Packed) -> Result<(), CommandErr
         || client.request(Method::PUT, &path).header(CONTENT_TYPE, MANIFEST_TYPE).body(packed.manifest_bytes.clone());
     client.send(put).await?;
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicU32, Ordering};
+
+    use axum::Router;
+    use axum::routing::{head, post, put};
+    use task_proto::Digest;
+    use task_proto::token::{Token, TokenKind};
+
+    use super::super::Connection;
+    use super::super::output::Format;
+    use super::*;
+
+    /// A server that forgets the first upload, as one that restarts does, and refuses all of the package `refused`.
+    async fn forgetful_server(puts: Arc<AtomicU32>) -> std::net::SocketAddr {
+        let begin = |axum::extract::Path(name): axum::extract::Path<String>| async move {
+            (StatusCode::ACCEPTED, [(LOCATION, format!("/upload/{name}"))])
+        };
+        let finish = move |axum::extract::Path(name): axum::extract::Path<String>| async move {
+            match (puts.fetch_add(1, Ordering::SeqCst), name.as_str()) {
+                (_, "refused") => StatusCode::INSUFFICIENT_STORAGE,
+                (0, _) => StatusCode::NOT_FOUND,
+                _ => StatusCode::CREATED,
+            }
+        };
+        let router = Router::new()
+            .route("/v2/{name}/blobs/uploads/", post(begin))
+            .route("/v2/{name}/blobs/{digest}", head(|| async { StatusCode::NOT_FOUND }))
+            .route("/upload/{name}", put(finish));
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = listener.local_addr().unwrap();
+        tokio::spawn(async move { axum::serve(listener, router).await });
+        address
+    }
+
+    #[tokio::test]
+    async fn a_forgotten_upload_is_begun_again_and_a_refused_one_is_not() {
+        let puts = Arc::new(AtomicU32::new(0));
+        let address = forgetful_server(puts.clone()).await;
+        let connection = Connection {
+            server: Some(format!("http://{address}")),
+            token: Some(Token::random(TokenKind::Operator).reveal()),
+            token_file: None,
+            data: None,
+            output: Format::Json,
+        };
+        let client = Client::connect(&connection).unwrap();
+        let blob = BlobRef { digest: Digest::of(b"content"), size: 7 };
+        let source = Source::Bytes(b"content");
+        upload_blob(&client, "talker", blob, &source).await.unwrap();
+        assert_eq!(puts.load(Ordering::SeqCst), 2);
+        assert!(upload_blob(&client, "refused", blob, &source).await.is_err());
+        assert_eq!(puts.load(Ordering::SeqCst), 3);
+    }
 }

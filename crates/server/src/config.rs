@@ -476,7 +476,8 @@ fn count(text: &str, most: u64) -> Result<u64, String> {
     }
 }
 
-fn lifetime(text: &str) -> Result<Duration, String> {
+/// Reads a time that something may last: not nothing, and at most ten years.
+pub fn lifetime(text: &str) -> Result<Duration, String> {
     const MOST: Duration = Duration::from_secs(3650 * 24 * 60 * 60);
     match parse_duration(text) {
         Some(time) if !time.is_zero() && time <= MOST => Ok(time),

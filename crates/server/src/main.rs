@@ -21,6 +21,8 @@ const LEFTOVER_PATIENCE: Duration = Duration::from_millis(500);
 #[derive(Parser)]
 #[command(name = "taskd", version, propagate_version = true)]
 struct CommandLine {
+    #[command(flatten)]
+    connection: commands::Connection,
     #[command(subcommand)]
     command: Command,
 }
@@ -34,14 +36,14 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    let CommandLine { command } = CommandLine::parse();
+    let CommandLine { connection, command } = CommandLine::parse();
     let runtime = match tokio::runtime::Runtime::new() {
         Ok(runtime) => runtime,
         Err(error) => return complain(&anyhow::Error::new(error).context("no threads to run on")),
     };
     let code = match command {
         Command::Serve(flags) => runtime.block_on(serve(&flags)).unwrap_or_else(|error| complain(&error)),
-        Command::Operator(command) => runtime.block_on(commands::run(command)),
+        Command::Operator(command) => runtime.block_on(commands::run(&connection, command)),
     };
     runtime.shutdown_timeout(LEFTOVER_PATIENCE);
     code
@@ -135,4 +137,26 @@ impl Signals {
 fn complain(error: &anyhow::Error) -> ExitCode {
     let _ = writeln!(std::io::stderr(), "taskd: {error:#}");
     ExitCode::FAILURE
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory as _;
+
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        CommandLine::command().debug_assert();
+    }
+
+    #[test]
+    fn the_data_directory_may_be_named_before_the_command_or_after_it() {
+        for line in [["taskd", "--data", "/d", "serve"], ["taskd", "serve", "--data", "/d"]] {
+            let Command::Serve(flags) = CommandLine::try_parse_from(line).expect("parses").command else {
+                panic!("{line:?}")
+            };
+            assert_eq!(flags.settings, [("data", "/d".to_owned())]);
+        }
+    }
 }

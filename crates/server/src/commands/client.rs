@@ -106,8 +106,11 @@ pub(crate) struct Client {
 impl Client {
     /// Finds server and token; nothing is sent yet.
     pub(crate) fn connect(connection: &Connection) -> Result<Self, CommandError> {
-        let data =
-            connection.data.clone().or_else(|| crate::config::default_data_directory(|name| std::env::var_os(name)));
+        let data = connection
+            .data
+            .as_ref()
+            .map(PathBuf::from)
+            .or_else(|| crate::config::default_data_directory(|name| std::env::var_os(name)));
         let base = match &connection.server {
             Some(url) => url.trim_end_matches('/').to_owned(),
             None => local_server(data.as_deref()).unwrap_or_else(|| "http://127.0.0.1:8080".to_owned()),

@@ -7,7 +7,8 @@ use task_proto::api::{CreateEnrollmentToken, EnrollmentToken};
 use task_proto::id::{LabelKey, LabelValue};
 
 use super::output::{say, time};
-use super::{CommandError, Outcome, Session, duration};
+use super::{CommandError, Outcome, Session};
+use crate::config::lifetime;
 
 /// What to do with enrolment tokens.
 #[derive(Debug, Subcommand)]
@@ -20,8 +21,8 @@ pub enum Action {
         /// How many enrolments it is good for [default: any number]
         #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
         uses: Option<u64>,
-        /// How long it lives, like 2h or 1d
-        #[arg(long, value_name = "TIME", value_parser = duration)]
+        /// How long it lives, like 2h or 7d [default: 1d]
+        #[arg(long, value_name = "TIME", value_parser = lifetime)]
         ttl: Option<Duration>,
         /// A label that each robot that uses it gets; may be repeated
         #[arg(long = "label", value_name = "KEY=VALUE", value_parser = label)]

@@ -3,7 +3,6 @@
 
 use std::path::PathBuf;
 use std::process::ExitCode;
-use std::time::Duration;
 
 use clap::{Args, Subcommand};
 
@@ -28,73 +27,37 @@ mod wait;
 pub enum Command {
     /// Look at robots, or remove one
     Robot {
-        /// Where the server is and who asks.
-        #[command(flatten)]
-        connection: Connection,
         /// What to do.
         #[command(subcommand)]
         action: robot::Action,
     },
     /// Make the tokens that robots enrol with
     EnrollToken {
-        /// Where the server is and who asks.
-        #[command(flatten)]
-        connection: Connection,
         /// What to do.
         #[command(subcommand)]
         action: enroll_token::Action,
     },
     /// Pack a directory, upload it and, with --to, deploy it
-    Push {
-        /// Where the server is and who asks.
-        #[command(flatten)]
-        connection: Connection,
-        /// What to push.
-        #[command(flatten)]
-        push: push::Push,
-    },
+    Push(push::Push),
     /// Pack a directory and print its digests; talks to no server
     Pack(push::Pack),
     /// Look at deployments, cancel or resume one
     Deploy {
-        /// Where the server is and who asks.
-        #[command(flatten)]
-        connection: Connection,
         /// What to do.
         #[command(subcommand)]
         action: deploy::Action,
     },
     /// Start a task on robots that have it
-    Start {
-        /// Where the server is and who asks.
-        #[command(flatten)]
-        connection: Connection,
-        /// Which task, where.
-        #[command(flatten)]
-        order: task::TaskOrder,
-    },
+    Start(task::TaskOrder),
     /// Stop a task; it stays installed
-    Stop {
-        /// Where the server is and who asks.
-        #[command(flatten)]
-        connection: Connection,
-        /// Which task, where.
-        #[command(flatten)]
-        order: task::TaskOrder,
-    },
+    Stop(task::TaskOrder),
     /// Stop a task and remove it from robots
-    Remove {
-        /// Where the server is and who asks.
-        #[command(flatten)]
-        connection: Connection,
-        /// Which task, where.
-        #[command(flatten)]
-        order: task::TaskOrder,
-    },
+    Remove(task::TaskOrder),
 }
 
-/// Where the server is and who asks.
+/// Where the server is and who asks. Each option may stand before the command or after it.
 #[derive(Debug, Args)]
+#[command(next_help_heading = "Asking the server")]
 pub struct Connection {
     /// The server's URL [default: the server of --data, else http://127.0.0.1:8080]
     #[arg(long, env = "TASKD_SERVER", value_name = "URL", global = true)]
@@ -107,7 +70,8 @@ pub struct Connection {
     pub token_file: Option<PathBuf>,
     /// The data directory of a server on this machine
     #[arg(long, env = "TASKD_DATA", value_name = "DIR", global = true)]
-    pub data: Option<PathBuf>,
+    // A text, as `serve` has it: both are one option to clap.
+    pub data: Option<String>,
     /// How to print the result
     #[arg(short, long, value_enum, default_value_t = Format::Table, value_name = "FORMAT", global = true)]
     pub output: Format,
@@ -176,8 +140,8 @@ impl CommandError {
 }
 
 /// Runs one command to its end. Results are on stdout, everything else has been said on stderr.
-pub async fn run(command: Command) -> ExitCode {
-    let outcome = match dispatch(command).await {
+pub async fn run(connection: &Connection, command: Command) -> ExitCode {
+    let outcome = match dispatch(connection, command).await {
         Ok(outcome) => outcome,
         Err(error) => {
             output::complain(&error);
@@ -187,16 +151,16 @@ pub async fn run(command: Command) -> ExitCode {
     outcome.into()
 }
 
-async fn dispatch(command: Command) -> Result<Outcome, CommandError> {
+async fn dispatch(connection: &Connection, command: Command) -> Result<Outcome, CommandError> {
     match command {
-        Command::Pack(pack) => push::pack(pack).await,
-        Command::Robot { connection, action } => robot::run(&connection.open()?, action).await,
-        Command::EnrollToken { connection, action } => enroll_token::run(&connection.open()?, action).await,
-        Command::Push { connection, push } => push::run(&connection.open()?, push).await,
-        Command::Deploy { connection, action } => deploy::run(&connection.open()?, action).await,
-        Command::Start { connection, order } => task::run(&connection.open()?, task::Verb::Start, order).await,
-        Command::Stop { connection, order } => task::run(&connection.open()?, task::Verb::Stop, order).await,
-        Command::Remove { connection, order } => task::run(&connection.open()?, task::Verb::Remove, order).await,
+        Command::Pack(pack) => push::pack(&Output::new(connection.output), pack).await,
+        Command::Robot { action } => robot::run(&connection.open()?, action).await,
+        Command::EnrollToken { action } => enroll_token::run(&connection.open()?, action).await,
+        Command::Push(push) => push::run(&connection.open()?, push).await,
+        Command::Deploy { action } => deploy::run(&connection.open()?, action).await,
+        Command::Start(order) => task::run(&connection.open()?, task::Verb::Start, order).await,
+        Command::Stop(order) => task::run(&connection.open()?, task::Verb::Stop, order).await,
+        Command::Remove(order) => task::run(&connection.open()?, task::Verb::Remove, order).await,
     }
 }
 
@@ -209,42 +173,5 @@ pub(crate) struct Session {
 impl Connection {
     fn open(&self) -> Result<Session, CommandError> {
         Ok(Session { client: Client::connect(self)?, output: Output::new(self.output) })
-    }
-}
-
-/// Reads `90s`, `2m`, `1h` or `7d`; at most ten years.
-fn duration(text: &str) -> Result<Duration, String> {
-    const MAX_S: u64 = 10 * 365 * 24 * 60 * 60;
-    let unit_s = match text.chars().last() {
-        Some('s') => 1,
-        Some('m') => 60,
-        Some('h') => 60 * 60,
-        Some('d') => 24 * 60 * 60,
-        _ => return Err("expected a number and one of s, m, h, d, like 90s or 2m".to_owned()),
-    };
-    let number: u64 =
-        text[..text.len() - 1].parse().map_err(|_| "expected a whole number before the unit".to_owned())?;
-    match number.checked_mul(unit_s) {
-        Some(seconds) if (1..=MAX_S).contains(&seconds) => Ok(Duration::from_secs(seconds)),
-        _ => Err("must be between 1s and ten years".to_owned()),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_command_line_is_consistent() {
-        Command::augment_subcommands(clap::Command::new("taskd")).debug_assert();
-    }
-
-    #[test]
-    fn durations_have_a_number_and_a_unit() {
-        assert_eq!(duration("2m"), Ok(Duration::from_secs(120)));
-        assert_eq!(duration("7d"), Ok(Duration::from_secs(604_800)));
-        for bad in ["", "m", "2", "2w", "0s", "-1s", "99999999d", "1.5h", "2 m", "2é"] {
-            assert!(duration(bad).is_err(), "{bad}");
-        }
     }
 }

@@ -9,8 +9,9 @@ use task_proto::desired::Delivery;
 use task_proto::selector::Selector;
 
 use super::confirm::confirm;
-use super::output::{bytes, robots, say};
-use super::{CommandError, Outcome, Session, deploy, duration, robot, task, upload, wait};
+use super::output::{Output, bytes, robots, say};
+use super::{CommandError, Outcome, Session, deploy, robot, task, upload, wait};
+use crate::config::lifetime;
 use crate::package::{self, Packed};
 
 /// What to push, where to and how.
@@ -26,7 +27,7 @@ pub struct Push {
     #[arg(long, requires = "to")]
     wait: bool,
     /// How long to wait
-    #[arg(long, value_name = "TIME", value_parser = duration, default_value = "10m", requires = "to")]
+    #[arg(long, value_name = "TIME", value_parser = lifetime, default_value = "10m", requires = "to")]
     timeout: Duration,
     /// So many robots at a time [default: all at once]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..), requires = "to")]
@@ -38,7 +39,7 @@ pub struct Push {
     #[arg(long, value_enum, default_value_t = DeliveryName::PushPull, requires = "to")]
     delivery: DeliveryName,
     /// When what is not done by then expires [default: the server's setting]
-    #[arg(long, value_name = "TIME", value_parser = duration, requires = "to")]
+    #[arg(long, value_name = "TIME", value_parser = lifetime, requires = "to")]
     expires: Option<Duration>,
     /// Only check the package and list the robots that are meant
     #[arg(long)]
@@ -66,11 +67,8 @@ pub struct Pack {
     /// The package's directory
     dir: PathBuf,
     /// Write the content archive (tar+zstd) to this file
-    #[arg(short, long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
-    /// Print JSON
-    #[arg(long)]
-    json: bool,
 }
 
 pub(super) async fn run(session: &Session, push: Push) -> Result<Outcome, CommandError> {
@@ -138,14 +136,13 @@ async fn packed(dir: PathBuf) -> Result<Packed, CommandError> {
     Ok(packed)
 }
 
-pub(super) async fn pack(pack: Pack) -> Result<Outcome, CommandError> {
+pub(super) async fn pack(output: &Output, pack: Pack) -> Result<Outcome, CommandError> {
     let packed = packed(pack.dir).await?;
     if let Some(path) = &pack.out {
         std::fs::copy(packed.content.path(), path)
             .map_err(|source| CommandError::Io { what: format!("can't write {}", path.display()), source })?;
     }
-    let format = if pack.json { super::output::Format::Json } else { super::output::Format::Table };
-    super::output::Output::new(format).described(&packed.package, |_| describe(&packed))?;
+    output.described(&packed.package, |_| describe(&packed))?;
     Ok(Outcome::Succeeded)
 }
 

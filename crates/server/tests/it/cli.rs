@@ -158,7 +158,7 @@ async fn a_second_push_of_the_same_tree_transfers_no_blob() {
     let first = bench.taskd(&["push", &package, "-o", "json"]).await.expect(0, "2 blobs transferred");
     let second = bench.taskd(&["push", &package, "-o", "json"]).await.expect(0, "nothing to upload");
     assert_eq!(first.json(), second.json());
-    let packed = bench.taskd(&["pack", &package, "--json"]).await.expect(0, "");
+    let packed = bench.taskd(&["-o", "json", "pack", &package]).await.expect(0, "");
     assert_eq!(packed.json(), first.json());
 }
 
@@ -266,6 +266,12 @@ async fn robots_and_deployments_are_shown_and_removed() {
     let robot = bench.enroll(7).await;
     let id = robot.identity.robot_id.as_str();
     let list = bench.taskd(&["robot", "list"]).await.expect(0, "");
+    let data = bench.data().display().to_string();
+    for order in
+        [["--data", &data, "robot", "list"], ["robot", "--data", &data, "list"], ["robot", "list", "--data", &data]]
+    {
+        assert_eq!(run(command(&order)).await.expect(0, "").stdout, list.stdout, "options stand anywhere");
+    }
     assert!(list.stdout.contains("robot-7") && list.stdout.contains("02:00:00:00:00:07"), "{}", list.stdout);
     let deployment = bench.taskd(&["push", &bench.package("1", ""), "--to", "*", "-o", "json"]).await.json();
     let deployment = deployment["id"].as_str().unwrap();

@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 
 use task_proto::DeploymentId;
+use task_proto::desired::Delivery;
 
 use crate::changes::Consequences;
 use crate::rollout::{Move, next_move};
@@ -26,7 +27,12 @@ pub async fn advance(
             Move::Release(count) => {
                 let released = write.release(&deployment, count, now_ms).await?;
                 consequences.deployments.extend(released.superseded.iter().cloned());
-                consequences.rings.extend(released.robots);
+                // Robots that are to ask by themselves are not rung.
+                let told = match released.delivery {
+                    Delivery::Poll => &mut consequences.robots,
+                    Delivery::PushPull => &mut consequences.rings,
+                };
+                told.extend(released.robots);
                 waiting.extend(released.superseded);
             }
         }

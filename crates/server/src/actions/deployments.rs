@@ -24,7 +24,7 @@ impl Actions {
         order: &CreateDeployment,
         package: &PackageView,
     ) -> Result<DeploymentId, ActionError> {
-        let request = format!("Create {}", serde_json::to_string(order).expect("an order always has a JSON form"));
+        let request = creation(order);
         let now_ms = self.clock.now_ms();
         let lifetime_ms = match order.expires_in_s {
             Some(seconds) => lifetime_ms("expires_in_s", seconds)?,
@@ -57,12 +57,22 @@ impl Actions {
         Ok(id)
     }
 
-    /// Takes a deployment back: what it replaced is desired again. Doing it twice is harmless.
+    /// The deployment that `key` with this `order` gave before. A repeated order is answered also when its package is gone.
+    pub async fn deployment_ordered_before(
+        &self,
+        key: &IdempotencyKey,
+        order: &CreateDeployment,
+    ) -> Result<Option<DeploymentId>, ActionError> {
+        let mut write = self.store.begin().await?;
+        self.answered_before(&mut write, key, &creation(order)).await
+    }
+
+    /// Interrupts a deployment: where it has not settled, what it replaced is desired again; a service that runs goes on.
+    /// Doing it twice is harmless.
     pub async fn cancel_deployment(&self, id: &DeploymentId) -> Result<(), ActionError> {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
-        let status = write.deployment_status(id).await?;
-        if status.ok_or_else(|| ActionError::DeploymentNotFound(id.clone()))?.cancelled {
+        if is_cancelled(&mut write, id).await? {
             return Ok(());
         }
         let robots: Vec<RobotId> = write.revocable(id).await?.into_iter().map(|row| row.robot).collect();
@@ -81,8 +91,7 @@ impl Actions {
     pub async fn resume_deployment(&self, id: &DeploymentId) -> Result<(), ActionError> {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
-        let status = write.deployment_status(id).await?;
-        if status.ok_or_else(|| ActionError::DeploymentNotFound(id.clone()))?.cancelled {
+        if is_cancelled(&mut write, id).await? {
             return Err(ActionError::DeploymentCancelled(id.clone()));
         }
         let Some((rollout, tally)) = write.rollout(id).await?.filter(|(rollout, _)| rollout.paused) else {
@@ -97,17 +106,28 @@ impl Actions {
         Ok(())
     }
 
-    /// Ends what was not done in time and forgets old idempotency keys. To be called about once a minute.
+    /// Ends what was not done in time, and forgets old idempotency keys and tokens that have ended. To be called about once
+    /// a minute.
     pub async fn expire(&self) -> Result<(), ActionError> {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
         write.forget_orders(now_ms.saturating_sub(KEY_LIFETIME_MS)).await?;
+        write.forget_ended_tokens(now_ms).await?;
         let overdue = write.overdue(now_ms).await?;
         let consequences = take_back(&mut write, &overdue, Phase::Expired, now_ms).await?;
         write.commit().await?;
         self.changes.publish(consequences);
         Ok(())
     }
+}
+
+/// An order to create a deployment, as its idempotency key remembers it.
+fn creation(order: &CreateDeployment) -> String {
+    format!("Create {}", serde_json::to_string(order).expect("an order always has a JSON form"))
+}
+
+async fn is_cancelled(write: &mut Write, id: &DeploymentId) -> Result<bool, ActionError> {
+    write.is_cancelled(id).await?.ok_or_else(|| ActionError::DeploymentNotFound(id.clone()))
 }
 
 /// Ends `taken` in `phase`, puts back what it had replaced, and moves on the rollouts this touches.

@@ -191,6 +191,10 @@ fn check_labels(labels: &Labels) -> Result<(), ActionError> {
 
 /// The robot with this id or name, or the error that there is none.
 async fn known_robot(write: &mut Write, id_or_name: &str) -> Result<KnownRobot, ActionError> {
-    let robot = write.known_robot(id_or_name).await?;
+    // An id has the form of a name. What has not is no matter for the database, which might not even take the text.
+    let robot = match id_or_name.parse::<RobotName>() {
+        Ok(name) => write.known_robot(name.as_str()).await?,
+        Err(_) => None,
+    };
     robot.ok_or_else(|| ActionError::RobotNotFound(id_or_name.chars().take(80).collect()))
 }

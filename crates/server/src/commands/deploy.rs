@@ -17,7 +17,7 @@ pub enum Action {
         /// Its id
         deployment: DeploymentId,
     },
-    /// Take one back: what is under way ends, the version before it keeps running
+    /// Interrupt one: where it is under way or has failed the version before it runs on; where it runs already it stays
     Cancel {
         /// Its id
         deployment: DeploymentId,

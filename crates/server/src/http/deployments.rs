@@ -37,15 +37,17 @@ pub(super) async fn create(
         return Ok(Json(MatchedRobots { robots }).into_response());
     }
     let key = idempotency_key(headers.get(IDEMPOTENCY_KEY))?;
-    let package = app.store.package(&order.package, &order.manifest).await?.ok_or_else(|| {
-        let message = format!("manifest: there is no package {} with manifest {}", order.package, order.manifest);
-        ApiError::new(StatusCode::NOT_FOUND, "package_not_found", message)
-    })?;
-    let id = app.actions.create_deployment(&key, &order, &package).await?;
+    let id = match app.store.package(&order.package, &order.manifest).await? {
+        Some(package) => app.actions.create_deployment(&key, &order, &package).await?,
+        None => app.actions.deployment_ordered_before(&key, &order).await?.ok_or_else(|| {
+            let message = format!("manifest: there is no package {} with manifest {}", order.package, order.manifest);
+            ApiError::new(StatusCode::NOT_FOUND, "package_not_found", message)
+        })?,
+    };
     Ok((StatusCode::CREATED, Json(view(&app, &id).await?)).into_response())
 }
 
-/// `POST /deployments/{deployment}/cancel`: takes it back.
+/// `POST /deployments/{deployment}/cancel`: interrupts it.
 pub(super) async fn cancel(
     State(app): State<App>,
     PathParam(id): PathParam<DeploymentId>,

@@ -10,7 +10,7 @@ use serde::Deserialize;
 use task_proto::api::{EditRobot, ReportReply, RobotList, RobotView};
 use task_proto::report::Report;
 use task_proto::selector::Selector;
-use task_proto::{Digest, RobotId};
+use task_proto::{Digest, RobotId, RobotName};
 
 use super::App;
 use super::error::ApiError;
@@ -42,7 +42,7 @@ pub(super) async fn list(
 /// `GET /robots/{robot}`: one robot, by id or name.
 pub(super) async fn show(
     State(app): State<App>,
-    PathParam(robot): PathParam<String>,
+    PathParam(robot): PathParam<RobotName>,
 ) -> Result<Json<RobotView>, ApiError> {
     let id = find(&app, &robot).await?;
     view(&app, &id).await.map(Json)
@@ -51,7 +51,7 @@ pub(super) async fn show(
 /// `PATCH /robots/{robot}`: changes name or labels.
 pub(super) async fn edit(
     State(app): State<App>,
-    PathParam(robot): PathParam<String>,
+    PathParam(robot): PathParam<RobotName>,
     JsonBody(edit): JsonBody<EditRobot>,
 ) -> Result<Json<RobotView>, ApiError> {
     let id = find(&app, &robot).await?;
@@ -62,7 +62,7 @@ pub(super) async fn edit(
 /// `DELETE /robots/{robot}`: removes it; whoever is connected with its token has to go.
 pub(super) async fn remove(
     State(app): State<App>,
-    PathParam(robot): PathParam<String>,
+    PathParam(robot): PathParam<RobotName>,
 ) -> Result<StatusCode, ApiError> {
     let id = find(&app, &robot).await?;
     app.actions.remove_robot(&id).await?;
@@ -112,10 +112,9 @@ pub(super) async fn report(
     Ok(Json(app.reports.submit(report).await?))
 }
 
-async fn find(app: &App, id_or_name: &str) -> Result<RobotId, ApiError> {
-    let shown: String = id_or_name.chars().take(80).collect();
-    let found = app.store.find_robot(id_or_name).await?;
-    found.ok_or_else(|| ApiError::not_found(format!("there is no robot {shown:?}")))
+async fn find(app: &App, id_or_name: &RobotName) -> Result<RobotId, ApiError> {
+    let found = app.store.find_robot(id_or_name.as_str()).await?;
+    found.ok_or_else(|| ApiError::not_found(format!("there is no robot {id_or_name}")))
 }
 
 async fn view(app: &App, id: &RobotId) -> Result<RobotView, ApiError> {

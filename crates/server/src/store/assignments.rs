@@ -5,10 +5,11 @@
 use std::collections::BTreeSet;
 
 use sqlx::{AssertSqlSafe, Row as _};
+use task_proto::desired::Delivery;
 use task_proto::report::Phase;
 use task_proto::{DeploymentId, RobotId, TaskName};
 
-use super::rows::{groups, id, stored, values};
+use super::rows::{from_word, groups, id, stored, values};
 use super::{StoreError, Write};
 
 /// What may be ordered about a task that a robot has.
@@ -29,6 +30,8 @@ pub struct Released {
     pub robots: Vec<RobotId>,
     /// Deployments whose place was taken on some of them.
     pub superseded: BTreeSet<DeploymentId>,
+    /// How they learn of it.
+    pub delivery: Delivery,
 }
 
 /// An assignment that is to be taken back.
@@ -142,15 +145,23 @@ impl Write {
         .execute(self.connection())
         .await?;
         self.raise_generations(&robots).await?;
-        Ok(Released { robots, superseded: deployments(superseded)? })
+        let delivery: String = sqlx::query_scalar("SELECT delivery FROM deployments WHERE id = $1")
+            .bind(deployment.as_str())
+            .fetch_one(self.connection())
+            .await?;
+        let delivery = from_word("deployments.delivery", &delivery)?;
+        Ok(Released { robots, superseded: deployments(superseded)?, delivery })
     }
 
-    /// What a cancel takes back: all that has not ended, and what ended badly but is still what its robot should have.
+    /// What a cancel takes back: all that has not settled, and what ended badly but is still what its robot should have.
+    /// A service that runs has settled: there is nothing left to interrupt.
     pub async fn revocable(&mut self, deployment: &DeploymentId) -> Result<Vec<Revocable>, StoreError> {
         let rows = sqlx::query(
-            "SELECT deployment_id, robot_id, desired, previous FROM assignments
-             WHERE deployment_id = $1 AND (ended = 0 OR (desired = 1 AND phase NOT IN ('succeeded', 'stopped')))
-             ORDER BY place",
+            "SELECT a.deployment_id, a.robot_id, a.desired, a.previous FROM assignments a
+             JOIN deployments d ON d.id = a.deployment_id
+             WHERE a.deployment_id = $1 AND NOT (a.phase = 'running' AND d.kind = 'service')
+               AND (a.ended = 0 OR (a.desired = 1 AND a.phase NOT IN ('succeeded', 'stopped')))
+             ORDER BY a.place",
         )
         .bind(deployment.as_str())
         .fetch_all(self.connection())

@@ -3,11 +3,11 @@
 use std::collections::HashMap;
 
 use sqlx::{AssertSqlSafe, Row as _};
+use task_proto::DeploymentId;
 use task_proto::api::{AssignmentView, CreateDeployment, DeploymentView, PhaseCount};
 use task_proto::desired::PackageRef;
 use task_proto::manifest::TaskKind;
 use task_proto::report::Phase;
-use task_proto::{DeploymentId, TaskName};
 
 use super::rows::{from_json, from_optional_json, from_word, id, json, number, stored, word};
 use super::{Store, StoreError, Write};
@@ -27,15 +27,6 @@ pub struct NewDeployment<'a> {
     pub order: &'a CreateDeployment,
     /// When what is left of it expires.
     pub expires_at_ms: u64,
-}
-
-/// How far a deployment is from its end.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct DeploymentStatus {
-    /// The task it brings.
-    pub task: TaskName,
-    /// Whether the operator took it back.
-    pub cancelled: bool,
 }
 
 /// The most deployments that are listed; older ones are found by id.
@@ -148,15 +139,13 @@ impl Write {
         Ok(())
     }
 
-    /// How far a deployment is from its end.
-    pub async fn deployment_status(&mut self, id: &DeploymentId) -> Result<Option<DeploymentStatus>, StoreError> {
-        let row: Option<(String, Option<i64>)> =
-            sqlx::query_as("SELECT task, cancelled_at_ms FROM deployments WHERE id = $1")
-                .bind(id.as_str())
-                .fetch_optional(self.connection())
-                .await?;
-        let Some((task, cancelled)) = row else { return Ok(None) };
-        Ok(Some(DeploymentStatus { task: super::rows::id("deployments.task", &task)?, cancelled: cancelled.is_some() }))
+    /// Whether the operator took a deployment back; `None` if there is none.
+    pub async fn is_cancelled(&mut self, id: &DeploymentId) -> Result<Option<bool>, StoreError> {
+        let row: Option<(Option<i64>,)> = sqlx::query_as("SELECT cancelled_at_ms FROM deployments WHERE id = $1")
+            .bind(id.as_str())
+            .fetch_optional(self.connection())
+            .await?;
+        Ok(row.map(|(cancelled_at_ms,)| cancelled_at_ms.is_some()))
     }
 
     /// The pace and the tally of a deployment that has robots waiting; `None` for any other.

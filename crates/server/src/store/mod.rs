@@ -21,7 +21,7 @@ use sqlx::any::{Any, AnyPoolOptions};
 use sqlx::{AnyConnection, AnyPool, Transaction};
 
 pub use assignments::{Released, Revocable, TaskOrder};
-pub use deployments::{DeploymentStatus, NewDeployment};
+pub use deployments::NewDeployment;
 pub use orders::PastOrder;
 pub use packages::{NewManifest, PutManifest, Reference, StoredManifest};
 pub use reports::{OpenAssignment, ReportedRobot};
@@ -167,12 +167,13 @@ fn pool_options(url: &str, connections: u32) -> AnyPoolOptions {
     })
 }
 
-/// A URL as it may be shown: `user:password@` cut out.
+/// A URL as it may be shown: `user:password@` and the query, which may hold a password too, cut out.
 fn without_password(url: &str) -> String {
-    match (url.find("://"), url.rfind('@')) {
+    let shown = match (url.find("://"), url.rfind('@')) {
         (Some(scheme), Some(at)) if scheme + 3 < at => format!("{}{}", &url[..scheme + 3], &url[at + 1..]),
         _ => url.to_owned(),
-    }
+    };
+    shown.split('?').next().unwrap_or_default().to_owned()
 }
 
 #[cfg(test)]
@@ -182,6 +183,8 @@ mod tests {
     #[test]
     fn a_shown_url_has_no_password() {
         assert_eq!(without_password("postgres://u:p@ss@host/db"), "postgres://host/db");
+        assert_eq!(without_password("postgres://u:p?ss@host/db"), "postgres://host/db");
+        assert_eq!(without_password("postgres://host/db?password=secret"), "postgres://host/db");
         assert_eq!(without_password("sqlite:///a.db"), "sqlite:///a.db");
     }
 

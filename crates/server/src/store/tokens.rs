@@ -143,6 +143,19 @@ impl Write {
         Ok(())
     }
 
+    /// Forgets enrolment and robot tokens that are good for nothing any more. A revoked operator token stays: the one in the
+    /// data directory must not come back to life at the next start.
+    pub async fn forget_ended_tokens(&mut self, now_ms: u64) -> Result<(), StoreError> {
+        sqlx::query(
+            "DELETE FROM tokens
+             WHERE kind <> 'operator' AND (revoked_at_ms IS NOT NULL OR expires_at_ms <= $1 OR uses_left = 0)",
+        )
+        .bind(stored(now_ms))
+        .execute(self.connection())
+        .await?;
+        Ok(())
+    }
+
     async fn insert_token(&mut self, token: &Token, robot: Option<&RobotId>, now_ms: u64) -> Result<(), StoreError> {
         sqlx::query("INSERT INTO tokens (id, kind, digest, robot_id, created_at_ms) VALUES ($1, $2, $3, $4, $5)")
             .bind(token.id())

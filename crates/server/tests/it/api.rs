@@ -89,6 +89,14 @@ async fn a_cancelled_order_puts_the_old_version_back() {
     let cancelled: DeploymentView = answer(server.request(Method::POST, &path)).await;
     assert_eq!(cancelled.state, DeploymentState::Cancelled);
     assert_eq!(server.desired(&robot).await.tasks[0].package, old);
+    // An order that is repeated after its package was deleted is the same order.
+    let path = format!("/v2/talker/manifests/{}", new.manifest.digest);
+    let deleted = server.request(Method::DELETE, &path).send().await.expect("an answer");
+    assert_eq!(deleted.status(), StatusCode::ACCEPTED);
+    assert_eq!(server.deploy(&new, "*", "key-2").await.id, second.id);
+    let body = json!({ "package": "talker", "manifest": new.manifest.digest, "selector": "*" });
+    let refused = refusal(server.order("/api/v1/deployments", "key-3", &body)).await;
+    assert_eq!(refused, (404, "package_not_found".to_owned()));
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -24,6 +24,7 @@ on_both_databases! {
     racing_operators_leave_one_winner,
     a_newer_deployment_supersedes_and_a_cancel_puts_back,
     a_cancel_skips_what_was_cancelled_before,
+    robots_that_are_to_poll_are_not_rung,
     batches_follow_each_other_and_failures_pause,
     what_is_not_done_in_time_expires,
     tasks_are_stopped_started_and_removed,
@@ -82,6 +83,16 @@ async fn tokens_stand_for_their_holder_until_they_end(database: TestDatabase) {
     assert_eq!(store.token_holder(&enrolment, now_ms).await.expect("reads"), None);
     assert_eq!(code(fleet.try_enroll(&enrolment, mac(1), None).await), "unauthorized");
     assert_eq!(code(fleet.try_enroll(&operator, mac(1), None).await), "unauthorized");
+    let lasting = fleet.enrolment_token(CreateEnrollmentToken::default()).await;
+    fleet.actions.expire().await.expect("forgets the one that has ended");
+    assert_eq!(store.token_holder(&lasting, now_ms).await.expect("reads"), Some(TokenHolder::Enrolment));
+    let mut write = store.begin().await.expect("begins");
+    assert_eq!(write.enrolment_terms(&enrolment, now_ms - 60_000).await.expect("reads"), None, "it is gone");
+    drop(write);
+    for unusable in ["no robot\0", "rob\u{e9}"] {
+        let order = CreateEnrollmentToken { robot: Some(unusable.to_owned()), ..Default::default() };
+        assert_eq!(code(fleet.actions.create_enrollment_token(&order).await), "not_found");
+    }
     for ttl_s in [0, u64::MAX] {
         let order = CreateEnrollmentToken { ttl_s: Some(ttl_s), ..Default::default() };
         assert_eq!(code(fleet.actions.create_enrollment_token(&order).await), "invalid_request");
@@ -150,6 +161,10 @@ async fn an_idempotency_key_orders_once(database: TestDatabase) {
     let other = task_proto::api::CreateDeployment { batch: Some(1), ..order };
     let refused = fleet.actions.create_deployment(&key, &other, &package).await;
     assert_eq!(code(refused), "idempotency_key_reused");
+    let before = fleet.actions.deployment_ordered_before(&key, &order_of(&package)).await.expect("reads");
+    assert_eq!(before, Some(first));
+    let never = fleet.actions.deployment_ordered_before(&random_key(), &order_of(&package)).await.expect("reads");
+    assert_eq!(never, None);
     let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
     let refused = fleet.actions.order_task(&key, TaskOrder::Stop, &task, &everyone).await;
     assert_eq!(code(refused), "idempotency_key_reused");
@@ -219,9 +234,14 @@ async fn a_newer_deployment_supersedes_and_a_cancel_puts_back(database: TestData
     fleet.follow(&mut robots[0], Phase::Running).await;
     assert_eq!(fleet.phases(&old).await, [Phase::Running, Phase::Running]);
     assert!(fleet.deployment(&new).await.supersedes.is_empty());
-    // Without anything to put back, the task goes.
+    // A service that runs has settled: there is nothing to interrupt.
     fleet.actions.cancel_deployment(&old).await.expect("cancelled");
-    assert!(fleet.desired(&robots[1]).await.expect("state").tasks.is_empty());
+    assert_eq!(fleet.phases(&old).await, [Phase::Running, Phase::Running]);
+    assert_eq!(fleet.desired(&robots[1]).await.expect("state").tasks[0].deployment, old);
+    // What runs under a cancelled deployment is put back like any other.
+    let third = fleet.deploy("3", |_| ()).await;
+    fleet.actions.cancel_deployment(&third).await.expect("cancelled");
+    assert_eq!(fleet.desired(&robots[1]).await.expect("state").tasks[0].deployment, old);
     let unknown = task_proto::DeploymentId::random();
     assert_eq!(code(fleet.actions.cancel_deployment(&unknown).await), "not_found");
     assert_eq!(code(fleet.actions.resume_deployment(&old).await), "deployment_cancelled");
@@ -237,6 +257,22 @@ async fn a_cancel_skips_what_was_cancelled_before(database: TestDatabase) {
     assert_eq!(fleet.desired(&robots[0]).await.expect("state").tasks[0].deployment, three);
     fleet.actions.cancel_deployment(&three).await.expect("cancelled");
     assert_eq!(fleet.desired(&robots[0]).await.expect("state").tasks[0].deployment, one);
+    // Without anything to put back, the task goes.
+    fleet.actions.cancel_deployment(&one).await.expect("cancelled");
+    assert!(fleet.desired(&robots[0]).await.expect("state").tasks.is_empty());
+}
+
+async fn robots_that_are_to_poll_are_not_rung(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let robots = fleet.enroll(2).await;
+    let poll = fleet.deploy("1", |order| {
+        order.selector = "r0".parse().expect("valid");
+        order.delivery = task_proto::desired::Delivery::Poll;
+    });
+    let poll = poll.await;
+    fleet.deploy("2", |order| order.selector = "r1".parse().expect("valid")).await;
+    assert_eq!(fleet.changes.take_rings().await, [robots[1].id.clone()].into());
+    assert_eq!(fleet.desired(&robots[0]).await.expect("state").tasks[0].deployment, poll);
 }
 
 async fn batches_follow_each_other_and_failures_pause(database: TestDatabase) {

@@ -293,6 +293,18 @@ async fn an_operator_who_does_not_acknowledge_is_shown_out() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn an_idle_client_is_not_taken_for_deaf_when_it_speaks_again() {
+    let write_timeout = Duration::from_millis(50);
+    let broker = TestBroker::with(|limits| limits.write_timeout = write_timeout).await;
+    let mut raw = broker.robot(&RobotId::random()).await;
+    for _ in 0..8 {
+        timeout(write_timeout * 2, raw.stream.read_u8()).await.expect_err("nothing comes unasked");
+        raw.send(&[0xc0, 0]).await;
+        raw.expect(&[0xd0, 0]).await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn there_are_as_many_places_as_configured() {
     let broker = TestBroker::with(|limits| (limits.max_connections, limits.max_operators) = (6, 2)).await;
     let (first, second) = (broker.operator("taskd/v1/#", 0).await, broker.operator("taskd/v1/#", 0).await);

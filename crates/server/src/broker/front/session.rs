@@ -259,14 +259,19 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         if may_read {
             self.input.reserve(1024);
         }
-        tokio::select! {
+        let woken = tokio::select! {
             stored = stored(&mut self.storing) => Woken::Stored(stored),
             wrote = self.writer.write_buf(&mut self.output), if !self.output.is_empty() => Woken::Wrote(wrote),
             read = self.reader.read_buf(&mut self.input), if may_read => Woken::Read(read),
             payload = self.seat.doorbell().answer(), if may_send && hears_desired => Woken::Rung(payload),
             heard = heard(&mut self.listener), if may_send => Woken::Heard(heard),
             () = sleep_until(deadline) => Woken::Late(lateness),
+        };
+        if may_send {
+            // Until now there was nothing to take, however long that was.
+            self.progress_at = Instant::now();
         }
+        woken
     }
 
     /// By when something must happen, and what it means if it does not.

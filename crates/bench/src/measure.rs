@@ -1,0 +1,96 @@
+//! Many robots' steps at once, and what they took: latencies and failures of one phase. It never drops a failure.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use futures_util::StreamExt as _;
+
+/// How long a phase may take. A step that is not done by then has failed.
+pub const PHASE_LIMIT: Duration = Duration::from_secs(300);
+
+/// What one robot's step took, or why it failed.
+pub type Sample = anyhow::Result<Duration>;
+
+/// Runs `steps`, at most `at_once` at a time, until all are done or `limit` is over.
+pub async fn every<T>(
+    at_once: usize,
+    limit: Duration,
+    steps: impl IntoIterator<Item = impl Future<Output = anyhow::Result<T>>>,
+) -> Vec<anyhow::Result<T>> {
+    let deadline = tokio::time::Instant::now() + limit;
+    let steps = steps.into_iter().map(|step| async move {
+        let in_time = tokio::time::timeout_at(deadline, step).await;
+        in_time.unwrap_or_else(|_| Err(anyhow::anyhow!("not done after the {limit:?} that the phase may take")))
+    });
+    futures_util::stream::iter(steps).buffer_unordered(at_once).collect().await
+}
+
+/// A phase as it was measured.
+pub struct Phase {
+    /// Its name.
+    pub name: &'static str,
+    /// From its begin to its last step's end.
+    pub wall: Duration,
+    /// How often each failure happened.
+    pub failures: BTreeMap<String, usize>,
+    /// What the successful steps took, the shortest first.
+    latencies: Vec<Duration>,
+}
+
+impl Phase {
+    /// A phase that took `wall`.
+    pub fn new(name: &'static str, wall: Duration, samples: impl IntoIterator<Item = Sample>) -> Self {
+        let mut phase = Self { name, wall, failures: BTreeMap::new(), latencies: Vec::new() };
+        for sample in samples {
+            match sample {
+                Ok(latency) => phase.latencies.push(latency),
+                Err(error) => *phase.failures.entry(format!("{error:#}")).or_default() += 1,
+            }
+        }
+        phase.latencies.sort_unstable();
+        phase
+    }
+
+    /// All steps, failed ones included.
+    pub fn count(&self) -> usize {
+        self.latencies.len() + self.failed()
+    }
+
+    /// The steps that failed.
+    pub fn failed(&self) -> usize {
+        self.failures.values().sum()
+    }
+
+    /// The latency in milliseconds that `percent` of the successful steps did not exceed; `None` if none succeeded.
+    pub fn percentile_ms(&self, percent: usize) -> Option<f64> {
+        let rank = (self.latencies.len() * percent).div_ceil(100).max(1);
+        self.latencies.get(rank - 1).map(|latency| latency.as_secs_f64() * 1000.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn percentiles_are_latencies_that_occurred() {
+        let phase = |n: u64| Phase::new("x", Duration::ZERO, (1..=n).rev().map(|ms| Ok(Duration::from_millis(ms))));
+        assert_eq!([50, 99, 100].map(|p| phase(200).percentile_ms(p)), [Some(100.0), Some(198.0), Some(200.0)]);
+        assert_eq!([50, 99, 100].map(|p| phase(1).percentile_ms(p)), [Some(1.0); 3]);
+        assert_eq!(phase(0).percentile_ms(50), None);
+    }
+
+    #[tokio::test]
+    async fn failures_and_what_is_not_done_in_time_are_counted() {
+        let steps = (0..4).map(|n| async move {
+            match n {
+                0 => std::future::pending().await,
+                1 => Ok(Duration::from_secs(1)),
+                _ => anyhow::bail!("refused"),
+            }
+        });
+        let phase = Phase::new("x", Duration::ZERO, every(4, Duration::from_millis(50), steps).await);
+        assert_eq!((phase.count(), phase.failed(), phase.failures["refused"]), (4, 3, 2));
+        assert!(phase.failures.keys().any(|text| text.contains("not done after the 50ms")), "{:?}", phase.failures);
+    }
+}

@@ -1,0 +1,276 @@
+//! One simulated robot: an MQTT session in a task of its own, and the steps a run asks of it. What it is ordered it
+//! verifies with the pinned key and reports on; it never fetches or runs anything.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use rumqttc::{
+    AsyncClient, Event, EventLoop, Incoming, LastWill, MqttOptions, NetworkOptions, Outgoing, QoS, SubscribeReasonCode,
+};
+use task_proto::api::EnrollResponse;
+use task_proto::desired::{DesiredState, DesiredTask, Doorbell, MAX_PUSHED_ENVELOPE_BYTES};
+use task_proto::envelope::{DESIRED_STATE_TYPE, PublicKey};
+use task_proto::report::{ActiveVersion, HostFacts, Phase, Report, Status, TaskReport};
+use task_proto::topic::{RobotTopic, Topic};
+use task_proto::{DeploymentId, Generation, InstanceId};
+use tokio::sync::watch;
+use tokio::task::JoinHandle;
+
+/// How long the server may take for any one thing.
+const PATIENCE: Duration = Duration::from_secs(60);
+/// As the agent's.
+const KEEP_ALIVE: Duration = Duration::from_secs(20);
+/// Requests between a robot and its session: a subscription, a status and a report.
+const QUEUED_REQUESTS: usize = 8;
+
+/// Why a robot's step failed.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum RobotError {
+    /// The session ended, says the broker or the MQTT client.
+    #[error("the MQTT session ended: {0}")]
+    Ended(String),
+    /// An earlier step failed.
+    #[error("no MQTT session since an earlier failure")]
+    NoSession,
+    /// The server did not answer.
+    #[error("no {0} within {PATIENCE:?}")]
+    Late(&'static str),
+}
+
+/// Where a robot connects to, as whom, and whose orders it takes.
+pub struct Identity {
+    /// What the server said at enrolment.
+    pub enrolled: EnrollResponse,
+    /// The MQTT broker's host.
+    pub host: String,
+    /// Its port.
+    pub port: u16,
+    /// The key pinned by the enrolment token.
+    pub key: PublicKey,
+}
+
+/// A robot of the fleet.
+pub struct Robot {
+    identity: Arc<Identity>,
+    instance: InstanceId,
+    began: Instant,
+    connection: u64,
+    seq: u64,
+    order: Option<(Generation, DesiredTask)>,
+    session: Option<Session>,
+}
+
+/// What has been heard in a session, with the time of it.
+#[derive(Default)]
+struct Heard {
+    subscribed: Option<Instant>,
+    reports: u64,
+    last_report: Option<Instant>,
+    desired: Option<(DesiredState, Instant)>,
+    ended: Option<String>,
+}
+
+/// An MQTT session. Dropping it closes the connection without a goodbye, as a power cut does.
+struct Session {
+    client: AsyncClient,
+    heard: watch::Receiver<Heard>,
+    listener: JoinHandle<()>,
+    published: u64,
+}
+
+impl Drop for Session {
+    fn drop(&mut self) {
+        self.listener.abort();
+    }
+}
+
+impl Robot {
+    /// A robot that is not connected.
+    pub fn new(identity: Identity) -> Self {
+        let (instance, began) = (InstanceId::random(), Instant::now());
+        Self { identity: Arc::new(identity), instance, began, connection: 0, seq: 0, order: None, session: None }
+    }
+
+    /// Connects and subscribes; gives the time from now to SUBACK. The status is published after it.
+    pub async fn connect(&mut self) -> Result<Duration, RobotError> {
+        self.connection += 1;
+        let begun = Instant::now();
+        let (client, mut event_loop) = AsyncClient::new(self.identity.options(self.status(false)), QUEUED_REQUESTS);
+        let mut network = NetworkOptions::new();
+        network.set_connection_timeout(PATIENCE.as_secs());
+        network.set_tcp_nodelay(true);
+        event_loop.set_network_options(network);
+        let (heard_in, heard) = watch::channel(Heard::default());
+        let listener = listen(event_loop, client.clone(), self.identity.clone(), self.status(true), heard_in);
+        self.session = Some(Session { client, heard, listener: tokio::spawn(listener), published: 0 });
+        Ok(self.hear("SUBACK", |heard| heard.subscribed).await? - begun)
+    }
+
+    /// Loses its connection.
+    pub fn cut(&mut self) {
+        self.session = None;
+    }
+
+    /// Waits for the signed order of `deployment`; gives when it came.
+    pub async fn receive(&mut self, deployment: &DeploymentId) -> Result<Instant, RobotError> {
+        let find = |heard: &Heard| {
+            let (state, at) = heard.desired.as_ref()?;
+            let task = state.tasks.iter().find(|task| task.deployment == *deployment)?;
+            Some((state.generation, task.clone(), *at))
+        };
+        let (generation, task, at) = self.hear("order", find).await?;
+        self.order = Some((generation, task));
+        Ok(at)
+    }
+
+    /// Reports that what was ordered, if anything was, is in `phase`; gives the time from now to PUBACK.
+    pub async fn report(&mut self, phase: Phase) -> Result<Duration, RobotError> {
+        self.seq += 1;
+        let begun = Instant::now();
+        let payload = json_bytes(&self.snapshot(phase));
+        let topic = self.identity.topic(RobotTopic::Report);
+        let session = self.session.as_mut().ok_or(RobotError::NoSession)?;
+        session.published += 1;
+        let published = session.published;
+        // The queue has room, as one report is under way at a time; a session that ended says so below.
+        let _ = session.client.try_publish(topic, QoS::AtLeastOnce, false, payload);
+        let stored = |heard: &Heard| heard.last_report.filter(|_| heard.reports >= published);
+        Ok(self.hear("PUBACK of a report", stored).await? - begun)
+    }
+
+    /// Waits until `find` finds. After a failure the session is over: a late answer must not count for the next step.
+    async fn hear<T>(&mut self, what: &'static str, find: impl Fn(&Heard) -> Option<T>) -> Result<T, RobotError> {
+        let session = self.session.as_mut().ok_or(RobotError::NoSession)?;
+        let news = session.heard.wait_for(|heard| heard.ended.is_some() || find(heard).is_some());
+        let outcome = match tokio::time::timeout(PATIENCE, news).await {
+            Ok(Ok(heard)) => find(&heard).ok_or_else(|| RobotError::Ended(heard.ended.clone().unwrap_or_default())),
+            Ok(Err(_)) => Err(RobotError::NoSession),
+            Err(_) => Err(RobotError::Late(what)),
+        };
+        if outcome.is_err() {
+            self.cut();
+        }
+        outcome
+    }
+
+    fn status(&self, online: bool) -> Vec<u8> {
+        json_bytes(&Status { online, start: 1, instance: self.instance.clone(), connection: self.connection })
+    }
+
+    fn snapshot(&self, phase: Phase) -> Report {
+        let task = |task: &DesiredTask| TaskReport {
+            task: task.task.clone(),
+            deployment: task.deployment.clone(),
+            package: task.package.clone(),
+            wanted: task.wanted,
+            run: task.run,
+            kind: None,
+            phase,
+            phase_ms: 0,
+            progress: None,
+            attempts: 1,
+            restarts: 0,
+            failure: None,
+            active: (phase == Phase::Running).then(|| ActiveVersion {
+                deployment: task.deployment.clone(),
+                version: task.package.version.clone(),
+                pid: 1,
+            }),
+        };
+        Report {
+            robot_id: self.identity.enrolled.robot_id.clone(),
+            start: 1,
+            instance: self.instance.clone(),
+            boot_id: "00000000-0000-0000-0000-000000000000".to_owned(),
+            seq: self.seq,
+            observed_generation: self.order.as_ref().map_or(Generation(0), |(generation, _)| *generation),
+            uptime_ms: u64::try_from(self.began.elapsed().as_millis()).unwrap_or(u64::MAX),
+            host: HostFacts {
+                agent_version: concat!("taskbench ", env!("CARGO_PKG_VERSION")).to_owned(),
+                hostname: self.identity.enrolled.name.to_string(),
+                arch: std::env::consts::ARCH.to_owned(),
+                ..HostFacts::default()
+            },
+            conditions: Vec::new(),
+            tasks: self.order.iter().map(|(_, ordered)| task(ordered)).collect(),
+        }
+    }
+}
+
+impl Identity {
+    fn topic(&self, topic: RobotTopic) -> String {
+        self.enrolled.mqtt.prefix.format(&Topic::Robot(self.enrolled.robot_id.clone(), topic))
+    }
+
+    fn options(&self, will: Vec<u8>) -> MqttOptions {
+        let mut options = MqttOptions::new(self.enrolled.robot_id.as_str(), &self.host, self.port);
+        options.set_credentials(self.enrolled.robot_id.as_str(), &self.enrolled.token);
+        options.set_keep_alive(KEEP_ALIVE);
+        options.set_max_packet_size(2 * MAX_PUSHED_ENVELOPE_BYTES, MAX_PUSHED_ENVELOPE_BYTES);
+        options.set_last_will(LastWill::new(self.topic(RobotTopic::Status), will, QoS::AtLeastOnce, false));
+        options
+    }
+
+    /// The state in a message on the `desired` topic, verified.
+    fn open(&self, payload: &[u8]) -> Result<DesiredState, String> {
+        let doorbell = serde_json::from_slice(payload).map_err(|error| format!("not a desired state: {error}"))?;
+        let Doorbell::State(envelope) = doorbell else {
+            return Err("a desired state was too large for a message".to_owned());
+        };
+        let payload = envelope.open(DESIRED_STATE_TYPE, &self.key).map_err(|error| error.to_string())?;
+        let state: DesiredState = serde_json::from_slice(&payload).map_err(|error| error.to_string())?;
+        let is_ours = state.robot_id == self.enrolled.robot_id;
+        if is_ours { Ok(state) } else { Err("a desired state for another robot".to_owned()) }
+    }
+}
+
+/// Drives a session to its end. Its poll is never dropped half way, unless the whole session is.
+async fn listen(
+    mut event_loop: EventLoop,
+    client: AsyncClient,
+    identity: Arc<Identity>,
+    status: Vec<u8>,
+    heard: watch::Sender<Heard>,
+) {
+    // The first publish of a session is the status. Its packet id is free for reports once it is acknowledged.
+    let (mut first_publish, mut status_acknowledged) = (None, false);
+    let ended = loop {
+        let event = match event_loop.poll().await {
+            Ok(event) => event,
+            Err(error) => break error.to_string(),
+        };
+        // The queue is empty at the start of a session, so nothing that is tried here is refused.
+        match event {
+            Event::Incoming(Incoming::ConnAck(_)) => {
+                let _ = client.try_subscribe(identity.topic(RobotTopic::Desired), QoS::AtLeastOnce);
+            }
+            Event::Incoming(Incoming::SubAck(ack)) if ack.return_codes.contains(&SubscribeReasonCode::Failure) => {
+                break "the subscription was refused".to_owned();
+            }
+            Event::Incoming(Incoming::SubAck(_)) => {
+                let topic = identity.topic(RobotTopic::Status);
+                let _ = client.try_publish(topic, QoS::AtLeastOnce, false, status.clone());
+                heard.send_modify(|heard| heard.subscribed = Some(Instant::now()));
+            }
+            Event::Outgoing(Outgoing::Publish(id)) => first_publish = first_publish.or(Some(id)),
+            Event::Incoming(Incoming::PubAck(ack)) if Some(ack.pkid) == first_publish && !status_acknowledged => {
+                status_acknowledged = true;
+            }
+            Event::Incoming(Incoming::PubAck(_)) => heard.send_modify(|heard| {
+                heard.reports += 1;
+                heard.last_report = Some(Instant::now());
+            }),
+            Event::Incoming(Incoming::Publish(message)) => match identity.open(&message.payload) {
+                Ok(state) => heard.send_modify(|heard| heard.desired = Some((state, Instant::now()))),
+                Err(text) => break text,
+            },
+            _ => {}
+        }
+    };
+    heard.send_modify(|heard| heard.ended = Some(ended));
+}
+
+fn json_bytes(value: &impl serde::Serialize) -> Vec<u8> {
+    // Plain numbers and texts can always be written.
+    serde_json::to_vec(value).unwrap_or_default()
+}

@@ -1,0 +1,162 @@
+//! The server's HTTP API as far as a load run needs it. Nothing is retried: a run measures what one try does.
+
+use std::time::Duration;
+
+use reqwest::{Method, RequestBuilder, Response, StatusCode, Url};
+use serde::de::DeserializeOwned;
+use task_proto::api::{
+    CreateDeployment, CreateEnrollmentToken, DeploymentView, EnrollRequest, EnrollResponse, EnrollmentToken, ErrorBody,
+    IDEMPOTENCY_KEY, RobotList, ServerInfo,
+};
+use task_proto::desired::BlobRef;
+use task_proto::manifest::{ContentFacts, TaskManifest};
+use task_proto::oci::{ImageManifest, MANIFEST_TYPE};
+use task_proto::selector::Selector;
+use task_proto::token::Token;
+use task_proto::{DeploymentId, Digest, RobotId, TaskName, Version};
+
+/// How long one answer may take.
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(60);
+
+/// Why the server did not do what it was asked.
+#[derive(Debug, thiserror::Error)]
+pub enum ServerError {
+    /// It could not be reached, went away, or answered something else than taskd does.
+    #[error("no answer to {0}")]
+    NoAnswer(&'static str, #[source] reqwest::Error),
+    /// It answered with an error.
+    #[error("{0} was refused with {1}: {2}")]
+    Refused(&'static str, StatusCode, String),
+}
+
+/// A server and the operator's token for it.
+pub struct Server {
+    http: reqwest::Client,
+    base: Url,
+    token: String,
+}
+
+impl Server {
+    /// Nothing is sent yet.
+    pub fn new(base: Url, token: &Token) -> Result<Self, ServerError> {
+        // A second install is refused because the first is in place, which is all that matters.
+        let _ = rustls::crypto::ring::default_provider().install_default();
+        let http = reqwest::Client::builder().timeout(ANSWER_TIMEOUT).redirect(reqwest::redirect::Policy::none());
+        let http = http.build().map_err(|source| ServerError::NoAnswer("nothing", source))?;
+        Ok(Self { http, base, token: token.reveal() })
+    }
+
+    pub async fn info(&self) -> Result<ServerInfo, ServerError> {
+        read("the question for its version", self.request(Method::GET, "/api/v1/server")).await
+    }
+
+    pub async fn create_enrollment_token(&self, order: &CreateEnrollmentToken) -> Result<EnrollmentToken, ServerError> {
+        read("an enrolment token", self.request(Method::POST, "/api/v1/enrollment-tokens").json(order)).await
+    }
+
+    /// What a robot does with the enrolment token.
+    pub async fn enroll(&self, token: &str, request: &EnrollRequest) -> Result<EnrollResponse, ServerError> {
+        let post = self.http.post(self.url("/api/v1/enroll")).bearer_auth(token);
+        read("an enrolment", post.json(request)).await
+    }
+
+    pub async fn robots(&self, selector: &Selector) -> Result<RobotList, ServerError> {
+        let get = self.request(Method::GET, "/api/v1/robots");
+        read("the list of robots", get.query(&[("selector", selector.to_string())])).await
+    }
+
+    pub async fn remove_robot(&self, robot: &RobotId) -> Result<(), ServerError> {
+        send("a robot's removal", self.request(Method::DELETE, &format!("/api/v1/robots/{robot}"))).await.map(drop)
+    }
+
+    pub async fn order(&self, order: &CreateDeployment) -> Result<DeploymentView, ServerError> {
+        let post = self.request(Method::POST, "/api/v1/deployments").header(IDEMPOTENCY_KEY, order.manifest.hex());
+        read("the order", post.json(order)).await
+    }
+
+    pub async fn deployment(&self, id: &DeploymentId) -> Result<DeploymentView, ServerError> {
+        read("the deployment", self.request(Method::GET, &format!("/api/v1/deployments/{id}"))).await
+    }
+
+    /// Pushes a package with one small file, and gives its manifest.
+    pub async fn push_package(&self, name: &TaskName, version: &Version) -> Result<Digest, ServerError> {
+        let (content, facts) = content();
+        let run = task_proto::manifest::Run { exec: Some(vec!["./run.sh".to_owned()]), ..Default::default() };
+        let manifest = TaskManifest {
+            name: name.clone(),
+            version: version.clone(),
+            build: Default::default(),
+            run,
+            ready: Default::default(),
+            parameters: Default::default(),
+            outputs: Default::default(),
+            requires: Default::default(),
+            exec_depends: Vec::new(),
+            content: facts,
+        };
+        let image = ImageManifest::package(
+            self.push_blob(name, json_bytes(&manifest)).await?,
+            self.push_blob(name, content).await?,
+        );
+        let bytes = json_bytes(&image);
+        let digest = Digest::of(&bytes);
+        let put = self.request(Method::PUT, &format!("/v2/{name}/manifests/{version}"));
+        send("the manifest", put.header(reqwest::header::CONTENT_TYPE, MANIFEST_TYPE).body(bytes)).await?;
+        Ok(digest)
+    }
+
+    pub async fn remove_package(&self, name: &TaskName, manifest: &Digest) -> Result<(), ServerError> {
+        let delete = self.request(Method::DELETE, &format!("/v2/{name}/manifests/{manifest}"));
+        send("the package's removal", delete).await.map(drop)
+    }
+
+    async fn push_blob(&self, name: &TaskName, bytes: Vec<u8>) -> Result<BlobRef, ServerError> {
+        let blob = BlobRef { digest: Digest::of(&bytes), size: bytes.len() as u64 };
+        let post = self.request(Method::POST, &format!("/v2/{name}/blobs/uploads/?digest={}", blob.digest));
+        send("a blob", post.body(bytes)).await?;
+        Ok(blob)
+    }
+
+    fn request(&self, method: Method, path: &str) -> RequestBuilder {
+        self.http.request(method, self.url(path)).bearer_auth(&self.token)
+    }
+
+    fn url(&self, path: &str) -> String {
+        format!("{}{path}", self.base.as_str().trim_end_matches('/'))
+    }
+}
+
+/// A file in a tar+zstd, as the packer writes it.
+fn content() -> (Vec<u8>, ContentFacts) {
+    let script: &[u8] = b"#!/bin/sh\nexec sleep infinity\n";
+    let mut header = tar::Header::new_ustar();
+    header.set_size(script.len() as u64);
+    header.set_mode(0o755);
+    header.set_entry_type(tar::EntryType::Regular);
+    let mut archive = tar::Builder::new(Vec::new());
+    let tar = archive.append_data(&mut header, "run.sh", script).and_then(|()| archive.into_inner());
+    // Writing to memory does not fail.
+    let tar = tar.unwrap_or_default();
+    let facts = ContentFacts { tar_digest: Digest::of(&tar), tar_size: tar.len() as u64, entries: 1 };
+    (zstd::bulk::compress(&tar, 0).unwrap_or_default(), facts)
+}
+
+fn json_bytes(value: &impl serde::Serialize) -> Vec<u8> {
+    // Plain numbers and texts can always be written.
+    serde_json::to_vec(value).unwrap_or_default()
+}
+
+async fn read<T: DeserializeOwned>(what: &'static str, request: RequestBuilder) -> Result<T, ServerError> {
+    send(what, request).await?.json().await.map_err(|source| ServerError::NoAnswer(what, source.without_url()))
+}
+
+async fn send(what: &'static str, request: RequestBuilder) -> Result<Response, ServerError> {
+    // Without the URL, which differs from robot to robot, the same failure has the same text.
+    let response = request.send().await.map_err(|source| ServerError::NoAnswer(what, source.without_url()))?;
+    if response.status().is_success() {
+        return Ok(response);
+    }
+    let status = response.status();
+    let body = response.json::<ErrorBody>().await;
+    Err(ServerError::Refused(what, status, body.map_or("no reason given".to_owned(), |body| body.error.message)))
+}

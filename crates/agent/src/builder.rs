@@ -15,8 +15,8 @@ use tokio_util::sync::CancellationToken;
 use crate::containment::{Containment, ContainmentError, RUN_DIR_VARIABLE};
 use crate::durable;
 use crate::layout::VersionDir;
+use crate::process::ExitStatus;
 use crate::process::{self, BuildPriority};
-use crate::run_dir::ExitStatus;
 use crate::script;
 
 /// How long the processes of a build may take to be gone.

@@ -5,7 +5,7 @@ use task_proto::Digest;
 use task_proto::id::Labels;
 use task_proto::manifest::{Requires, TaskManifest};
 
-use crate::run_dir::ExitStatus;
+use crate::process::ExitStatus;
 
 /// What is on the disk of one version, and which versions there are.
 #[derive(Debug, Clone, Default, PartialEq)]

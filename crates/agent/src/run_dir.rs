@@ -6,7 +6,6 @@ use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
 use std::io;
 use std::os::unix::fs::OpenOptionsExt;
-use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
@@ -14,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use task_proto::DeploymentId;
 
 use crate::durable;
-use crate::process::ProcessIdentity;
+use crate::process::{ExitStatus, ProcessIdentity};
 
 /// One start of a task, by its directory.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -53,16 +52,6 @@ pub struct Started {
     pub shim: ProcessIdentity,
     /// The task's first process, which leads its own process group.
     pub task: ProcessIdentity,
-}
-
-/// How a task's first process ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum ExitStatus {
-    /// It exited with this code.
-    Code(i32),
-    /// This signal killed it.
-    Signal(i32),
 }
 
 /// The end of a run. When this is on disk, none of the run's processes is left that the shim could see.
@@ -175,25 +164,6 @@ impl LogSpec {
     /// A log at `path` of at most 50 MiB in five files.
     pub fn at(path: PathBuf) -> Self {
         Self { path, max_bytes: 10 * 1024 * 1024, files: 5 }
-    }
-}
-
-impl From<std::process::ExitStatus> for ExitStatus {
-    fn from(status: std::process::ExitStatus) -> Self {
-        // A process that was waited for has one or the other.
-        status.code().map_or_else(|| Self::Signal(status.signal().unwrap_or_default()), Self::Code)
-    }
-}
-
-impl std::fmt::Display for ExitStatus {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Self::Code(code) => write!(f, "exited with code {code}"),
-            Self::Signal(signal) => match nix::sys::signal::Signal::try_from(*signal) {
-                Ok(known) => write!(f, "killed by {known}"),
-                Err(_) => write!(f, "killed by signal {signal}"),
-            },
-        }
     }
 }
 

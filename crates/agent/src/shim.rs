@@ -14,8 +14,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::containment::Containment;
 use crate::logs::RotatedLog;
+use crate::process::ExitStatus;
 use crate::process::{self, ChildEvent, ProcessIdentity};
-use crate::run_dir::{Ended, ExitStatus, RunDir, RunDirError, Started};
+use crate::run_dir::{Ended, RunDir, RunDirError, Started};
 
 /// How long what a task leaves behind may take to end after SIGTERM.
 const LEFTOVER_GRACE: Duration = Duration::from_secs(2);

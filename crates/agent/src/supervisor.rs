@@ -15,7 +15,8 @@ use nix::sys::signal::Signal;
 
 use crate::containment::{ASSIGNMENT_VARIABLE, Containment, ContainmentError, RUN_DIR_VARIABLE};
 use crate::process;
-use crate::run_dir::{ExitStatus, RunDir, RunDirError, RunSpec, Started};
+use crate::process::ExitStatus;
+use crate::run_dir::{RunDir, RunDirError, RunSpec, Started};
 use crate::shim::Answer;
 
 /// How long a start may take; it is a fork, an exec and two small files.

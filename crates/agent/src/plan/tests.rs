@@ -11,7 +11,7 @@ use task_proto::{DeploymentId, Digest};
 
 use super::*;
 use crate::observed::Exit;
-use crate::run_dir::ExitStatus;
+use crate::process::ExitStatus;
 
 /// One robot with one task.
 struct World {

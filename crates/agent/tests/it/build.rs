@@ -7,7 +7,8 @@ use std::time::Duration;
 
 use task_agent::builder::{self, BuildError, BuildLimits, BuildOrder};
 use task_agent::layout::DataDir;
-use task_agent::run_dir::{ExitStatus, LogSpec, RunSpec};
+use task_agent::process::ExitStatus;
+use task_agent::run_dir::{LogSpec, RunSpec};
 use task_agent::supervisor::Observed;
 use task_agent::underlay::{SYSTEM_ROOT, Underlays};
 use task_agent::{environment, process, script};

@@ -294,6 +294,11 @@ fn read_token(path: &Path) -> Result<String, ClientError> {
     std::fs::read_to_string(path).map_err(|source| ClientError::TokenFile { path: path.to_owned(), source })
 }
 
+/// A key for an order that the operator gave none.
+pub(super) fn random_key() -> String {
+    format!("{:032x}", rand::random::<u128>())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

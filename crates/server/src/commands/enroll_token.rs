@@ -38,7 +38,7 @@ pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, Co
         ttl_s: ttl.map(|ttl| ttl.as_secs()),
         labels: labels.into_iter().collect(),
     };
-    let key = super::push::random_key();
+    let key = super::client::random_key();
     let token: EnrollmentToken = session.client.order("/enrollment-tokens", &request, &key).await?;
     session.output.described(&token, |token| token.token.clone())?;
     say(&format!("valid until {}; it is not shown again", time(token.expires_at_ms)));

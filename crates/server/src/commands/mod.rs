@@ -20,6 +20,7 @@ mod push;
 mod robot;
 mod task;
 mod upload;
+mod view;
 mod wait;
 
 /// The operator's commands; `main` adds `serve` to them.

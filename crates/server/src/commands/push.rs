@@ -10,7 +10,7 @@ use task_proto::selector::Selector;
 
 use super::confirm::confirm;
 use super::output::{Output, bytes, robots, say};
-use super::{CommandError, Outcome, Session, deploy, robot, task, upload, wait};
+use super::{CommandError, Outcome, Session, client, robot, upload, view, wait};
 use crate::config::lifetime;
 use crate::package::{self, Packed};
 
@@ -78,7 +78,7 @@ pub(super) async fn run(session: &Session, push: Push) -> Result<Outcome, Comman
     };
     let packed = packed(push.dir.clone()).await?;
     if push.dry_run {
-        task::print_matched(session, &matched.unwrap_or_default())?;
+        view::print_matched(session, &matched.unwrap_or_default())?;
         return Ok(Outcome::Succeeded);
     }
     if let (Some(selector), Some(matched)) = (&push.to, &matched) {
@@ -102,7 +102,7 @@ pub(super) async fn run(session: &Session, push: Push) -> Result<Outcome, Comman
         expires_in_s: push.expires.map(|expires| expires.as_secs()),
         dry_run: false,
     };
-    let key = push.idempotency_key.unwrap_or_else(random_key);
+    let key = push.idempotency_key.unwrap_or_else(client::random_key);
     let ordered: DeploymentView = session.client.order("/deployments", &order, &key).await?;
     let count = robots(ordered.counts.iter().map(|count| count.count).sum());
     say(&format!("deployment {}: {} {} to {count}", ordered.id, order.package, ordered.package.version));
@@ -110,7 +110,7 @@ pub(super) async fn run(session: &Session, push: Push) -> Result<Outcome, Comman
         say(&format!("it supersedes {superseded}"));
     }
     if !push.wait {
-        session.output.described(&ordered, deploy::describe)?;
+        session.output.described(&ordered, view::describe)?;
         return Ok(Outcome::Succeeded);
     }
     wait::until_settled(session, &ordered.id, push.timeout).await
@@ -158,9 +158,4 @@ fn describe(packed: &Packed) -> String {
         bytes(facts.tar_size),
         facts.entries
     )
-}
-
-/// A key for an order that the operator gave none.
-pub(super) fn random_key() -> String {
-    format!("{:032x}", rand::random::<u128>())
 }

@@ -8,6 +8,7 @@ use task_proto::selector::Selector;
 use super::client::ClientError;
 use super::confirm::confirm;
 use super::output::{robots, say};
+use super::view::print_matched;
 use super::{CommandError, Outcome, Session};
 
 /// Which task on which robots.
@@ -52,10 +53,10 @@ pub(super) async fn run(session: &Session, verb: Verb, order: TaskOrder) -> Resu
     let path = format!("/tasks/{task}/{}", verb.as_str());
     // With a key this may be an order that was carried out before, whose tasks are gone by now: the server knows.
     let may_be_repeated = idempotency_key.is_some() && !dry_run;
-    let key = idempotency_key.unwrap_or_else(super::push::random_key);
+    let key = idempotency_key.unwrap_or_else(super::client::random_key);
     let ask = OrderTask { selector: on.clone(), dry_run: true };
     // A dry run is no order, so it gets a key of its own.
-    let matched: MatchedRobots = match session.client.order(&path, &ask, &super::push::random_key()).await {
+    let matched: MatchedRobots = match session.client.order(&path, &ask, &super::client::random_key()).await {
         Err(ClientError::Refused { code, .. }) if code == "no_robots_match" => MatchedRobots::default(),
         answer => answer?,
     };
@@ -75,18 +76,4 @@ pub(super) async fn run(session: &Session, verb: Verb, order: TaskOrder) -> Resu
         say(&format!("{offline} of them are offline and follow when they are back"));
     }
     Ok(Outcome::Succeeded)
-}
-
-/// Lists the robots an order means.
-pub(super) fn print_matched(session: &Session, matched: &MatchedRobots) -> Result<(), CommandError> {
-    session.output.result(matched, &["id", "name", "state"], |matched| {
-        let row = |robot: &task_proto::api::MatchedRobot| {
-            vec![
-                robot.id.to_string(),
-                robot.name.to_string(),
-                if robot.online { "online" } else { "offline" }.to_owned(),
-            ]
-        };
-        matched.robots.iter().map(row).collect()
-    })
 }

@@ -10,7 +10,7 @@ use tokio::time::{Instant, sleep, timeout_at};
 use super::client::ClientError;
 use super::output::{printable, say};
 use super::progress::DeploymentProgress;
-use super::{CommandError, Outcome, Session, deploy};
+use super::{CommandError, Outcome, Session, view};
 
 /// The first pause between two looks; it doubles while nothing changes.
 const MIN_PAUSE: Duration = Duration::from_millis(100);
@@ -49,7 +49,7 @@ pub(super) async fn until_settled(
         say("timed out: the server did not say how the deployment stands");
         return Ok(Outcome::TimedOut);
     };
-    session.output.described(&view, deploy::describe)?;
+    session.output.described(&view, view::describe)?;
     let verdict = judge(&view);
     say(&verdict.text);
     Ok(verdict.outcome)

@@ -13,6 +13,7 @@ mod package_xml;
 mod rules;
 mod source;
 mod task_toml;
+mod text_file;
 mod tree;
 
 pub use pack::pack;

@@ -4,7 +4,7 @@
 use task_proto::manifest::{BuildTool, TaskManifest};
 
 use super::package_xml::{self, PackageXml};
-use super::source::read_text;
+use super::text_file::read_text;
 use super::tree::{Entry, Tree};
 use super::{PackageError, Problem, task_toml};
 

@@ -1,8 +1,8 @@
 //! What a package's directory says of itself: `task.toml`, with what it leaves out taken from `package.xml`, merged into
 //! a task manifest, and the files that belong to it. It collects everything that is wrong before it gives up.
 
-use std::fs::{self, File};
-use std::io::{self, Read as _};
+use std::fs;
+use std::io;
 use std::path::Path;
 
 use task_proto::Digest;
@@ -10,11 +10,9 @@ use task_proto::manifest::{Build, BuildTool, ContentFacts, TaskManifest};
 
 use super::package_xml::{self, BuildType, PackageXml};
 use super::task_toml::{self, TaskToml};
+use super::text_file::read_text;
 use super::tree::Tree;
 use super::{PackageError, Problem, rules};
-
-/// The largest text file that is read.
-const MAX_TEXT_BYTES: u64 = 1024 * 1024;
 
 /// A directory that can become a package.
 #[derive(Debug)]
@@ -68,37 +66,6 @@ pub(super) fn read(dir: &Path) -> Result<Source, PackageError> {
             if problems.is_empty() { Ok(Source { manifest, tree }) } else { Err(invalid(problems)) }
         }
         _ => Err(invalid(problems)),
-    }
-}
-
-/// The text file `name` in `dir`; `None` if it is not there or can't be used, which is then a problem.
-pub(super) fn read_text(dir: &Path, name: &str, problems: &mut Vec<Problem>) -> Result<Option<String>, PackageError> {
-    let path = dir.join(name);
-    let mut refuse = |reason: String| problems.push(Problem { file: name.to_owned(), reason });
-    // Only a regular file is opened: a FIFO would wait for ever.
-    match fs::symlink_metadata(&path) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
-        Ok(metadata) if metadata.is_file() && metadata.len() <= MAX_TEXT_BYTES => {}
-        Ok(metadata) if metadata.is_file() => {
-            refuse(format!("is larger than {MAX_TEXT_BYTES} bytes"));
-            return Ok(None);
-        }
-        Ok(_) => {
-            refuse("is not a regular file".to_owned());
-            return Ok(None);
-        }
-        Err(source) => return Err(PackageError::Io { what: format!("can't read {}", path.display()), source }),
-    }
-    let mut bytes = Vec::new();
-    File::open(&path)
-        .and_then(|file| file.take(MAX_TEXT_BYTES).read_to_end(&mut bytes))
-        .map_err(|source| PackageError::Io { what: format!("can't read {}", path.display()), source })?;
-    match String::from_utf8(bytes) {
-        Ok(text) => Ok(Some(text)),
-        Err(_) => {
-            refuse("is not UTF-8".to_owned());
-            Ok(None)
-        }
     }
 }
 

@@ -220,7 +220,7 @@ impl Pattern {
 }
 
 fn read_patterns(root: &Path, problems: &mut Vec<Problem>) -> Result<Vec<Pattern>, PackageError> {
-    let Some(text) = super::source::read_text(root, IGNORE_FILE, problems)? else { return Ok(Vec::new()) };
+    let Some(text) = super::text_file::read_text(root, IGNORE_FILE, problems)? else { return Ok(Vec::new()) };
     let mut patterns = Vec::new();
     for (number, line) in text.lines().enumerate() {
         let line = line.trim();

@@ -127,7 +127,7 @@ impl Load {
         }
         let begun = Instant::now();
         // The server's list, not ours: an enrolment may have been stored whose answer never came.
-        let left = self.server.robots(&self.selector().parse()?).await?.robots;
+        let left = self.server.robots(&self.label().parse()?).await?.robots;
         let steps = left.iter().map(async |robot| {
             let begun = Instant::now();
             self.server.remove_robot(&robot.id).await?;
@@ -143,6 +143,11 @@ impl Load {
     /// Prints what is left to print, and gives the number of failed steps.
     pub fn finish(&self) -> usize {
         self.report.finish()
+    }
+
+    /// The label of this run's robots, which is also the selector that means them.
+    pub fn label(&self) -> String {
+        format!("{NAME}={}", self.run)
     }
 
     async fn enrol(&mut self) -> anyhow::Result<Vec<Robot>> {
@@ -193,7 +198,7 @@ impl Load {
         let order = CreateDeployment {
             package,
             manifest,
-            selector: self.selector().parse()?,
+            selector: self.label().parse()?,
             delivery: Delivery::PushPull,
             batch: None,
             max_failures: None,
@@ -263,10 +268,6 @@ impl Load {
         let steps = every(count, limit, steps).await;
         let samples = steps.into_iter().flat_map(|step| step.unwrap_or_else(|error| vec![Err(error)]));
         self.add("steady reports", begun, samples)
-    }
-
-    fn selector(&self) -> String {
-        format!("{NAME}={}", self.run)
     }
 
     fn add(

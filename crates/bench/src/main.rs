@@ -9,6 +9,7 @@ mod server;
 use std::io::Write as _;
 use std::process::ExitCode;
 
+use anyhow::Context as _;
 use clap::{Parser, Subcommand};
 
 use crate::load::{Load, LoadFlags};
@@ -49,8 +50,9 @@ async fn load(flags: LoadFlags) -> anyhow::Result<ExitCode> {
     };
     let cleaned = tokio::select! {
         cleaned = load.clean_up() => cleaned,
-        _ = tokio::signal::ctrl_c() => Err(anyhow::anyhow!("interrupted again: its robots may be left on the server")),
+        _ = tokio::signal::ctrl_c() => Err(anyhow::anyhow!("interrupted again")),
     };
+    let cleaned = cleaned.with_context(|| format!("robots labelled {} may be left on the server", load.label()));
     let mut code = if load.finish() == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE };
     for error in [outcome.err(), cleaned.err()].into_iter().flatten() {
         code = complain(&error);

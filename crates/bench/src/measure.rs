@@ -64,7 +64,7 @@ impl Phase {
     /// The latency in milliseconds that `percent` of the successful steps did not exceed; `None` if none succeeded.
     pub fn percentile_ms(&self, percent: usize) -> Option<f64> {
         let rank = (self.latencies.len() * percent).div_ceil(100).max(1);
-        self.latencies.get(rank - 1).map(|latency| latency.as_secs_f64() * 1000.0)
+        self.latencies.get(rank - 1).map(|latency| latency.as_micros() as f64 / 1000.0)
     }
 }
 

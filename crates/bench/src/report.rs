@@ -95,7 +95,7 @@ fn document(phase: &Phase) -> serde_json::Value {
         "phase": phase.name,
         "count": phase.count(),
         "failed": phase.failed(),
-        "wall_s": phase.wall.as_secs_f64(),
+        "wall_s": phase.wall.as_millis() as f64 / 1000.0,
         "p50_ms": phase.percentile_ms(50),
         "p99_ms": phase.percentile_ms(99),
         "max_ms": phase.percentile_ms(100),

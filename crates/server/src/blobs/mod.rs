@@ -11,7 +11,7 @@ use std::fs::{self, File};
 use std::io::{self, Write as _};
 use std::os::unix::fs::FileExt as _;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
@@ -175,7 +175,7 @@ impl Blobs {
 
     /// The blob, if it is here.
     pub async fn get(&self, digest: Digest) -> Result<Option<Blob>, BlobError> {
-        if let Some(blob) = self.take_from_open(digest) {
+        if let Some(blob) = self.already_open(digest) {
             return Ok(Some(blob));
         }
         let path = self.path(digest);
@@ -184,11 +184,7 @@ impl Blobs {
             Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
             opened => opened.map(Some).map_err(BlobError::disk("open", &path)),
         });
-        let blob = opened.await?;
-        if let Some(blob) = &blob {
-            self.put_in_open(blob.clone());
-        }
-        Ok(blob)
+        Ok(opened.await?.map(|blob| self.keep_open(blob)))
     }
 
     /// Stores small bytes that are in memory already, and says what they hash to.
@@ -262,7 +258,7 @@ impl Blobs {
 
     /// Deletes a blob. Only the collector may, which knows that nothing refers to it.
     pub async fn delete(&self, digest: Digest, _collection: &Collection) -> Result<(), BlobError> {
-        self.take_from_open(digest);
+        self.close(digest);
         let path = self.path(digest);
         on_disk(move || match fs::remove_file(&path) {
             Err(error) if error.kind() != io::ErrorKind::NotFound => Err(BlobError::disk("delete", &path)(error)),
@@ -270,7 +266,7 @@ impl Blobs {
         })
         .await?;
         // A reader may have opened it in between; it keeps its copy, later ones shall not find it.
-        self.take_from_open(digest);
+        self.close(digest);
         Ok(())
     }
 
@@ -278,17 +274,33 @@ impl Blobs {
         self.shared.directory.join(digest.hex())
     }
 
-    fn take_from_open(&self, digest: Digest) -> Option<Blob> {
-        let mut open = self.shared.open.lock().unwrap_or_else(PoisonError::into_inner);
+    /// The blob, if it is open; it then is the last to be closed.
+    fn already_open(&self, digest: Digest) -> Option<Blob> {
+        let mut open = self.open_blobs();
         let at = open.iter().position(|blob| blob.digest == digest)?;
-        open.remove(at)
+        let blob = open.remove(at)?;
+        open.push_front(blob.clone());
+        Some(blob)
     }
 
-    fn put_in_open(&self, blob: Blob) {
-        let mut open = self.shared.open.lock().unwrap_or_else(PoisonError::into_inner);
-        open.retain(|other| other.digest != blob.digest);
-        open.push_front(blob);
+    /// Keeps `blob` open, unless somebody else has opened it meanwhile: then theirs is used, so that many first readers
+    /// at once end with one mapping.
+    fn keep_open(&self, blob: Blob) -> Blob {
+        let mut open = self.open_blobs();
+        if let Some(earlier) = open.iter().find(|other| other.digest == blob.digest) {
+            return earlier.clone();
+        }
+        open.push_front(blob.clone());
         open.truncate(self.shared.settings.max_open_blobs);
+        blob
+    }
+
+    fn close(&self, digest: Digest) {
+        self.open_blobs().retain(|blob| blob.digest != digest);
+    }
+
+    fn open_blobs(&self) -> MutexGuard<'_, VecDeque<Blob>> {
+        self.shared.open.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -371,4 +383,40 @@ fn move_into_place(partial: &Path, target: &Path) -> Result<(), BlobError> {
 fn modified_ms(metadata: &fs::Metadata) -> io::Result<u64> {
     let since = metadata.modified()?.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
     Ok(u64::try_from(since.as_millis()).unwrap_or(u64::MAX))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn mapping(blob: &Blob) -> *const u8 {
+        match &blob.source {
+            Source::Mapped(bytes) => bytes.as_ptr(),
+            Source::File(_) => panic!("not mapped"),
+        }
+    }
+
+    #[tokio::test]
+    async fn readers_share_one_mapping() {
+        let data = tempfile::tempdir().expect("a directory");
+        let blobs = Blobs::open(data.path(), BlobSettings::default()).expect("opened");
+        let digest = blobs.put(Bytes::from_static(b"content")).await.expect("stored");
+        let readers: Vec<_> = (0..64)
+            .map(|_| {
+                tokio::spawn({
+                    let blobs = blobs.clone();
+                    async move { blobs.get(digest).await }
+                })
+            })
+            .collect();
+        let first = blobs.get(digest).await.expect("read").expect("there");
+        for reader in readers {
+            let blob = reader.await.expect("no panic").expect("read").expect("there");
+            assert_eq!(mapping(&blob), mapping(&first));
+        }
+        for _ in 0..3 {
+            let again = blobs.get(digest).await.expect("read").expect("there");
+            assert_eq!(mapping(&again), mapping(&first));
+        }
+    }
 }

@@ -7,7 +7,7 @@ use task_proto::api::ReportReply;
 use task_proto::desired::{BlobRef, Delivery, PackageRef, Wanted};
 use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
 use task_proto::manifest::{Build, ContentFacts, Outputs, Ready, Requires, Run, TaskManifest};
-use task_proto::report::{HostFacts, Phase, Report};
+use task_proto::report::{Failure, FailureCode, HostFacts, Phase, Report};
 use task_proto::{DeploymentId, Digest, Generation};
 
 use super::*;

@@ -1,0 +1,150 @@
+//! The steps under way: begun, interrupted when they serve nothing any more, and what their end means for the ledger.
+//! Which step is next is the plan's to say.
+
+use std::time::Duration;
+
+use task_proto::TaskName;
+use task_proto::report::{Failure, FailureCode, Progress};
+use tokio::sync::watch;
+use tokio::task::Id;
+use tokio::time::Instant;
+use tokio_util::sync::CancellationToken;
+
+use super::{Driver, Outcome, UnderWay};
+use crate::effects::Effects;
+use crate::observed::{Prepared, ProcessState};
+use crate::plan::{self, Lane, Situation, Step, StepFailure};
+
+/// How long an interrupted step may take to end by itself.
+const INTERRUPT_GRACE: Duration = Duration::from_secs(5);
+
+impl<E: Effects> Driver<E> {
+    pub(super) fn begin(&mut self, task: TaskName, step: Step) {
+        tracing::info!("{}", plan::describe(&task, &step));
+        let cancel = CancellationToken::new();
+        let (progress, pull) = watch::channel(Progress { done: 0, total: 0 });
+        if matches!(step, Step::PullContent(_)) {
+            self.views.entry(task.clone()).or_default().pull = Some(pull);
+        }
+        let running = self.ledger.tasks.get(&task).and_then(|record| record.active.as_ref()?.process.clone());
+        let (effects, lane) = (self.effects.clone(), step.lane());
+        let (name, doing, stop) = (task.clone(), step.clone(), cancel.clone());
+        let handle = self.steps.spawn(async move {
+            let done = |()| None;
+            let work = async {
+                match &doing {
+                    Step::PullManifest(package) => effects.pull_manifest(package, &stop).await.map(done),
+                    Step::PullContent(package) => effects.pull_content(package, &progress, &stop).await.map(done),
+                    Step::Build(package) => effects.build(package, &stop).await.map(done),
+                    Step::Start(run) => effects.start(&name, run).await.map(Some),
+                    Step::Stop { process, stop_timeout_s } => {
+                        effects.stop(&name, process, *stop_timeout_s).await.map(done)
+                    }
+                    Step::Prune { kept } => effects.prune(&name, kept, running.as_ref()).await.map(done),
+                    Step::Remove => effects.remove(&name).await.map(done),
+                }
+            };
+            let outcome = match doing.deadline() {
+                Some(deadline) => tokio::time::timeout(deadline, work).await.unwrap_or_else(|_| Err(late(deadline))),
+                None => work.await,
+            };
+            (name, lane, outcome)
+        });
+        self.under_way.insert((task, lane), UnderWay { step, handle, cancel, drop_at: None });
+    }
+
+    /// Tells steps to end that serve nothing any more, and drops those that do not listen.
+    pub(super) fn interrupt_unwanted(&mut self) {
+        let now = Instant::now();
+        let unwanted: Vec<(TaskName, Lane)> = self
+            .under_way
+            .iter()
+            .filter(|((task, _), under_way)| !under_way.step.is_wanted(self.desired_task(task).as_ref()))
+            .map(|(key, _)| key.clone())
+            .collect();
+        for key in unwanted {
+            if let Some(under_way) = self.under_way.get_mut(&key).filter(|under_way| under_way.drop_at.is_none()) {
+                under_way.cancel.cancel();
+                under_way.drop_at = Some(now + INTERRUPT_GRACE);
+            }
+        }
+        for ((task, _), under_way) in &mut self.under_way {
+            if under_way.drop_at.is_some_and(|at| at <= now) {
+                tracing::warn!("{} does not end and is dropped", plan::describe(task, &under_way.step));
+                under_way.handle.abort();
+                under_way.drop_at = Some(now + INTERRUPT_GRACE);
+            }
+        }
+    }
+
+    pub(super) fn step_ended(&mut self, ended: Result<(Id, (TaskName, Lane, Outcome)), tokio::task::JoinError>) {
+        let (id, outcome) = match ended {
+            Ok((id, (_, _, outcome))) => (id, outcome),
+            Err(error) => {
+                let failure = Failure::new(FailureCode::IO_ERROR, format!("the step ended without a result: {error}"));
+                (error.id(), Err(StepFailure { failure, retry_after_ms: Some(1000) }))
+            }
+        };
+        let found =
+            self.under_way.iter().find(|(_, under_way)| under_way.handle.id() == id).map(|(key, _)| key.clone());
+        let Some((task, lane)) = found else { return };
+        let Some(under_way) = self.under_way.remove(&(task.clone(), lane)) else { return };
+        let view = self.views.entry(task.clone()).or_default();
+        (view.pull, view.progress) = (None, None);
+        if under_way.cancel.is_cancelled() {
+            view.prepared = None;
+            // It may have gathered more after its order was taken back.
+            self.kept_parts = None;
+            return;
+        }
+        if let Err(error) = &outcome {
+            tracing::warn!(failure = %error.failure, "{} failed", plan::describe(&task, &under_way.step));
+        }
+        self.finish(&task, &under_way.step, outcome);
+    }
+
+    fn finish(&mut self, task: &TaskName, step: &Step, outcome: Outcome) {
+        if *step == Step::Remove && outcome.is_ok() {
+            self.ledger.tasks.remove(task);
+            self.views.remove(task);
+            self.dirty = true;
+            return;
+        }
+        let (Some(record), Some(view)) = (self.ledger.tasks.get(task), self.views.get(task)) else { return };
+        let now = self.effects.now();
+        let nothing = Prepared::default();
+        let situation = Situation {
+            desired: None,
+            record,
+            prepared: view.prepared.as_ref().unwrap_or(&nothing),
+            process: view.process.as_ref().unwrap_or(&ProcessState::None),
+            preparing: false,
+            deleting: false,
+            robot: &self.robot,
+            may_begin: self.may_begin(now),
+            held: self.held,
+            boot_id: &self.speaker.boot_id,
+            now_ms: now.boot_ms,
+            jitter: rand::random(),
+        };
+        let record = plan::finished(&situation, step, outcome);
+        if let (Step::Prune { kept }, Some(prepared)) =
+            (step, &mut self.views.entry(task.clone()).or_default().prepared)
+        {
+            // Should deleting have failed, it is not tried again before the next look at the disk.
+            prepared.versions.retain(|version| kept.contains(version));
+        } else if step.lane() == Lane::Prepare {
+            self.views.entry(task.clone()).or_default().prepared = None;
+        }
+        if matches!(step, Step::Start(_) | Step::Stop { .. }) {
+            self.views.entry(task.clone()).or_default().process = None;
+        }
+        self.put(task, record);
+    }
+}
+
+/// A step that did not end in time. It is tried again: nothing is known of how far it came.
+fn late(deadline: Duration) -> StepFailure {
+    let text = format!("the step did not end within {} s", deadline.as_secs());
+    StepFailure { failure: Failure::new(FailureCode::DEADLINE_EXCEEDED, text), retry_after_ms: Some(0) }
+}

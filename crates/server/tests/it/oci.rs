@@ -207,6 +207,15 @@ async fn a_manifest_that_can_not_be_is_refused_with_the_reason() {
     assert_eq!(put("v1", INDEX_TYPE, &good).await, invalid);
     assert_eq!(put("v1", MANIFEST_TYPE, &json!({ "schemaVersion": 2 })).await, invalid);
     assert_eq!(put("v1", MANIFEST_TYPE, &json!([])).await, invalid);
+    for (key, value) in [
+        ("artifactType", json!("application/x-\0")),
+        ("subject", json!({ "mediaType": MANIFEST_TYPE, "digest": "sha256:\0" })),
+    ] {
+        let mut manifest = good.clone();
+        manifest[key] = value;
+        assert_eq!(put("v1", MANIFEST_TYPE, &manifest).await, invalid, "{key}");
+    }
+    assert_eq!(put("v1", "", &json!({ "mediaType": "application/x-\n" })).await, invalid);
     let index = json!({ "schemaVersion": 2, "manifests": [{ "mediaType": MANIFEST_TYPE, "digest": missing.digest }] });
     assert_eq!(put("v1", INDEX_TYPE, &index).await, refused(400, "MANIFEST_BLOB_UNKNOWN"));
     let name = registry.put_manifest("/v2/A/manifests/v1", MANIFEST_TYPE, &good).await;

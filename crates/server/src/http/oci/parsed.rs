@@ -69,14 +69,29 @@ impl Parsed {
         let is_package = document.artifact_type.as_deref() == Some(PACKAGE_TYPE);
         let package = is_package.then(|| serde_json::from_slice(bytes).map_err(invalid)).transpose()?;
         let config_type = document.config.as_ref().map(|config| config.media_type.clone());
-        Ok(Self {
+        let parsed = Self {
             media_type,
             parts: document.parts()?,
             artifact_type: document.artifact_type.filter(|kind| !kind.is_empty()).or(config_type),
             annotations: document.annotations.unwrap_or_default(),
             subject: document.subject.map(|subject| subject.digest),
             package,
-        })
+        };
+        parsed.check_texts()?;
+        Ok(parsed)
+    }
+
+    /// These go into headers and columns, which not every character can.
+    fn check_texts(&self) -> Result<(), OciError> {
+        let texts = [
+            ("mediaType", Some(&self.media_type)),
+            ("artifactType", self.artifact_type.as_ref()),
+            ("subject", self.subject.as_ref()),
+        ];
+        match texts.iter().find(|(_, text)| text.is_some_and(|text| text.contains(char::is_control))) {
+            Some((key, _)) => Err(OciError::manifest_invalid(format!("{key}: it has a control character"))),
+            None => Ok(()),
+        }
     }
 }
 

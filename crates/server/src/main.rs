@@ -9,7 +9,7 @@ use clap::{Parser, Subcommand};
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use taskd::clock::Clock;
 use taskd::commands;
-use taskd::config::{Config, ServeFlags};
+use taskd::config::{Config, ConfigError, ServeFlags};
 use taskd::serve::Server;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tracing_subscriber::EnvFilter;
@@ -136,7 +136,8 @@ impl Signals {
 /// Says on stderr what went wrong, with all causes. A broken stderr is no reason to panic.
 fn complain(error: &anyhow::Error) -> ExitCode {
     let _ = writeln!(std::io::stderr(), "taskd: {error:#}");
-    ExitCode::FAILURE
+    let outcome = if error.is::<ConfigError>() { commands::Outcome::Usage } else { commands::Outcome::Failed };
+    outcome.into()
 }
 
 #[cfg(test)]

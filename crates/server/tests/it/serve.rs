@@ -232,3 +232,29 @@ async fn a_second_signal_ends_it_at_once() {
     assert_eq!(program.exit_code().await, Some(1));
     assert!(asked.elapsed() < Duration::from_secs(3), "it waited {:?} for the upload", asked.elapsed());
 }
+
+#[test]
+#[expect(clippy::disallowed_methods, reason = "the test starts the program it tests")]
+fn a_wrong_setting_is_wrong_usage_wherever_it_stands() {
+    let directory = tempfile::TempDir::new().expect("a directory");
+    let file = directory.path().join("taskd.toml");
+    std::fs::write(&file, "htpt = \"127.0.0.1:0\"").expect("written");
+    let run = |arguments: &[&str], variable: Option<(&str, &str)>| {
+        let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_taskd"));
+        command.arg("serve").args(arguments).arg("--data").arg(directory.path().join("data"));
+        command.env_clear().envs(variable).stdin(Stdio::null());
+        let output = command.output().expect("it runs");
+        (output.status.code(), String::from_utf8(output.stderr).expect("text"))
+    };
+    for (arguments, variable, named) in [
+        (&["--http", "nowhere"][..], None, "--http"),
+        (&["--htpt", "127.0.0.1:0"], None, "--htpt"),
+        (&[], Some(("TASKD_MQTT", "nowhere")), "TASKD_MQTT"),
+        (&["--config", file.to_str().expect("text")], None, "htpt in "),
+    ] {
+        let (code, said) = run(arguments, variable);
+        assert_eq!(code, Some(2), "{said}");
+        assert!(said.contains(named), "{said}");
+    }
+    assert!(!directory.path().join("data").exists());
+}

@@ -225,7 +225,7 @@ pub struct CreateDeployment {
     /// Which robots; resolved once, now.
     pub selector: Selector,
     /// How the bytes should travel.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "known_delivery")]
     pub delivery: Delivery,
     /// How many robots at a time; absent: all at once.
     #[serde(default)]
@@ -239,6 +239,20 @@ pub struct CreateDeployment {
     /// Only say which robots it would be. Stores nothing, needs no key.
     #[serde(default)]
     pub dry_run: bool,
+}
+
+/// An order names a way that exists; only what a robot reads may name one that is newer than its reader.
+fn known_delivery<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Delivery, D::Error> {
+    #[derive(Deserialize)]
+    #[serde(rename_all = "kebab-case")]
+    enum Known {
+        Poll,
+        PushPull,
+    }
+    Known::deserialize(deserializer).map(|known| match known {
+        Known::Poll => Delivery::Poll,
+        Known::PushPull => Delivery::PushPull,
+    })
 }
 
 /// Answer to a dry run, and to an order on tasks: the robots meant.

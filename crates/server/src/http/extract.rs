@@ -128,6 +128,7 @@ mod tests {
             (r#"{"package": "talker"}"#.to_owned(), "the body: missing field `manifest`"),
             (body(r#", "batch": "two""#), "batch: invalid type"),
             (body(r#", "batch": -1"#), "batch: invalid value"),
+            (body(r#", "delivery": "by-pigeon""#), "delivery: unknown variant `by-pigeon`"),
             (body("} x"), "the body: trailing"),
             (r#"{"package": "No!"}"#.to_owned(), "package: \"No!\" is not a valid package name"),
         ];

@@ -9,6 +9,7 @@ use std::time::Duration;
 use axum::extract::State;
 use axum::response::sse::{Event as SentEvent, KeepAlive, Sse};
 use futures_util::{Stream, StreamExt as _};
+use http::{HeaderMap, header};
 use task_proto::RobotId;
 use task_proto::api::Event;
 use tokio::sync::{Semaphore, broadcast};
@@ -147,9 +148,10 @@ fn name_of(event: &Event) -> &'static str {
     }
 }
 
-/// `GET /events`: what changes from now on, until the server stops.
+/// `GET /events`: what changes from now on, until the server stops or the listener's session ends.
 pub(super) async fn stream(
     State(app): State<App>,
+    headers: HeaderMap,
 ) -> Result<Sse<impl Stream<Item = Result<SentEvent, Infallible>>>, ApiError> {
     let place = app.events.places.clone().try_acquire_owned();
     let place = place.map_err(|_| ApiError::unavailable("too many pages listen to events already"))?;
@@ -165,6 +167,34 @@ pub(super) async fn stream(
     // A first line, so that proxies pass the headers on and the page knows that it is connected.
     let greeting =
         futures_util::stream::iter([Ok(SentEvent::default().retry(Duration::from_secs(2)).comment("hello"))]);
-    let events = greeting.chain(events).take_until(app.stop.cancelled_owned());
+    let events = greeting.chain(events).take_until(end_of_stream(&app, &headers)?);
     Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)))
+}
+
+/// Resolves when whoever sent these headers may listen no longer. A session may have ended since the guard looked.
+fn end_of_stream(app: &App, headers: &HeaderMap) -> Result<impl Future<Output = ()> + use<>, ApiError> {
+    let now_ms = app.clock.now_ms();
+    let session = match headers.contains_key(header::AUTHORIZATION) {
+        true => None,
+        false => {
+            Some(app.sessions.find(headers, now_ms).ok_or_else(|| ApiError::unauthorized("the session has ended"))?)
+        }
+    };
+    let stop = app.stop.clone();
+    Ok(async move {
+        let session_ends = async {
+            match session {
+                Some(session) => {
+                    let left = Duration::from_millis(session.expires_at_ms.saturating_sub(now_ms));
+                    // Signed out before, or over: either way it has ended.
+                    let _ = tokio::time::timeout(left, session.ended.cancelled()).await;
+                }
+                None => std::future::pending().await,
+            }
+        };
+        tokio::select! {
+            () = stop.cancelled() => {}
+            () = session_ends => {}
+        }
+    })
 }

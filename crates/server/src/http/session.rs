@@ -11,6 +11,7 @@ use http::{HeaderMap, StatusCode, header};
 use task_proto::Digest;
 use task_proto::api::{SessionView, SignIn};
 use task_proto::token::{Token, TokenKind};
+use tokio_util::sync::{CancellationToken, DropGuard};
 
 use super::App;
 use super::auth::require_same_origin;
@@ -27,7 +28,14 @@ const MOST_SESSIONS: usize = 1_024;
 
 /// Who is signed in. A session is found by the SHA-256 of its id.
 #[derive(Debug, Default)]
-pub struct Sessions(Mutex<HashMap<Digest, Session>>);
+pub struct Sessions(Mutex<HashMap<Digest, Entry>>);
+
+/// A session that lives: what is streamed in it ends when this is dropped.
+#[derive(Debug)]
+struct Entry {
+    session: Session,
+    _end: DropGuard,
+}
 
 /// One signed-in page.
 #[derive(Debug, Clone)]
@@ -36,6 +44,8 @@ pub struct Session {
     pub token: Token,
     /// When it ends by itself.
     pub expires_at_ms: u64,
+    /// Cancelled when it ends before that.
+    pub ended: CancellationToken,
 }
 
 impl Sessions {
@@ -43,19 +53,21 @@ impl Sessions {
     fn begin(&self, token: Token, now_ms: u64) -> String {
         let id = format!("{:032x}{:032x}", rand::random::<u128>(), rand::random::<u128>());
         let mut sessions = self.lock();
-        sessions.retain(|_, session| session.expires_at_ms > now_ms);
+        sessions.retain(|_, entry| entry.session.expires_at_ms > now_ms);
         if sessions.len() >= MOST_SESSIONS {
-            let oldest = sessions.iter().min_by_key(|(_, session)| session.expires_at_ms).map(|(key, _)| *key);
+            let oldest = sessions.iter().min_by_key(|(_, entry)| entry.session.expires_at_ms).map(|(key, _)| *key);
             oldest.map(|key| sessions.remove(&key));
         }
-        sessions.insert(Digest::of(id.as_bytes()), Session { token, expires_at_ms: now_ms + LIFETIME_MS });
+        let ended = CancellationToken::new();
+        let session = Session { token, expires_at_ms: now_ms + LIFETIME_MS, ended: ended.clone() };
+        sessions.insert(Digest::of(id.as_bytes()), Entry { session, _end: ended.drop_guard() });
         id
     }
 
     /// The session of a request's cookie, if it has one that lives.
     pub fn find(&self, headers: &HeaderMap, now_ms: u64) -> Option<Session> {
         let key = Digest::of(cookie(headers)?.as_bytes());
-        self.lock().get(&key).filter(|session| session.expires_at_ms > now_ms).cloned()
+        self.lock().get(&key).map(|entry| &entry.session).filter(|session| session.expires_at_ms > now_ms).cloned()
     }
 
     fn end(&self, headers: &HeaderMap) {
@@ -64,7 +76,7 @@ impl Sessions {
         }
     }
 
-    fn lock(&self) -> MutexGuard<'_, HashMap<Digest, Session>> {
+    fn lock(&self) -> MutexGuard<'_, HashMap<Digest, Entry>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -128,11 +140,13 @@ mod tests {
         let sessions = Sessions::default();
         let id = sessions.begin(Token::random(TokenKind::Operator), 1_000);
         let headers = with_cookie(format!("theme=dark; {COOKIE}={id}"));
-        assert!(sessions.find(&headers, 1_001).is_some());
+        let found = sessions.find(&headers, 1_001).expect("it lives");
         assert!(sessions.find(&headers, 1_000 + LIFETIME_MS).is_none());
         assert!(sessions.find(&with_cookie(format!("{COOKIE}=guess")), 1_001).is_none());
+        assert!(!found.ended.is_cancelled());
         sessions.end(&headers);
         assert!(sessions.find(&headers, 1_001).is_none());
+        assert!(found.ended.is_cancelled());
     }
 
     #[test]

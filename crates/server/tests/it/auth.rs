@@ -1,5 +1,7 @@
 //! Who may call what: every route of the table is called by every kind of caller.
 
+use std::time::Duration;
+
 use reqwest::{Method, RequestBuilder, StatusCode};
 use serde_json::{Value, json};
 use task_proto::api::{EnrollmentToken, SessionView};
@@ -178,7 +180,11 @@ async fn a_session_opens_what_its_token_opens_and_only_from_its_own_page() {
     assert_eq!(refusal(create().header("origin", "http://evil.example")).await.0, 403);
     assert_eq!(create().header("origin", &origin).send().await.expect("an answer").status(), StatusCode::CREATED);
 
+    let events = signed_in(Method::GET, "/api/v1/events").send().await.expect("an answer");
+    assert_eq!(events.status(), StatusCode::OK);
     let out = signed_in(Method::DELETE, "/api/v1/session").header("origin", &origin).send().await.expect("an answer");
     assert_eq!(out.status(), StatusCode::NO_CONTENT);
     assert_eq!(refusal(signed_in(Method::GET, "/api/v1/robots")).await.0, 401);
+    let heard = tokio::time::timeout(Duration::from_secs(9), events.text()).await.expect("the stream ends");
+    assert!(heard.expect("a proper end").contains("hello"));
 }

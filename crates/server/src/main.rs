@@ -17,9 +17,13 @@ use tracing_subscriber::EnvFilter;
 /// What may still run on a blocking thread when everything else has ended.
 const LEFTOVER_PATIENCE: Duration = Duration::from_millis(500);
 
+/// See [`commands::Outcome`].
+const EXIT_CODES: &str = "Exit codes: 0 done, 1 failed, 2 the command line, a setting or the package is wrong or no robot \
+                          is meant, 3 some robots failed, 4 not allowed, 5 not done in time";
+
 /// Distributes task packages to robots and runs them there
 #[derive(Parser)]
-#[command(name = "taskd", version, propagate_version = true)]
+#[command(name = "taskd", version, propagate_version = true, after_help = EXIT_CODES)]
 struct CommandLine {
     #[command(flatten)]
     connection: commands::Connection,

@@ -20,7 +20,7 @@ use crate::server::{self, Server};
 /// Arguments of `enroll`.
 #[derive(Debug, clap::Args)]
 pub struct Arguments {
-    /// The server's URL; absent: the one in the property file
+    /// The server's URL [default: the one in the property file]
     #[arg(long, value_name = "URL")]
     server: Option<String>,
     /// The enrolment token: `taskd enroll-token create` makes one
@@ -32,7 +32,7 @@ pub struct Arguments {
     /// A label; may be given more than once
     #[arg(long = "label", value_name = "K=V", value_parser = parse_label)]
     labels: Vec<(LabelKey, LabelValue)>,
-    /// The MAC the robot shall be known by; absent: that of its first physical network interface
+    /// The MAC the robot shall be known by [default: that of its first physical network interface]
     #[arg(long)]
     mac: Option<MacAddress>,
     /// Register anew although this robot is registered

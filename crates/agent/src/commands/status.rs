@@ -15,14 +15,14 @@ use crate::ledger::{Ledger, TaskRecord};
 /// Arguments of `status`.
 #[derive(Debug, clap::Args)]
 pub struct Arguments {
-    /// How to write it
-    #[arg(short, long, value_enum, default_value_t = Output::Table)]
+    /// How to print the result
+    #[arg(short, long, value_enum, default_value_t = Output::Table, value_name = "FORMAT")]
     output: Output,
     #[command(flatten)]
     data: DataDir,
 }
 
-/// How to write it.
+/// How to print the result.
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum Output {
     /// For people.

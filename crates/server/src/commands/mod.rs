@@ -1,5 +1,6 @@
 //! The operator's commands: what they are called, what they take, and which exit code they end with. Each command talks
-//! to the server over its public API only; none of them opens the server's database or files (the token file excepted).
+//! to the server over its public API only; none of them opens the server's database or files (the published address and
+//! the operator's token excepted).
 
 use std::path::PathBuf;
 use std::process::ExitCode;

@@ -174,27 +174,19 @@ pub(super) async fn stream(
 /// Resolves when whoever sent these headers may listen no longer. A session may have ended since the guard looked.
 fn end_of_stream(app: &App, headers: &HeaderMap) -> Result<impl Future<Output = ()> + use<>, ApiError> {
     let now_ms = app.clock.now_ms();
-    let session = match headers.contains_key(header::AUTHORIZATION) {
-        true => None,
-        false => {
-            Some(app.sessions.find(headers, now_ms).ok_or_else(|| ApiError::unauthorized("the session has ended"))?)
-        }
+    let (ended, left) = if headers.contains_key(header::AUTHORIZATION) {
+        (CancellationToken::new(), Duration::MAX)
+    } else {
+        let session = app.sessions.find(headers, now_ms);
+        let session = session.ok_or_else(|| ApiError::unauthorized("the session has ended"))?;
+        (session.ended, Duration::from_millis(session.expires_at_ms.saturating_sub(now_ms)))
     };
     let stop = app.stop.clone();
     Ok(async move {
-        let session_ends = async {
-            match session {
-                Some(session) => {
-                    let left = Duration::from_millis(session.expires_at_ms.saturating_sub(now_ms));
-                    // Signed out before, or over: either way it has ended.
-                    let _ = tokio::time::timeout(left, session.ended.cancelled()).await;
-                }
-                None => std::future::pending().await,
-            }
-        };
         tokio::select! {
             () = stop.cancelled() => {}
-            () = session_ends => {}
+            () = ended.cancelled() => {}
+            () = tokio::time::sleep(left) => {}
         }
     })
 }

@@ -171,6 +171,7 @@ impl Robot {
             attempts: 1,
             restarts: 0,
             failure: None,
+            degraded: None,
             active: (phase == Phase::Running).then(|| ActiveVersion {
                 deployment: task.deployment.clone(),
                 version: task.package.version.clone(),

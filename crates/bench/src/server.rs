@@ -91,6 +91,7 @@ impl Server {
             parameters: Default::default(),
             outputs: Default::default(),
             requires: Default::default(),
+            limits: Default::default(),
             exec_depends: Vec::new(),
             content: facts,
         };

@@ -169,6 +169,9 @@ pub struct RobotTask {
     pub progress: Option<Progress>,
     /// Why it failed.
     pub failure: Option<Failure>,
+    /// Why it runs, yet not as it should.
+    #[serde(default)]
+    pub degraded: Option<Failure>,
     /// The version whose process lives.
     pub active: Option<ActiveVersion>,
     /// Times the process was started again in this run.

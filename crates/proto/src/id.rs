@@ -17,7 +17,7 @@ pub struct InvalidId {
 }
 
 impl InvalidId {
-    fn new(kind: &'static str, given: &str, expected: &'static str) -> Self {
+    pub(crate) fn new(kind: &'static str, given: &str, expected: &'static str) -> Self {
         // A hostile name must not fill a log line.
         Self { kind, given: given.chars().take(80).collect(), expected }
     }
@@ -91,6 +91,20 @@ text_id!(
 text_id!(
     /// One start of an agent: `i` and 16 lower-case hex digits.
     InstanceId, "instance id", "the letter i and 16 lower-case hex digits", |t| is_prefixed_hex(t, 'i')
+);
+text_id!(
+    /// A question to a robot: `q` and 16 lower-case hex digits.
+    RequestId, "request id", "the letter q and 16 lower-case hex digits", |t| is_prefixed_hex(t, 'q')
+);
+text_id!(
+    /// A node's, topic's or service's full name on a ROS graph, `/robot/scan`; from the ROS 2 design article on names.
+    GraphName, "ROS name", "like /robot/scan: letters, digits and '_' in parts that begin with no digit, at most 255 bytes", |t| {
+        let part_ok = |part: &str| {
+            part.bytes().next().is_some_and(|b| b.is_ascii_alphabetic() || b == b'_')
+                && part.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'_')
+        };
+        t.len() <= 255 && t.strip_prefix('/').is_some_and(|rest| rest.split('/').all(part_ok))
+    }
 );
 text_id!(
     /// The name of a package and of the task it becomes on a robot. It is one component of an OCI repository name, so it
@@ -177,6 +191,13 @@ impl DeploymentId {
     /// A fresh id from the thread's random generator.
     pub fn random() -> Self {
         Self(random_hex('d'))
+    }
+}
+
+impl RequestId {
+    /// A fresh id from the thread's random generator.
+    pub fn random() -> Self {
+        Self(random_hex('q'))
     }
 }
 

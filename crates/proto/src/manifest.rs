@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use crate::id::Labels;
+use crate::id::{GraphName, Labels};
 use crate::{Digest, TaskName, Version};
 
 /// The longest any text in a manifest may be, in bytes.
@@ -51,6 +51,9 @@ pub struct TaskManifest {
     /// What the robot must have.
     #[serde(default)]
     pub requires: Requires,
+    /// What it may use of the robot.
+    #[serde(default, skip_serializing_if = "Limits::is_empty")]
+    pub limits: Limits,
     /// Names of the packages that `package.xml` says are needed to run it.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub exec_depends: Vec<String>,
@@ -106,6 +109,9 @@ pub struct Run {
     /// Seconds between SIGINT and SIGTERM, and again between SIGTERM and SIGKILL.
     #[serde(default = "default_stop_timeout_s")]
     pub stop_timeout_s: u32,
+    /// Seconds a job may run; absent: any time.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub deadline_s: Option<u32>,
 }
 
 impl Default for Run {
@@ -119,6 +125,7 @@ impl Default for Run {
             restart: Restart::default(),
             idempotent: false,
             stop_timeout_s: default_stop_timeout_s(),
+            deadline_s: None,
         }
     }
 }
@@ -171,6 +178,12 @@ pub struct Ready {
     /// Lifecycle nodes the agent configures and activates.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub lifecycle: Vec<String>,
+    /// Services that must answer.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub services: Vec<String>,
+    /// Topics that must have a publisher.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub topics: BTreeMap<String, ReadyTopic>,
     /// Seconds all of it must hold.
     #[serde(default = "default_hold_s")]
     pub hold_s: u32,
@@ -184,10 +197,20 @@ impl Default for Ready {
         Self {
             nodes: Vec::new(),
             lifecycle: Vec::new(),
+            services: Vec::new(),
+            topics: BTreeMap::new(),
             hold_s: default_hold_s(),
             timeout_s: default_ready_timeout_s(),
         }
     }
+}
+
+/// What must hold of a topic beside having a publisher.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct ReadyTopic {
+    /// Messages a second it must carry.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub min_hz: Option<f64>,
 }
 
 fn default_hold_s() -> u32 {
@@ -220,6 +243,27 @@ pub struct Requires {
     pub arch: Vec<String>,
 }
 
+/// What a task may use of the robot; enforced where the robot has control groups.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Limits {
+    /// Memory of all its processes together, in MiB.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub memory_mb: Option<u64>,
+    /// Its share of the processors where they are short: 1 to 10,000, others having 100.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub cpu_weight: Option<u32>,
+    /// Processes and threads.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub pids: Option<u32>,
+}
+
+impl Limits {
+    /// Whether it limits nothing.
+    pub fn is_empty(&self) -> bool {
+        *self == Self::default()
+    }
+}
+
 /// What the packer measured of the content blob, so that a robot knows before it pulls.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ContentFacts {
@@ -247,6 +291,7 @@ impl TaskManifest {
         let mut problems = Problems(Vec::new());
         self.check_run(&mut problems);
         self.check_ready(&mut problems);
+        self.check_limits(&mut problems);
         problems.texts("outputs.paths", &self.outputs.paths);
         for path in &self.outputs.paths {
             if path.starts_with('/') || path.split('/').any(|part| part == "..") {
@@ -260,7 +305,7 @@ impl TaskManifest {
             problems.add("parameters", format!("more than {MAX_LIST_LEN} entries"));
         }
         for node in self.parameters.keys() {
-            problems.node_name("parameters", node);
+            problems.graph_name("parameters", node);
         }
         problems.0
     }
@@ -302,14 +347,29 @@ impl TaskManifest {
         if run.idempotent && run.kind == TaskKind::Service {
             problems.add("run.idempotent", "goes with kind = \"job\"".to_owned());
         }
+        if run.deadline_s.is_some() && run.kind == TaskKind::Service {
+            problems.add("run.deadline_s", "goes with kind = \"job\"".to_owned());
+        }
+        if run.deadline_s.is_some_and(|seconds| !(1..=30 * 24 * 3600).contains(&seconds)) {
+            problems.add("run.deadline_s", "must be between 1 and 2592000".to_owned());
+        }
     }
 
     fn check_ready(&self, problems: &mut Problems) {
         let ready = &self.ready;
-        for (key, nodes) in [("ready.nodes", &ready.nodes), ("ready.lifecycle", &ready.lifecycle)] {
-            problems.texts(key, nodes);
-            for node in nodes {
-                problems.node_name(key, node);
+        let lists =
+            [("ready.nodes", &ready.nodes), ("ready.lifecycle", &ready.lifecycle), ("ready.services", &ready.services)];
+        for (key, names) in lists {
+            problems.texts(key, names);
+            for name in names {
+                problems.graph_name(key, name);
+            }
+        }
+        problems.texts("ready.topics", ready.topics.keys());
+        for (topic, wanted) in &ready.topics {
+            problems.graph_name("ready.topics", topic);
+            if wanted.min_hz.is_some_and(|hz| !(hz > 0.0 && hz <= 10_000.0)) {
+                problems.add("ready.topics", format!("{topic:?} min_hz: must be above 0 and at most 10000"));
             }
         }
         if !(1..=3600).contains(&ready.timeout_s) {
@@ -317,6 +377,19 @@ impl TaskManifest {
         }
         if ready.hold_s >= ready.timeout_s {
             problems.add("ready.hold_s", "must be less than ready.timeout_s".to_owned());
+        }
+    }
+
+    fn check_limits(&self, problems: &mut Problems) {
+        let limits = &self.limits;
+        if limits.memory_mb.is_some_and(|megabytes| !(1..=1 << 24).contains(&megabytes)) {
+            problems.add("limits.memory_mb", "must be between 1 and 16777216".to_owned());
+        }
+        if limits.cpu_weight.is_some_and(|weight| !(1..=10_000).contains(&weight)) {
+            problems.add("limits.cpu_weight", "must be between 1 and 10000".to_owned());
+        }
+        if limits.pids.is_some_and(|pids| !(1..=1 << 22).contains(&pids)) {
+            problems.add("limits.pids", "must be between 1 and 4194304".to_owned());
         }
     }
 }
@@ -346,13 +419,9 @@ impl Problems {
         }
     }
 
-    fn node_name(&mut self, key: &str, name: &str) {
-        let part_ok = |part: &str| {
-            part.bytes().next().is_some_and(|b| b.is_ascii_alphabetic() || b == b'_')
-                && part.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'_')
-        };
-        if !name.strip_prefix('/').is_some_and(|rest| rest.split('/').all(part_ok)) || name.len() > 255 {
-            self.add(key, format!("{name:?} is not a full node name like \"/mapper\""));
+    fn graph_name(&mut self, key: &str, name: &str) {
+        if let Err(error) = name.parse::<GraphName>() {
+            self.add(key, error.to_string());
         }
     }
 }
@@ -371,6 +440,7 @@ mod tests {
             parameters: BTreeMap::new(),
             outputs: Outputs::default(),
             requires: Requires::default(),
+            limits: Limits::default(),
             exec_depends: Vec::new(),
             content: ContentFacts { tar_digest: Digest::of(b""), tar_size: 0, entries: 0 },
         }

@@ -54,6 +54,40 @@ pub struct HostFacts {
     /// Free bytes on the data directory's file system.
     #[serde(default)]
     pub disk_free_bytes: u64,
+    /// How tasks meet ROS; absent where no ROS was found.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ros: Option<RosFacts>,
+    /// What keeps tasks from using more than their limits.
+    #[serde(default)]
+    pub isolation: Isolation,
+}
+
+/// How tasks on a robot meet ROS.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RosFacts {
+    /// The distribution tasks use unless they require another, for example `jazzy`.
+    pub distro: String,
+    /// The middleware: `RMW_IMPLEMENTATION`, or the distribution's default. Absent with ROS 1.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rmw: Option<String>,
+    /// `ROS_DOMAIN_ID`. Absent with ROS 1.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub domain_id: Option<u16>,
+    /// Whether nodes are only found on the robot itself.
+    #[serde(default)]
+    pub localhost_only: bool,
+}
+
+/// What keeps tasks from using more than their limits.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Isolation {
+    /// A control group per task, with its controllers.
+    Cgroup,
+    /// Nothing, or something this version does not know.
+    #[default]
+    #[serde(other)]
+    None,
 }
 
 /// A condition of the whole robot, with a stable code and a text for people.
@@ -97,6 +131,9 @@ pub struct TaskReport {
     /// Why it failed, is unmet or deferred.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub failure: Option<Failure>,
+    /// Why it runs, yet not as it should; it is a health of `running`, not a phase.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub degraded: Option<Failure>,
     /// The version whose process lives, which need not be the one ordered.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub active: Option<ActiveVersion>,
@@ -310,6 +347,32 @@ failure_codes! {
     PROCESS_EXITED = "process_exited";
     /// It was not ready within its time.
     NOT_READY = "not_ready";
+    /// A node or service of that name was on the graph before the task was started.
+    NODE_NAME_TAKEN = "node_name_taken";
+    /// A node does not accept a parameter of the package.
+    PARAMETER_REJECTED = "parameter_rejected";
+    /// A lifecycle node refused a transition or failed in it.
+    LIFECYCLE_FAILED = "lifecycle_failed";
+    /// A node that was ready left the graph.
+    NODE_VANISHED = "node_vanished";
+    /// A lifecycle node that was active is so no more.
+    NODE_INACTIVE = "node_inactive";
+    /// A topic lost its publisher, or carries less than it should.
+    TOPIC_SILENT = "topic_silent";
+    /// A service that was ready does not answer any more.
+    SERVICE_LOST = "service_lost";
+    /// The robot's ROS graph can't be watched.
+    GRAPH_UNAVAILABLE = "graph_unavailable";
+    /// The task used more memory than its limit.
+    OUT_OF_MEMORY = "out_of_memory";
+    /// The robot has no user to run tasks as.
+    NO_TASK_USER = "no_task_user";
+    /// The robot's gate said not now.
+    GATE_REFUSED = "gate_refused";
+    /// The robot's gate hung, crashed or could not be run.
+    GATE_FAILED = "gate_failed";
+    /// Files that were to come back did not.
+    OUTPUTS_LOST = "outputs_lost";
     /// A job's process was gone after a restart of robot or agent.
     INTERRUPTED = "interrupted";
     /// A step did not end within its deadline.

@@ -114,6 +114,7 @@ mod tests {
             attempts: 0,
             restarts: 0,
             failure: None,
+            degraded: None,
             active: None,
         }
     }

@@ -100,6 +100,7 @@ fn task_report(task: &TaskName, record: &TaskRecord, view: Option<&View>, now_ms
         attempts: record.preparation.attempts,
         restarts: for_order.map_or(0, |active| active.restarts),
         failure: failure.cloned(),
+        degraded: None,
         active: active.and_then(|active| {
             let process = active.process.as_ref()?;
             let pid = match view.and_then(|view| view.process.as_ref()) {

@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use task_proto::desired::PackageRef;
 use task_proto::manifest::{BuildTool, TaskManifest};
-use task_proto::report::{Failure, FailureCode, HostFacts, Progress};
+use task_proto::report::{Failure, FailureCode, HostFacts, Isolation, Progress};
 use task_proto::{Digest, MacAddress, TaskName};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
@@ -354,5 +354,7 @@ fn host_facts(data_dir: &Path, mac: MacAddress, ros_distros: Vec<String>) -> Hos
         mac: Some(mac),
         ros_distros,
         disk_free_bytes: disk::room(data_dir).map_or(0, |room| room.free),
+        ros: None,
+        isolation: Isolation::None,
     }
 }

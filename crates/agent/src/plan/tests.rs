@@ -321,6 +321,7 @@ fn manifest(run: &Run) -> TaskManifest {
         parameters: Default::default(),
         outputs: Outputs::default(),
         requires: Requires::default(),
+        limits: task_proto::manifest::Limits::default(),
         exec_depends: Vec::new(),
         content: ContentFacts { tar_digest: Digest::of(b""), tar_size: 0, entries: 0 },
     }

@@ -11,11 +11,17 @@ use serde_json::{Value, json};
 use task_proto::api::{CreateDeployment, EnrollRequest, EnrollResponse, ErrorBody, Event, MqttEndpoint, ReportReply};
 use task_proto::desired::{BlobRef, Delivery, DesiredState, DesiredTask, Doorbell, PackageRef, Wanted};
 use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
-use task_proto::manifest::{Build, BuildTool, ContentFacts, Outputs, Ready, Requires, Run, TaskKind, TaskManifest};
+use task_proto::log::{LogBatch, LogLevel, LogLine, LogSource};
+use task_proto::manifest::{
+    Build, BuildTool, ContentFacts, Limits, Outputs, Ready, ReadyTopic, Requires, Run, TaskKind, TaskManifest,
+};
 use task_proto::oci::ImageManifest;
 use task_proto::report::{
-    ActiveVersion, Condition, Failure, FailureCode, HostFacts, Phase, Progress, Report, Status, TaskReport,
+    ActiveVersion, Condition, Failure, FailureCode, HostFacts, Isolation, Phase, Progress, Report, RosFacts, Status,
+    TaskReport,
 };
+use task_proto::request::{Answer, Ask, Outcome, Refusal, Reply, Request};
+use task_proto::ros::{Endpoint, LifecycleState, NodeDetail, NodeSummary, Parameter, TopicSummary, Transition};
 use task_proto::topic::TopicPrefix;
 use task_proto::{Digest, Generation, RobotId};
 
@@ -74,6 +80,13 @@ fn report() -> Report {
             mac: Some(parsed("02:00:00:00:00:01")),
             ros_distros: vec!["jazzy".to_owned()],
             disk_free_bytes: 10_000_000_000,
+            ros: Some(RosFacts {
+                distro: "jazzy".to_owned(),
+                rmw: Some("rmw_fastrtps_cpp".to_owned()),
+                domain_id: Some(7),
+                localhost_only: false,
+            }),
+            isolation: Isolation::Cgroup,
         },
         conditions: vec![Condition { code: "held".to_owned(), text: "held at the robot".to_owned() }],
         tasks: vec![
@@ -90,6 +103,7 @@ fn report() -> Report {
                 attempts: 1,
                 restarts: 0,
                 failure: None,
+                degraded: None,
                 active: None,
             },
             TaskReport {
@@ -105,6 +119,7 @@ fn report() -> Report {
                 attempts: 3,
                 restarts: 1,
                 failure: Some(Failure::new(FailureCode::BUILD_FAILED, "colcon build ended with status 1")),
+                degraded: Some(Failure::new(FailureCode::TOPIC_SILENT, "/scan has no publisher")),
                 active: Some(ActiveVersion {
                     deployment: parsed("d00000000000000b0"),
                     version: parsed("1.1.0"),
@@ -125,10 +140,20 @@ fn manifest() -> TaskManifest {
             kind: TaskKind::Service,
             ..Run::default()
         },
-        ready: Ready { nodes: vec!["/talker".to_owned()], ..Ready::default() },
+        ready: Ready {
+            nodes: vec!["/talker".to_owned()],
+            lifecycle: vec!["/talker".to_owned()],
+            services: vec!["/talker/say".to_owned()],
+            topics: BTreeMap::from([
+                ("/chatter".to_owned(), ReadyTopic { min_hz: Some(5.0) }),
+                ("/words".to_owned(), ReadyTopic::default()),
+            ]),
+            ..Ready::default()
+        },
         parameters: BTreeMap::from([("/talker".to_owned(), BTreeMap::from([("period_s".to_owned(), json!(0.5))]))]),
         outputs: Outputs { paths: vec!["maps/*.pgm".to_owned()] },
         requires: Requires { ros_distro: vec!["jazzy".to_owned(), "kilted".to_owned()], ..Requires::default() },
+        limits: Limits { memory_mb: Some(512), cpu_weight: None, pids: Some(64) },
         exec_depends: vec!["rclpy".to_owned()],
         content: ContentFacts { tar_digest: Digest::of(b"tar"), tar_size: 10_240, entries: 9 },
     }
@@ -200,6 +225,76 @@ fn documents_between_server_and_robot() {
     check_tolerance::<Status>("status.json");
     let payload = envelope.open(DESIRED_STATE_TYPE, &key.public_key()).expect("signed");
     assert_eq!(serde_json::from_slice::<DesiredState>(&payload).expect("json"), state);
+}
+
+#[test]
+fn questions_and_answers() {
+    let asks = [
+        Ask::Nodes,
+        Ask::Node { name: parsed("/talker") },
+        Ask::Topics,
+        Ask::Parameters { node: parsed("/talker") },
+        Ask::Parameter { node: parsed("/talker"), name: "period_s".to_owned() },
+        Ask::SetParameter { node: parsed("/talker"), parameter: parameter() },
+        Ask::Lifecycle { node: parsed("/talker"), transition: Transition::Activate },
+        Ask::Logs { task: Some(parsed("talker")), level: LogLevel::Warn, since_ms: Some(600_000), max_lines: 100 },
+        Ask::Follow { level: LogLevel::Info, lease_ms: 30_000 },
+    ];
+    let requests = asks.map(|ask| Request { id: parsed("q00000000000000d4"), ttl_ms: 10_000, ask });
+    check("requests.json", &requests.to_vec());
+    check_tolerance::<Vec<Request>>("requests.json");
+    let newer = json!({"id": "q00000000000000d4", "ttl_ms": 1, "ask": {"type": "levitate", "height_m": 2}});
+    assert_eq!(serde_json::from_value::<Request>(newer).expect("tolerated").ask, Ask::Unknown);
+
+    let summary =
+        NodeSummary { name: parsed("/talker"), task: Some(parsed("talker")), lifecycle: Some(LifecycleState::Active) };
+    let endpoint = |name: &str, kind: &str| vec![Endpoint { name: parsed(name), kind: kind.to_owned() }];
+    let detail = NodeDetail {
+        node: summary.clone(),
+        publishers: endpoint("/chatter", "std_msgs/msg/String"),
+        subscriptions: Vec::new(),
+        services: endpoint("/talker/say", "std_srvs/srv/Trigger"),
+        clients: Vec::new(),
+    };
+    let topic = TopicSummary {
+        name: parsed("/chatter"),
+        types: vec!["std_msgs/msg/String".to_owned()],
+        publishers: vec![parsed("/talker")],
+        subscriptions: Vec::new(),
+    };
+    let answers = [
+        Answer::Nodes { age_ms: 20, nodes: vec![summary] },
+        Answer::Node { age_ms: 20, nodes: vec![detail] },
+        Answer::Topics { age_ms: 20, topics: vec![topic] },
+        Answer::Parameters { parameters: vec![parameter()] },
+        Answer::ParameterSet { parameter: parameter() },
+        Answer::Lifecycle { state: LifecycleState::Active },
+        Answer::Logs(log_batch()),
+        Answer::Following,
+    ];
+    let refusal = Refusal { code: "no_such_node".to_owned(), text: "no node /talker on the graph".to_owned() };
+    let outcomes = answers.map(Outcome::Answer).into_iter().chain([Outcome::Refusal(refusal)]);
+    let reply = |outcome| Reply { robot_id: robot(), id: parsed("q00000000000000d4"), outcome };
+    check("replies.json", &outcomes.map(reply).collect::<Vec<_>>());
+    check_tolerance::<Vec<Reply>>("replies.json");
+    check("log_batch.json", &log_batch());
+    check_tolerance::<LogBatch>("log_batch.json");
+}
+
+fn parameter() -> Parameter {
+    Parameter { name: "period_s".to_owned(), value: json!(0.5) }
+}
+
+fn log_batch() -> LogBatch {
+    let line = LogLine {
+        at_ms: 1_800_000_000_000,
+        level: LogLevel::Warn,
+        source: LogSource::Rosout,
+        task: Some(parsed("talker")),
+        node: Some(parsed("/talker")),
+        text: "nobody listens".to_owned(),
+    };
+    LogBatch { robot_id: robot(), now_ms: 1_800_000_000_250, lines: vec![line], suppressed: 3 }
 }
 
 #[test]

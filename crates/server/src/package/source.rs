@@ -139,6 +139,7 @@ fn merge(
         parameters: toml.parameters,
         outputs: toml.outputs,
         requires: toml.requires,
+        limits: toml.limits,
         exec_depends: xml.map(|xml| xml.exec_depends.clone()).unwrap_or_default(),
         content: ContentFacts { tar_digest: Digest::of(b""), tar_size: 0, entries: 0 },
     })

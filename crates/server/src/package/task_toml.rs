@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 
 use serde::de::DeserializeOwned;
-use task_proto::manifest::{BuildTool, Outputs, Ready, Requires, Run};
+use task_proto::manifest::{BuildTool, Limits, Outputs, Ready, ReadyTopic, Requires, Run};
 use task_proto::{TaskName, Version};
 
 use super::Problem;
@@ -23,6 +23,7 @@ pub(super) struct TaskToml {
     pub(super) parameters: BTreeMap<String, BTreeMap<String, serde_json::Value>>,
     pub(super) outputs: Outputs,
     pub(super) requires: Requires,
+    pub(super) limits: Limits,
 }
 
 /// Reads `text`, adding what is wrong with it to `problems`.
@@ -62,11 +63,14 @@ impl Section<'_> {
             section.take("restart", &mut run.restart);
             section.take("idempotent", &mut run.idempotent);
             section.take("stop_timeout_s", &mut run.stop_timeout_s);
+            section.take("deadline_s", &mut run.deadline_s);
         });
         self.section("ready", |section| {
             let ready = &mut file.ready;
             section.take("nodes", &mut ready.nodes);
             section.take("lifecycle", &mut ready.lifecycle);
+            section.take("services", &mut ready.services);
+            section.topics(&mut ready.topics);
             section.take("hold_s", &mut ready.hold_s);
             section.take("timeout_s", &mut ready.timeout_s);
         });
@@ -76,6 +80,12 @@ impl Section<'_> {
             section.take("labels", &mut requires.labels);
             section.take("ros_distro", &mut requires.ros_distro);
             section.take("arch", &mut requires.arch);
+        });
+        self.section("limits", |section| {
+            let limits = &mut file.limits;
+            section.take("memory_mb", &mut limits.memory_mb);
+            section.take("cpu_weight", &mut limits.cpu_weight);
+            section.take("pids", &mut limits.pids);
         });
         self.parameters(&mut file.parameters);
         self.finish();
@@ -107,6 +117,20 @@ impl Section<'_> {
                 section.finish();
             }
             Some(other) => self.problem(key, format!("expected a table, written [{key}] (it is {})", brief(&other))),
+        }
+    }
+
+    /// Takes `topics` apart: a table of tables, by the topics' names.
+    fn topics(&mut self, topics: &mut BTreeMap<String, ReadyTopic>) {
+        let mut tables: BTreeMap<String, toml::Table> = BTreeMap::new();
+        self.take("topics", &mut tables);
+        for (topic, table) in tables {
+            let path = format!("{}topics.{topic:?}.", self.path);
+            let mut section = Section { path, table, known: Vec::new(), problems: self.problems };
+            let mut wanted = ReadyTopic::default();
+            section.take("min_hz", &mut wanted.min_hz);
+            section.finish();
+            topics.insert(topic, wanted);
         }
     }
 

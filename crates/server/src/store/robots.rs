@@ -301,6 +301,7 @@ fn robot_view(row: &sqlx::any::AnyRow, mut tasks: Vec<RobotTask>) -> Result<Robo
     for task in &mut tasks {
         if let Some(said) = reported.iter_mut().find(|said| said.task == task.task) {
             task.active = said.active.take();
+            task.degraded = said.degraded.take().filter(|_| said.deployment == task.deployment);
             task.restarts = if said.deployment == task.deployment { said.restarts } else { 0 };
         }
     }
@@ -331,6 +332,7 @@ fn robot_task(row: &sqlx::any::AnyRow) -> Result<RobotTask, StoreError> {
         phase: Phase::from_text(row.try_get("phase")?),
         progress: from_optional_json("assignments.progress", row.try_get("progress")?)?,
         failure: from_optional_json("assignments.failure", row.try_get("failure")?)?,
+        degraded: None,
         active: None,
         restarts: 0,
     })

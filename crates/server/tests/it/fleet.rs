@@ -153,6 +153,7 @@ pub fn task_report(task: &DesiredTask, phase: Phase) -> TaskReport {
         attempts: 1,
         restarts: 0,
         failure: None,
+        degraded: None,
         active: None,
     }
 }

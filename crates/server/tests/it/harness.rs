@@ -218,6 +218,7 @@ fn in_phase(task: &DesiredTask, phase: Phase) -> TaskReport {
         attempts: 1,
         restarts: 0,
         failure: None,
+        degraded: None,
         active: None,
     }
 }

@@ -13,7 +13,7 @@ pub const MAX_BATCH_LINES: usize = 500;
 /// The longest text of a line, in bytes; a longer one is cut and ends in `…`.
 pub const MAX_LINE_BYTES: usize = 4096;
 /// The largest batch, in bytes of JSON.
-pub const MAX_BATCH_BYTES: usize = 512 * 1024;
+pub const MAX_BATCH_BYTES: usize = 200 * 1024;
 
 /// How serious a line is: the five levels of ROS, each more serious than the one before.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]

@@ -8,8 +8,8 @@ use crate::log::{LogBatch, LogLevel};
 use crate::ros::{LifecycleState, NodeDetail, NodeSummary, Parameter, TopicSummary, Transition};
 use crate::{RobotId, TaskName};
 
-/// The largest reply, in bytes of JSON.
-pub const MAX_REPLY_BYTES: usize = 768 * 1024;
+/// The largest reply, in bytes of JSON; a broker of ours takes packets up to 256 KiB.
+pub const MAX_REPLY_BYTES: usize = 240 * 1024;
 /// The longest a robot may take for an answer, in milliseconds.
 pub const MAX_TTL_MS: u64 = 60_000;
 

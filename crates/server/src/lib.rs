@@ -19,6 +19,7 @@ pub mod http;
 pub mod package;
 pub mod presence;
 pub mod report_writer;
+pub mod requests;
 pub mod rollout;
 pub mod serve;
 pub mod store;

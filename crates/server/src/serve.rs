@@ -26,6 +26,7 @@ use crate::http::events::{EventFeed, EventSource};
 use crate::http::{App, listener};
 use crate::presence::Presence;
 use crate::report_writer::ReportWriter;
+use crate::requests::Requests;
 use crate::store::{Store, StoreError, sqlite_url};
 use crate::uplink::Uplink;
 
@@ -97,7 +98,8 @@ impl Server {
         let presence = Arc::new(Presence::new(milliseconds(config.presence_timeout)));
         let actions = Actions::new(store.clone(), clock.clone(), changes.clone(), key, action_settings(&config));
         let (writer, reports) = ReportWriter::start(store.clone(), clock.clone(), changes.clone());
-        let uplink = Uplink::new(writer.clone(), presence.clone(), changes.clone(), clock.clone());
+        let requests = Requests::default();
+        let uplink = Uplink::new(writer.clone(), requests.clone(), presence.clone(), changes.clone(), clock.clone());
         let gatekeeper = StoreGatekeeper { store: store.clone(), clock: clock.clone() };
         let broker = Broker::start(broker_config(&config), Arc::new(gatekeeper), Arc::new(uplink)).await?;
 
@@ -110,6 +112,7 @@ impl Server {
             reports: writer,
             presence,
             broker: broker.clone(),
+            requests,
             blobs,
             sessions: Arc::default(),
             attempts: Arc::default(),

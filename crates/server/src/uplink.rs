@@ -1,4 +1,4 @@
-//! What robots say over MQTT: reports go to the writer, connections to presence. The broker has proven who speaks; what
+//! What robots say over MQTT: reports go to the writer, replies to whoever asked, connections to presence. The broker has proven who speaks; what
 //! is said is checked here. It never answers by itself: robots that are behind are put on the list of those to ring.
 
 use std::collections::HashMap;
@@ -10,6 +10,7 @@ use futures_util::future::BoxFuture;
 use serde::de::DeserializeOwned;
 use task_proto::RobotId;
 use task_proto::report::{Report, Status};
+use task_proto::request::{MAX_REPLY_BYTES, Reply};
 use task_proto::topic::RobotTopic;
 
 use crate::broker::{Inbox, NotStored, RobotMessage};
@@ -17,6 +18,7 @@ use crate::changes::{Change, Changes};
 use crate::clock::Clock;
 use crate::presence::Presence;
 use crate::report_writer::{ReportError, ReportWriter};
+use crate::requests::Requests;
 
 /// The largest report and status that are read.
 const MAX_REPORT_BYTES: usize = 1024 * 1024;
@@ -27,6 +29,7 @@ const RING_AGAIN_MS: u64 = 5_000;
 /// Receives what the broker takes in.
 pub struct Uplink {
     reports: ReportWriter,
+    requests: Requests,
     presence: Arc<Presence>,
     changes: Changes,
     clock: Clock,
@@ -36,8 +39,14 @@ pub struct Uplink {
 
 impl Uplink {
     /// An uplink that feeds these.
-    pub fn new(reports: ReportWriter, presence: Arc<Presence>, changes: Changes, clock: Clock) -> Self {
-        Self { reports, presence, changes, clock, reminded_ms: Mutex::default() }
+    pub fn new(
+        reports: ReportWriter,
+        requests: Requests,
+        presence: Arc<Presence>,
+        changes: Changes,
+        clock: Clock,
+    ) -> Self {
+        Self { reports, requests, presence, changes, clock, reminded_ms: Mutex::default() }
     }
 
     async fn take_report(&self, message: &RobotMessage) -> Result<(), NotStored> {
@@ -97,7 +106,11 @@ impl Inbox for Uplink {
             match message.topic {
                 RobotTopic::Report => return self.take_report(&message).await,
                 RobotTopic::Status => self.take_status(&message),
-                // Nothing asks questions yet, so there are no replies to expect.
+                RobotTopic::Reply => {
+                    if let Some(reply) = parsed::<Reply>(&message, MAX_REPLY_BYTES) {
+                        self.requests.replied(&message.robot, reply);
+                    }
+                }
                 _ => {}
             }
             Ok(())

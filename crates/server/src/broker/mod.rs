@@ -192,6 +192,17 @@ pub enum BrokerError {
 #[error("the robot is not connected over MQTT")]
 pub struct NotConnected;
 
+/// Why a question did not go out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum NotAsked {
+    /// The robot has no live session here.
+    #[error("the robot is not connected over MQTT")]
+    NotConnected,
+    /// Too many questions wait for it already.
+    #[error("the robot has not taken the questions before this one")]
+    Busy,
+}
+
 /// A handle on the running broker; clones are cheap.
 #[derive(Clone)]
 pub struct Broker {
@@ -218,6 +229,12 @@ impl Broker {
     /// one undelivered payload, and a newer one takes its place, also before the robot has subscribed.
     pub fn ring(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotConnected> {
         self.front.ring(robot, payload)
+    }
+
+    /// Sends `payload` on the robot's `request` topic, QoS 1, straight into its session. Never waits; questions that the
+    /// session has not taken when it ends are lost.
+    pub fn ask(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotAsked> {
+        self.front.ask(robot, payload)
     }
 
     /// Ends the robot's session, if it has one: its token was revoked or it was removed.

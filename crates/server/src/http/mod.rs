@@ -1,6 +1,7 @@
 //! The HTTP edge: one table of routes, each with who may call it, in front of handlers that look up, act and reply.
 //! It never holds SQL and never decides what an order means.
 
+mod ask;
 pub mod attempts;
 pub mod auth;
 mod deployments;
@@ -40,6 +41,7 @@ use crate::changes::Changes;
 use crate::clock::Clock;
 use crate::presence::Presence;
 use crate::report_writer::ReportWriter;
+use crate::requests::Requests;
 use crate::store::Store;
 use crate::web;
 use auth::{Access, Gate, guard};
@@ -62,6 +64,8 @@ pub struct App {
     pub presence: Arc<Presence>,
     /// The MQTT broker.
     pub broker: Broker,
+    /// Questions to robots that are under way.
+    pub requests: Requests,
     /// The packages' bytes.
     pub blobs: Blobs,
     /// Who is signed in at the page.
@@ -160,6 +164,7 @@ pub fn routes() -> Vec<Route> {
         Route::new(get.clone(), "/api/v1/robots/{robot}/desired", OwnRobot, robots::desired),
         Route::new(post.clone(), "/api/v1/robots/{robot}/report", OwnRobot, robots::report)
             .body_bytes(REPORT_BODY_BYTES),
+        Route::new(post.clone(), "/api/v1/robots/{robot}/ask", Operator, ask::ask),
         Route::new(get.clone(), "/api/v1/packages", Operator, packages::list),
         Route::new(get.clone(), "/api/v1/deployments", Operator, deployments::list),
         Route::new(post.clone(), "/api/v1/deployments", Operator, deployments::create).body_bytes(ORDER_BODY_BYTES),

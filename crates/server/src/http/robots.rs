@@ -112,7 +112,8 @@ pub(super) async fn report(
     Ok(Json(app.reports.submit(report).await?))
 }
 
-async fn find(app: &App, id_or_name: &RobotName) -> Result<RobotId, ApiError> {
+/// The robot that an operator names.
+pub(super) async fn find(app: &App, id_or_name: &RobotName) -> Result<RobotId, ApiError> {
     let found = app.store.find_robot(id_or_name.as_str()).await?;
     found.ok_or_else(|| ApiError::not_found(format!("there is no robot {id_or_name}")))
 }

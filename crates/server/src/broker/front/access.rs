@@ -30,7 +30,7 @@ pub(super) enum Route {
 pub(super) enum Hearing {
     /// The server's words to this robot, straight from its doorbell.
     Desired,
-    /// The server's questions to this robot. Nothing asks yet.
+    /// The server's questions to this robot, likewise.
     Request,
     /// What matches the filter among what goes through the router.
     Router,

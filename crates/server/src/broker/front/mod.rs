@@ -23,7 +23,7 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use super::router::Router;
-use super::{BrokerConfig, BrokerError, Gatekeeper, Inbox, Limits, NotConnected};
+use super::{BrokerConfig, BrokerError, Gatekeeper, Inbox, Limits, NotAsked, NotConnected};
 use crate::anteroom::Anteroom;
 use crate::backlog::listen;
 pub(super) use entrance::{CANARY_ID, CanaryPass};
@@ -81,6 +81,11 @@ impl Front {
     pub(super) fn ring(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotConnected> {
         self.context.seats.doorbell(robot).ok_or(NotConnected)?.ring(payload);
         Ok(())
+    }
+
+    pub(super) fn ask(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotAsked> {
+        let doorbell = self.context.seats.doorbell(robot).ok_or(NotAsked::NotConnected)?;
+        if doorbell.ask(payload) { Ok(()) } else { Err(NotAsked::Busy) }
     }
 
     pub(super) fn disconnect(&self, robot: &RobotId) {

@@ -222,6 +222,7 @@ enum Woken {
     Wrote(std::io::Result<usize>),
     Stored(Result<(), NotStored>),
     Rung(Bytes),
+    Asked(Bytes),
     Heard(Result<Heard, RouterError>),
     Late(End),
 }
@@ -255,7 +256,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         let (deadline, lateness) = self.deadline();
         let may_read = self.may_read();
         let may_send = self.output.is_empty() && self.outgoing.has_room();
-        let hears_desired = self.desired_qos().is_some();
+        let hears_desired = self.qos_of(Hearing::Desired).is_some();
+        let hears_request = self.qos_of(Hearing::Request).is_some();
         if may_read {
             self.input.reserve(1024);
         }
@@ -264,6 +266,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
             wrote = self.writer.write_buf(&mut self.output), if !self.output.is_empty() => Woken::Wrote(wrote),
             read = self.reader.read_buf(&mut self.input), if may_read => Woken::Read(read),
             payload = self.seat.doorbell().answer(), if may_send && hears_desired => Woken::Rung(payload),
+            payload = self.seat.doorbell().question(), if may_send && hears_request => Woken::Asked(payload),
             heard = heard(&mut self.listener), if may_send => Woken::Heard(heard),
             () = sleep_until(deadline) => Woken::Late(lateness),
         };
@@ -307,7 +310,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
                 give_back(&mut self.output);
             }
             Woken::Stored(stored) => self.acknowledge_stored(stored)?,
-            Woken::Rung(payload) => self.send_desired(payload),
+            Woken::Rung(payload) => self.send_own(RobotTopic::Desired, Hearing::Desired, payload),
+            Woken::Asked(payload) => self.send_own(RobotTopic::Request, Hearing::Request, payload),
             Woken::Heard(heard) => self.pass_on(heard.map_err(|_| End::RouterLost)?),
             Woken::Late(end) => return Err(end),
         }
@@ -425,13 +429,14 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         Ok(())
     }
 
-    fn desired_qos(&self) -> Option<QoS> {
-        self.hearing.values().find(|(hearing, _)| *hearing == Hearing::Desired).map(|(_, qos)| *qos)
+    fn qos_of(&self, wanted: Hearing) -> Option<QoS> {
+        self.hearing.values().find(|(hearing, _)| *hearing == wanted).map(|(_, qos)| *qos)
     }
 
-    fn send_desired(&mut self, payload: Bytes) {
-        if let (Visitor::Robot(robot), Some(granted)) = (&self.visitor, self.desired_qos()) {
-            let topic = self.context.prefix.format(&Topic::Robot(robot.clone(), RobotTopic::Desired));
+    /// Sends what is said to this robot alone.
+    fn send_own(&mut self, last: RobotTopic, hearing: Hearing, payload: Bytes) {
+        if let (Visitor::Robot(robot), Some(granted)) = (&self.visitor, self.qos_of(hearing)) {
+            let topic = self.context.prefix.format(&Topic::Robot(robot.clone(), last));
             self.send_message(topic, payload, lower(granted, QoS::AtLeastOnce));
         }
     }

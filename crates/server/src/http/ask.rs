@@ -1,0 +1,60 @@
+//! Questions of operators to one robot: passed on, answered by the robot itself.
+
+use std::time::Duration;
+
+use axum::Json;
+use axum::extract::State;
+use http::StatusCode;
+use task_proto::RobotName;
+use task_proto::request::{Answer, Ask, Refusal};
+
+use super::App;
+use super::error::ApiError;
+use super::extract::{JsonBody, PathParam};
+use super::robots::find;
+use crate::requests::RequestError;
+
+/// How long a robot may take. A lifecycle transition on a slow robot is what takes longest.
+const PATIENCE: Duration = Duration::from_secs(20);
+
+/// `POST /robots/{robot}/ask`: asks the robot and gives its answer.
+pub(super) async fn ask(
+    State(app): State<App>,
+    PathParam(robot): PathParam<RobotName>,
+    JsonBody(ask): JsonBody<Ask>,
+) -> Result<Json<Answer>, ApiError> {
+    if ask == Ask::Unknown {
+        return Err(ApiError::invalid("type: there is no such question"));
+    }
+    let id = find(&app, &robot).await?;
+    Ok(Json(app.requests.ask(&app.broker, &id, ask, PATIENCE).await?))
+}
+
+impl From<RequestError> for ApiError {
+    fn from(error: RequestError) -> Self {
+        let message = error.to_string();
+        match error {
+            RequestError::NotConnected(_) => Self::conflict("robot_offline", message),
+            RequestError::Busy => Self::unavailable(message),
+            RequestError::TimedOut { .. } => Self::new(StatusCode::GATEWAY_TIMEOUT, "robot_silent", message),
+            RequestError::Refused(refusal) => Self::new(StatusCode::UNPROCESSABLE_ENTITY, code(&refusal), message),
+            RequestError::Unwritable(_) => Self::internal(&error),
+        }
+    }
+}
+
+/// The robot's code, if it is one that this version knows.
+fn code(refusal: &Refusal) -> &'static str {
+    const KNOWN: [&str; 9] = [
+        "no_ros",
+        "no_such_node",
+        "no_such_parameter",
+        "no_such_task",
+        "rejected",
+        "timeout",
+        "too_large",
+        "busy",
+        "unsupported",
+    ];
+    KNOWN.into_iter().find(|known| *known == refusal.code).unwrap_or("refused")
+}

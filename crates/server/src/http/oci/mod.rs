@@ -111,11 +111,12 @@ pub async fn dispatch(State(registry): State<Registry>, Path(path): Path<String>
         Endpoint::Uploads => Err(OciError::method("POST")),
         Endpoint::Upload(id) => {
             let id = id.parse().map_err(|_| OciError::upload_unknown())?;
+            let upload = uploads::Upload { registry: &registry, repository: &repository, id };
             match method {
-                Method::GET => uploads::status(&registry, &repository, &id).await,
-                Method::PATCH => uploads::append(&registry, &repository, &id, &parts, body).await,
-                Method::PUT => uploads::finish(&registry, &repository, &id, &parts, body).await,
-                Method::DELETE => uploads::cancel(&registry, &repository, &id).await,
+                Method::GET => upload.status().await,
+                Method::PATCH => upload.append(&parts, body).await,
+                Method::PUT => upload.finish(&parts, body).await,
+                Method::DELETE => upload.cancel().await,
                 _ => Err(OciError::method("GET, PATCH, PUT, DELETE")),
             }
         }

@@ -40,84 +40,93 @@ pub(super) async fn begin(registry: &Registry, repository: &RepositoryName, part
     } else if let Some(digest) = &query.digest {
         let digest = parse_digest(digest)?;
         check_length(registry, &parts.headers)?;
-        let id = registry.blobs.begin_upload(repository).await?;
-        let appended = registry.blobs.append(repository, &id, Some(0), body.into_data_stream()).await;
+        let upload = begun(registry, repository).await?;
+        let appended = registry.blobs.append(repository, &upload.id, Some(0), body.into_data_stream()).await;
         if let Err(error) = appended {
             // Best effort, for the collector would find it; what the caller has to know is the error.
-            let _ = registry.blobs.cancel_upload(repository, &id).await;
+            let _ = upload.cancel().await;
             return Err(error.into());
         }
-        return complete(registry, repository, &id, digest).await;
+        return upload.complete(digest).await;
     }
+    begun(registry, repository).await?.accepted(StatusCode::ACCEPTED, 0)
+}
+
+async fn begun<'a>(registry: &'a Registry, repository: &'a RepositoryName) -> Result<Upload<'a>, OciError> {
     let id = registry.blobs.begin_upload(repository).await?;
-    accepted(StatusCode::ACCEPTED, repository, &id, 0)
+    Ok(Upload { registry, repository, id })
 }
 
-/// `GET` of an upload: where it stands.
-pub(super) async fn status(registry: &Registry, repository: &RepositoryName, id: &UploadId) -> Answer {
-    let offset = registry.blobs.upload_offset(repository, id).await?;
-    accepted(StatusCode::NO_CONTENT, repository, id, offset)
+/// An upload that was begun.
+pub(super) struct Upload<'a> {
+    pub(super) registry: &'a Registry,
+    pub(super) repository: &'a RepositoryName,
+    pub(super) id: UploadId,
 }
 
-/// `PATCH`: one more chunk; without a `Content-Range` it begins where the upload stands.
-pub(super) async fn append(
-    registry: &Registry,
-    repository: &RepositoryName,
-    id: &UploadId,
-    parts: &Parts,
-    body: Body,
-) -> Answer {
-    let offset = take_chunk(registry, repository, id, parts, body).await?;
-    accepted(StatusCode::ACCEPTED, repository, id, offset)
-}
-
-/// `PUT`: perhaps a last chunk, then the digest that everything must have.
-pub(super) async fn finish(
-    registry: &Registry,
-    repository: &RepositoryName,
-    id: &UploadId,
-    parts: &Parts,
-    body: Body,
-) -> Answer {
-    let FinishQuery { digest } = query(&parts.uri)?;
-    let digest = parse_digest(&digest.ok_or_else(|| OciError::digest_invalid("the digest parameter is missing"))?)?;
-    take_chunk(registry, repository, id, parts, body).await?;
-    complete(registry, repository, id, digest).await
-}
-
-/// `DELETE`: gives the upload up.
-pub(super) async fn cancel(registry: &Registry, repository: &RepositoryName, id: &UploadId) -> Answer {
-    registry.blobs.cancel_upload(repository, id).await?;
-    empty(StatusCode::NO_CONTENT, [])
-}
-
-async fn take_chunk(
-    registry: &Registry,
-    repository: &RepositoryName,
-    id: &UploadId,
-    parts: &Parts,
-    body: Body,
-) -> Result<u64, OciError> {
-    let range = content_range(parts)?;
-    check_length(registry, &parts.headers)?;
-    let start = range.as_ref().map(|range| range.start);
-    let offset = registry.blobs.append(repository, id, start, body.into_data_stream()).await?;
-    match range {
-        Some(range) if range.end != offset => Err(OciError::size_invalid(format!(
-            "the Content-Range ends before byte {}, the body before byte {offset}",
-            range.end
-        ))),
-        _ => Ok(offset),
+impl Upload<'_> {
+    /// `GET`: where it stands.
+    pub(super) async fn status(&self) -> Answer {
+        let offset = self.registry.blobs.upload_offset(self.repository, &self.id).await?;
+        self.accepted(StatusCode::NO_CONTENT, offset)
     }
-}
 
-/// Makes the upload a blob of the repository, in one go as the collector sees it.
-async fn complete(registry: &Registry, repository: &RepositoryName, id: &UploadId, digest: Digest) -> Answer {
-    let _hold = registry.blobs.hold_collection().await;
-    registry.blobs.finish_upload(repository, id, digest).await?;
-    registry.blobs.touch(digest, registry.clock.now_ms()).await?;
-    registry.store.link_blob(repository, &digest).await?;
-    created(repository, &digest)
+    /// `PATCH`: one more chunk; without a `Content-Range` it begins where the upload stands.
+    pub(super) async fn append(&self, parts: &Parts, body: Body) -> Answer {
+        let offset = self.take_chunk(parts, body).await?;
+        self.accepted(StatusCode::ACCEPTED, offset)
+    }
+
+    /// `PUT`: perhaps a last chunk, then the digest that everything must have.
+    pub(super) async fn finish(&self, parts: &Parts, body: Body) -> Answer {
+        let FinishQuery { digest } = query(&parts.uri)?;
+        let digest = digest.ok_or_else(|| OciError::digest_invalid("the digest parameter is missing"))?;
+        let digest = parse_digest(&digest)?;
+        self.take_chunk(parts, body).await?;
+        self.complete(digest).await
+    }
+
+    /// `DELETE`: gives the upload up.
+    pub(super) async fn cancel(&self) -> Answer {
+        self.registry.blobs.cancel_upload(self.repository, &self.id).await?;
+        empty(StatusCode::NO_CONTENT, [])
+    }
+
+    async fn take_chunk(&self, parts: &Parts, body: Body) -> Result<u64, OciError> {
+        let range = content_range(parts)?;
+        check_length(self.registry, &parts.headers)?;
+        let start = range.as_ref().map(|range| range.start);
+        let body = body.into_data_stream();
+        let offset = self.registry.blobs.append(self.repository, &self.id, start, body).await?;
+        match range {
+            Some(range) if range.end != offset => Err(OciError::size_invalid(format!(
+                "the Content-Range ends before byte {}, the body before byte {offset}",
+                range.end
+            ))),
+            _ => Ok(offset),
+        }
+    }
+
+    /// Makes the upload a blob of the repository, in one go as the collector sees it.
+    async fn complete(&self, digest: Digest) -> Answer {
+        let Self { registry, repository, id } = self;
+        let _hold = registry.blobs.hold_collection().await;
+        registry.blobs.finish_upload(repository, id, digest).await?;
+        registry.blobs.touch(digest, registry.clock.now_ms()).await?;
+        registry.store.link_blob(repository, &digest).await?;
+        created(repository, &digest)
+    }
+
+    fn accepted(&self, status: StatusCode, offset: u64) -> Answer {
+        let (repository, id) = (self.repository, self.id.as_str());
+        let headers: [(&str, String); 3] = [
+            ("location", format!("/v2/{repository}/blobs/uploads/{id}")),
+            // An upload without a byte can't be told from one with a single byte: the specification has no word for it.
+            ("range", format!("0-{}", offset.saturating_sub(1))),
+            ("docker-upload-uuid", id.to_owned()),
+        ];
+        empty(status, headers)
+    }
 }
 
 /// Makes a blob of `from` (of any repository, if absent) one of this repository; false if it is not there.
@@ -164,16 +173,6 @@ fn content_range(parts: &Parts) -> Result<Option<std::ops::Range<u64>>, OciError
         }
         _ => Ok(Some(range)),
     }
-}
-
-fn accepted(status: StatusCode, repository: &RepositoryName, id: &UploadId, offset: u64) -> Answer {
-    let headers: [(&str, String); 3] = [
-        ("location", format!("/v2/{repository}/blobs/uploads/{}", id.as_str())),
-        // An upload without a byte can't be told from one with a single byte: the specification has no word for it.
-        ("range", format!("0-{}", offset.saturating_sub(1))),
-        ("docker-upload-uuid", id.as_str().to_owned()),
-    ];
-    empty(status, headers)
 }
 
 fn created(repository: &RepositoryName, digest: &Digest) -> Result<Response, OciError> {

@@ -72,6 +72,13 @@ pub struct EnrollResponse {
     pub mqtt: MqttEndpoint,
 }
 
+/// Answer to a robot's `POST /robots/{robot}/token`. The token is shown this once; its first use ends the one before.
+#[derive(Clone, Serialize, Deserialize)]
+pub struct RobotToken {
+    /// The robot's next bearer token and MQTT password.
+    pub token: String,
+}
+
 /// Where a robot's MQTT session goes.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct MqttEndpoint {

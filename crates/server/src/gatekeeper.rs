@@ -1,5 +1,6 @@
 //! Who may come in over MQTT: the broker's question, answered from the database for each connection, so that a token
-//! that was revoked a moment ago no longer opens anything.
+//! that was revoked a moment ago no longer opens anything. A robot that comes in by a new token thereby ends its old one;
+//! the session that came by that one is taken over.
 
 use futures_util::FutureExt as _;
 use futures_util::future::BoxFuture;
@@ -21,14 +22,14 @@ impl StoreGatekeeper {
     async fn decide(&self, login: Login) -> Result<Principal, Refusal> {
         let password = login.password.as_deref().ok_or(Refusal::BadCredentials)?;
         let token: Token = password.parse().map_err(|_| Refusal::BadCredentials)?;
-        let holder = self.store.token_holder(&token, self.clock.now_ms()).await.map_err(|error| {
+        let admitted = self.store.admit(&token, self.clock.now_ms()).await.map_err(|error| {
             tracing::warn!(error = &error as &dyn std::error::Error, "a login over MQTT could not be checked");
             Refusal::Unavailable
         })?;
-        match holder {
-            Some(TokenHolder::Robot(robot)) => {
+        match admitted.map(|admitted| admitted.holder) {
+            Some(TokenHolder::Robot { robot, token_number }) => {
                 let is_itself = login.client_id == robot.as_str() && login.user_name.as_deref() == Some(robot.as_str());
-                if is_itself { Ok(Principal::Robot(robot)) } else { Err(Refusal::NotAuthorised) }
+                if is_itself { Ok(Principal::Robot { robot, token_number }) } else { Err(Refusal::NotAuthorised) }
             }
             Some(TokenHolder::Operator) => Ok(Principal::Operator),
             Some(TokenHolder::Enrolment) => Err(Refusal::NotAuthorised),

@@ -39,6 +39,9 @@ pub enum ReportError {
     /// No such robot, or no longer.
     #[error("there is no robot {0}")]
     RobotNotFound(RobotId),
+    /// Another token of the robot was used since the sender showed its own: it speaks for the robot no longer.
+    #[error("robot {0} uses a newer token")]
+    TokenEnded(RobotId),
     /// The queue stays full, or the server is stopping.
     #[error("reports can't be taken now")]
     Busy,
@@ -50,6 +53,7 @@ pub enum ReportError {
 #[derive(Debug)]
 struct Submission {
     report: Report,
+    token_number: u64,
     answer: oneshot::Sender<Result<ReportReply, ReportError>>,
 }
 
@@ -60,10 +64,11 @@ impl ReportWriter {
         (Self { queue }, tokio::spawn(write_all(submissions, store, clock, changes)))
     }
 
-    /// Stores `report`, whose `robot_id` the caller has authenticated. Resolves after the commit.
-    pub async fn submit(&self, report: Report) -> Result<ReportReply, ReportError> {
+    /// Stores `report`, whose `robot_id` the caller has authenticated by the robot's token of this number. Resolves after
+    /// the commit.
+    pub async fn submit(&self, report: Report, token_number: u64) -> Result<ReportReply, ReportError> {
         let (answer, answered) = oneshot::channel();
-        let submission = Submission { report, answer };
+        let submission = Submission { report, token_number, answer };
         self.queue.send_timeout(submission, PATIENCE).await.map_err(|_| ReportError::Busy)?;
         answered.await.map_err(|_| ReportError::Busy)?
     }
@@ -87,10 +92,13 @@ async fn write_all(mut submissions: mpsc::Receiver<Submission>, store: Store, cl
                 Err(ReportError::NotStored)
             }
         };
-        for Submission { report, answer } in batch.drain(..) {
-            let reply = answers.as_ref().map_err(Clone::clone).and_then(|answers| {
-                answers.get(&report.robot_id).cloned().ok_or(ReportError::RobotNotFound(report.robot_id))
-            });
+        for Submission { report, token_number, answer } in batch.drain(..) {
+            let reply =
+                answers.as_ref().map_err(Clone::clone).and_then(|answers| match answers.get(&report.robot_id) {
+                    None => Err(ReportError::RobotNotFound(report.robot_id)),
+                    Some(answer) if token_number < answer.token_number => Err(ReportError::TokenEnded(report.robot_id)),
+                    Some(answer) => Ok(answer.reply.clone()),
+                });
             // A caller that has gone away does not need to know.
             let _ = answer.send(reply);
         }
@@ -98,12 +106,14 @@ async fn write_all(mut submissions: mpsc::Receiver<Submission>, store: Store, cl
 }
 
 /// The last report of each robot in a batch.
-fn newest_by_robot(batch: &[Submission]) -> Vec<&Report> {
-    let mut newest: HashMap<&RobotId, &Report> = HashMap::new();
-    for Submission { report, .. } in batch {
-        let last = newest.entry(&report.robot_id).or_insert(report);
-        if position(report) > position(last) {
-            *last = report;
+fn newest_by_robot(batch: &[Submission]) -> Vec<&Submission> {
+    let mut newest: HashMap<&RobotId, &Submission> = HashMap::new();
+    // An agent that came with a newer token may count its starts from 1 again.
+    let position = |submission: &Submission| (submission.token_number, position(&submission.report));
+    for submission in batch {
+        let last = newest.entry(&submission.report.robot_id).or_insert(submission);
+        if position(submission) > position(last) {
+            *last = submission;
         }
     }
     newest.into_values().collect()
@@ -114,11 +124,17 @@ fn position(report: &Report) -> (u64, u64) {
     (report.start, report.seq)
 }
 
-type Answers = HashMap<RobotId, ReportReply>;
+/// What all that reported for a robot are answered, those by an ended token excepted.
+struct Answer {
+    reply: ReportReply,
+    token_number: u64,
+}
+
+type Answers = HashMap<RobotId, Answer>;
 
 async fn write_with_retries(
     store: &Store,
-    reports: &[&Report],
+    reports: &[&Submission],
     clock: &Clock,
 ) -> Result<(Answers, Consequences), StoreError> {
     let mut pause = FIRST_PAUSE;
@@ -138,15 +154,22 @@ async fn write_with_retries(
 }
 
 /// Stores a batch and what follows from it, in one write.
-async fn write_batch(store: &Store, reports: &[&Report], now_ms: u64) -> Result<(Answers, Consequences), StoreError> {
+async fn write_batch(
+    store: &Store,
+    reports: &[&Submission],
+    now_ms: u64,
+) -> Result<(Answers, Consequences), StoreError> {
     let mut write = store.begin().await?;
-    let robots: Vec<RobotId> = reports.iter().map(|report| report.robot_id.clone()).collect();
+    let robots: Vec<RobotId> = reports.iter().map(|submission| submission.report.robot_id.clone()).collect();
     let mut known: HashMap<RobotId, ReportedRobot> =
         write.reported_robots(&robots).await?.into_iter().map(|robot| (robot.id.clone(), robot)).collect();
     // A report that is older than the stored one is acknowledged, so that it is not sent again, and ignored.
-    let is_news =
-        |report: &&Report| known.get(&report.robot_id).is_some_and(|robot| position(report) > robot.last_report);
-    let news: Vec<&Report> = reports.iter().copied().filter(is_news).collect();
+    let is_news = |submission: &&Submission| {
+        known.get(&submission.report.robot_id).is_some_and(|robot| {
+            submission.token_number >= robot.token_number && position(&submission.report) > robot.last_report
+        })
+    };
+    let news: Vec<&Report> = reports.iter().copied().filter(is_news).map(|submission| &submission.report).collect();
     let mut consequences = Consequences::default();
     consequences.robots.extend(news.iter().map(|report| report.robot_id.clone()));
     let moved = write_standings(&mut write, &news, now_ms).await?;
@@ -158,7 +181,8 @@ async fn write_batch(store: &Store, reports: &[&Report], now_ms: u64) -> Result<
     known.extend(write.reported_robots(&rung).await?.into_iter().map(|robot| (robot.id.clone(), robot)));
     write.commit().await?;
     let answer = |robot: ReportedRobot| {
-        (robot.id, ReportReply { generation: robot.generation, name: robot.name, labels: robot.labels })
+        let reply = ReportReply { generation: robot.generation, name: robot.name, labels: robot.labels };
+        (robot.id, Answer { reply, token_number: robot.token_number })
     };
     Ok((known.into_values().map(answer).collect(), consequences))
 }

@@ -57,7 +57,7 @@ impl Uplink {
         }
         self.saw_instance(message, &report.instance);
         let observed = report.observed_generation;
-        match self.reports.submit(report).await {
+        match self.reports.submit(report, message.token_number).await {
             Ok(reply) => {
                 if reply.generation > observed {
                     self.remind(&message.robot);

@@ -137,6 +137,9 @@ pub enum ActionError {
     /// The enrolment token is unknown, used up, expired or revoked.
     #[error("the enrolment token is unknown, used up, expired or revoked")]
     TokenRefused,
+    /// The robot was registered again and the token made then waits for its first use: the old agent gets no other.
+    #[error("robot {0} was registered again and its new token was not used yet")]
+    EnrolledAnew(RobotId),
     /// There is no such robot.
     #[error("there is no robot {0:?}")]
     RobotNotFound(String),
@@ -165,6 +168,7 @@ impl ActionError {
             Self::TokenForOther { .. } => "token_for_other_robot",
             Self::NameTaken(_) => "name_taken",
             Self::TokenRefused => "unauthorized",
+            Self::EnrolledAnew(_) => "enrolled_anew",
             Self::RobotNotFound(_) | Self::DeploymentNotFound(_) => "not_found",
             Self::DeploymentCancelled(_) => "deployment_cancelled",
             Self::Diverged(_) => "diverged",

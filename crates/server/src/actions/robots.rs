@@ -27,26 +27,47 @@ pub struct Enrolled {
 
 impl Actions {
     /// Registers a robot that holds the enrolment token `token`. A robot that is known by its MAC may register again with
-    /// a token made for it: it keeps its id, name and labels, and its old token ends.
+    /// a token made for it, and by the same token as before while the answer to that may have been lost: nobody has used
+    /// what was in it. It keeps its id, name and labels; its old token ends when the new one is first used.
     pub async fn enroll(&self, token: &Token, request: &EnrollRequest) -> Result<Enrolled, ActionError> {
         check_labels(&request.labels)?;
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
         let terms = write.enrolment_terms(token, now_ms).await?.ok_or(ActionError::TokenRefused)?;
-        let robot = match write.robot_by_mac(&request.mac).await? {
-            Some(known) if terms.robot.as_ref() == Some(&known.id) => {
-                write.forget_report(&known.id).await?;
-                known
-            }
+        let known = write.robot_by_mac(&request.mac).await?;
+        let is_retry = match &known {
+            Some(known) => write.awaits_first_use(&known.id, Some(token)).await?,
+            None => false,
+        };
+        if terms.uses_left == Some(0) && !is_retry {
+            return Err(ActionError::TokenRefused);
+        }
+        let robot = match known {
+            Some(known) if is_retry || terms.robot.as_ref() == Some(&known.id) => known,
             Some(known) => return Err(ActionError::MacKnown { mac: known.mac, name: known.name }),
             None => register(&mut write, terms, request, now_ms).await?,
         };
-        write.use_enrolment_token(token).await?;
+        if !is_retry {
+            write.use_enrolment_token(token).await?;
+        }
         let robot_token = Token::random(TokenKind::Robot);
-        write.replace_robot_token(&robot_token, &robot.id, now_ms).await?;
+        write.offer_robot_token(&robot_token, &robot.id, Some(token), now_ms).await?;
         write.commit().await?;
         self.changes.announce(Change::Robot(robot.id.clone()));
         Ok(Enrolled { robot_id: robot.id, name: robot.name, token: robot_token })
+    }
+
+    /// Makes a token that `robot` may go over to. The one it uses ends when that one is first used.
+    pub async fn next_robot_token(&self, robot: &RobotId) -> Result<Token, ActionError> {
+        let mut write = self.store.begin().await?;
+        known_robot(&mut write, robot.as_str()).await?;
+        if write.awaits_first_use(robot, None).await? {
+            return Err(ActionError::EnrolledAnew(robot.clone()));
+        }
+        let token = Token::random(TokenKind::Robot);
+        write.offer_robot_token(&token, robot, None, self.clock.now_ms()).await?;
+        write.commit().await?;
+        Ok(token)
     }
 
     /// Makes an enrolment token.
@@ -97,7 +118,7 @@ impl Actions {
         let mut write = self.store.begin().await?;
         known_robot(&mut write, robot.as_str()).await?;
         let touched = write.end_all_of_robot(robot, now_ms).await?;
-        write.revoke_tokens(robot, None, now_ms).await?;
+        write.revoke_tokens(robot, now_ms).await?;
         write.remove_robot(robot, now_ms).await?;
         let mut consequences = Consequences { deployments: touched.clone(), ..Consequences::default() };
         advance(&mut write, touched, now_ms, &mut consequences).await?;

@@ -37,7 +37,12 @@ pub struct Login {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Principal {
     /// A robot: speaks and listens on its own topics only. Its client id must be its robot id.
-    Robot(RobotId),
+    Robot {
+        /// Which.
+        robot: RobotId,
+        /// Which of its tokens it showed; comes back with its messages.
+        token_number: u64,
+    },
     /// A person or program with an operator's token: may listen below the prefix.
     Operator,
 }
@@ -76,6 +81,8 @@ pub struct RobotMessage {
     pub peer: SocketAddr,
     /// The connection it came by, as in [`Inbox::connected`].
     pub connection: u64,
+    /// The token the connection was let in by, as in [`Principal::Robot`].
+    pub token_number: u64,
 }
 
 /// The message could not be stored; the robot keeps it and sends it again.

@@ -17,7 +17,7 @@ use task_proto::token::Token;
 
 use super::App;
 use super::error::ApiError;
-use crate::store::TokenHolder;
+use crate::store::{Admitted, TokenHolder};
 
 /// Who may call a route.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -33,6 +33,10 @@ pub enum Access {
     /// An operator, or any robot; the handler narrows what a robot gets.
     OperatorOrRobot,
 }
+
+/// Which of its tokens a robot called with, by number. Handlers for robots may take it as an extension.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct TokenNumber(pub u64);
 
 /// Who is calling, as the guard found out. Handlers take it as an argument.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -96,10 +100,13 @@ pub(super) async fn guard(
     // A path that is no text names nobody; the handler says that there is no such thing.
     let own = params.iter().flatten().find(|(name, _)| *name == "robot").map(|(_, value)| value);
     match admit(&gate, peer, own, request.method(), request.headers()).await {
-        Ok(caller) => request.extensions_mut().insert(caller),
+        Ok((caller, token_number)) => {
+            request.extensions_mut().insert(caller);
+            request.extensions_mut().insert(token_number);
+        }
         Err(error) if is_oci => return error.into_oci_response(),
         Err(error) => return error.into_response(),
-    };
+    }
     let Some(deadline) = gate.deadline else { return next.run(request).await };
     tokio::time::timeout(deadline, next.run(request)).await.unwrap_or_else(|_| {
         let message = "the request took too long to arrive or to be answered";
@@ -113,13 +120,13 @@ async fn admit(
     own: Option<&str>,
     method: &Method,
     headers: &HeaderMap,
-) -> Result<Caller, ApiError> {
+) -> Result<(Caller, TokenNumber), ApiError> {
     if gate.access == Access::Anyone {
-        return Ok(Caller::Anyone);
+        return Ok((Caller::Anyone, TokenNumber(0)));
     }
     match identify(&gate.app, method, headers).await {
-        Ok(caller) if caller.may(gate.access, own) => Ok(caller),
-        Ok(Caller::Anyone) => Err(ApiError::unauthorized("a token is needed: Authorization: Bearer …")),
+        Ok((caller, token_number)) if caller.may(gate.access, own) => Ok((caller, token_number)),
+        Ok((Caller::Anyone, _)) => Err(ApiError::unauthorized("a token is needed: Authorization: Bearer …")),
         Ok(_) => Err(ApiError::forbidden("this token may not do that")),
         Err(error) if error.status == StatusCode::UNAUTHORIZED => {
             let is_too_many = gate.app.attempts.record(peer.ip(), gate.app.clock.now_ms());
@@ -130,7 +137,7 @@ async fn admit(
 }
 
 /// Who sent these headers. `Anyone` if they don't say; an error if they say it wrongly.
-async fn identify(app: &App, method: &Method, headers: &HeaderMap) -> Result<Caller, ApiError> {
+async fn identify(app: &App, method: &Method, headers: &HeaderMap) -> Result<(Caller, TokenNumber), ApiError> {
     let now_ms = app.clock.now_ms();
     let token = if let Some(value) = headers.get(header::AUTHORIZATION) {
         let text = value.to_str().ok().and_then(presented_token);
@@ -142,14 +149,22 @@ async fn identify(app: &App, method: &Method, headers: &HeaderMap) -> Result<Cal
         }
         session.token
     } else {
-        return Ok(Caller::Anyone);
+        return Ok((Caller::Anyone, TokenNumber(0)));
     };
-    match app.store.token_holder(&token, now_ms).await? {
-        Some(TokenHolder::Operator) => Ok(Caller::Operator),
-        Some(TokenHolder::Robot(robot)) => Ok(Caller::Robot(robot)),
-        Some(TokenHolder::Enrolment) => Ok(Caller::Enrolment(Box::new(token))),
-        None => Err(ApiError::unauthorized("the token is unknown, expired or revoked")),
-    }
+    let Some(Admitted { holder, is_first_use }) = app.store.admit(&token, now_ms).await? else {
+        return Err(ApiError::unauthorized("the token is unknown, expired or revoked"));
+    };
+    Ok(match holder {
+        TokenHolder::Operator => (Caller::Operator, TokenNumber(0)),
+        TokenHolder::Enrolment => (Caller::Enrolment(Box::new(token)), TokenNumber(0)),
+        TokenHolder::Robot { robot, token_number } => {
+            if is_first_use {
+                // Whoever is connected came in by the token that has just ended.
+                app.broker.disconnect(&robot);
+            }
+            (Caller::Robot(robot), TokenNumber(token_number))
+        }
+    })
 }
 
 /// The token of `Bearer TOKEN` or `Basic base64(anything:TOKEN)`.

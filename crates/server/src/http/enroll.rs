@@ -20,8 +20,6 @@ pub(super) async fn enroll(
         return Err(ApiError::forbidden("an enrolment token is needed"));
     };
     let enrolled = app.actions.enroll(&token, &request).await?;
-    // A robot that registers again has new tokens; whoever is connected with an old one has to go.
-    app.broker.disconnect(&enrolled.robot_id);
     let answer = EnrollResponse {
         robot_id: enrolled.robot_id,
         name: enrolled.name,

@@ -121,6 +121,7 @@ impl From<ActionError> for ApiError {
             | ActionError::IdempotencyKeyReused(_)
             | ActionError::MacKnown { .. }
             | ActionError::NameTaken(_)
+            | ActionError::EnrolledAnew(_)
             | ActionError::DeploymentCancelled(_)
             | ActionError::Diverged(_) => StatusCode::CONFLICT,
         };
@@ -132,6 +133,7 @@ impl From<ReportError> for ApiError {
     fn from(error: ReportError) -> Self {
         match error {
             ReportError::RobotNotFound(_) => Self::not_found(error.to_string()),
+            ReportError::TokenEnded(_) => Self::unauthorized(error.to_string()),
             ReportError::Busy | ReportError::NotStored => Self::unavailable(error.to_string()),
         }
     }

@@ -162,6 +162,7 @@ pub fn routes() -> Vec<Route> {
         Route::new(patch, "/api/v1/robots/{robot}", Operator, robots::edit),
         Route::new(delete, "/api/v1/robots/{robot}", Operator, robots::remove),
         Route::new(get.clone(), "/api/v1/robots/{robot}/desired", OwnRobot, robots::desired),
+        Route::new(post.clone(), "/api/v1/robots/{robot}/token", OwnRobot, robots::next_token),
         Route::new(post.clone(), "/api/v1/robots/{robot}/report", OwnRobot, robots::report)
             .body_bytes(REPORT_BODY_BYTES),
         Route::new(post.clone(), "/api/v1/robots/{robot}/ask", Operator, ask::ask),

@@ -2,17 +2,18 @@
 
 use std::net::SocketAddr;
 
-use axum::Json;
 use axum::extract::{ConnectInfo, State};
 use axum::response::{IntoResponse, Response};
+use axum::{Extension, Json};
 use http::{HeaderMap, StatusCode, header};
 use serde::Deserialize;
-use task_proto::api::{EditRobot, ReportReply, RobotList, RobotView};
+use task_proto::api::{EditRobot, ReportReply, RobotList, RobotToken, RobotView};
 use task_proto::report::Report;
 use task_proto::selector::Selector;
 use task_proto::{Digest, RobotId, RobotName};
 
 use super::App;
+use super::auth::TokenNumber;
 use super::error::ApiError;
 use super::extract::{JsonBody, PathParam, QueryParams, TolerantJson};
 use super::views::complete_robot;
@@ -100,6 +101,7 @@ pub(super) async fn desired(
 pub(super) async fn report(
     State(app): State<App>,
     ConnectInfo(peer): ConnectInfo<SocketAddr>,
+    Extension(TokenNumber(token_number)): Extension<TokenNumber>,
     PathParam(robot): PathParam<RobotId>,
     TolerantJson(report): TolerantJson<Report>,
 ) -> Result<Json<ReportReply>, ApiError> {
@@ -109,7 +111,16 @@ pub(super) async fn report(
     let now_ms = app.clock.now_ms();
     uplink::heard(&app.presence, &app.changes, &robot, peer, now_ms);
     app.presence.instance_seen(&robot, peer, &report.instance, now_ms);
-    Ok(Json(app.reports.submit(report).await?))
+    Ok(Json(app.reports.submit(report, token_number).await?))
+}
+
+/// `POST /robots/{robot}/token` (that robot): a token it may go over to; the first use of it ends the one it called with.
+pub(super) async fn next_token(
+    State(app): State<App>,
+    PathParam(robot): PathParam<RobotId>,
+) -> Result<(StatusCode, Json<RobotToken>), ApiError> {
+    let token = app.actions.next_robot_token(&robot).await?;
+    Ok((StatusCode::CREATED, Json(RobotToken { token: token.reveal() })))
 }
 
 /// The robot that an operator names.

@@ -26,7 +26,7 @@ pub use orders::PastOrder;
 pub use packages::{NewManifest, PutManifest, Reference, StoredManifest};
 pub use reports::{OpenAssignment, ReportedRobot};
 pub use robots::{DesiredTasks, KnownRobot};
-pub use tokens::{EnrolmentTerms, TokenHolder};
+pub use tokens::{Admitted, EnrolmentTerms, TokenHolder};
 
 /// Connections that read at the same time.
 const READERS: u32 = 4;

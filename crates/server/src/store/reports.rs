@@ -26,6 +26,8 @@ pub struct ReportedRobot {
     pub generation: Generation,
     /// Start and number of its last report.
     pub last_report: (u64, u64),
+    /// The number of the token it uses.
+    pub token_number: u64,
 }
 
 /// A released assignment that has not ended.
@@ -50,7 +52,8 @@ impl Write {
         for group in groups(robots) {
             let sql = format!(
                 "WITH v (id) AS ({})
-                 SELECT r.id, r.name, r.labels, r.generation, r.report_start, r.report_seq
+                 SELECT r.id, r.name, r.labels, r.generation, r.report_start, r.report_seq,
+                     r.token_number
                  FROM v JOIN robots r ON r.id = v.id WHERE r.removed_at_ms IS NULL",
                 values(1, group.len(), &["TEXT"])
             );
@@ -65,6 +68,7 @@ impl Write {
                     labels: from_json("robots.labels", row.try_get("labels")?)?,
                     generation: Generation(number(row.try_get("generation")?)),
                     last_report: (number(row.try_get("report_start")?), number(row.try_get("report_seq")?)),
+                    token_number: number(row.try_get("token_number")?),
                 });
             }
         }

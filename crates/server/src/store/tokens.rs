@@ -1,4 +1,5 @@
-//! Tokens: stored as digests of their secrets, with what each may do.
+//! Tokens: stored as digests of their secrets, with what each may do. A robot has at most two that are valid: the one it
+//! uses, and one that was made for it and ends the other when it is first used.
 
 use sqlx::Row as _;
 use subtle::ConstantTimeEq as _;
@@ -16,8 +17,22 @@ pub enum TokenHolder {
     Operator,
     /// Someone who may enrol.
     Enrolment,
-    /// This robot.
-    Robot(RobotId),
+    /// A robot.
+    Robot {
+        /// Which.
+        robot: RobotId,
+        /// The number of its token: a later one has a higher number.
+        token_number: u64,
+    },
+}
+
+/// A token that was shown and is good.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Admitted {
+    /// Whom it stands for.
+    pub holder: TokenHolder,
+    /// Whether a robot used it for the first time, which has just ended the robot's other tokens.
+    pub is_first_use: bool,
 }
 
 /// What an enrolment token is good for.
@@ -27,7 +42,7 @@ pub struct EnrolmentTerms {
     pub robot: Option<RobotId>,
     /// Labels that whoever uses it gets.
     pub labels: Labels,
-    /// Enrolments left; `None`: any number.
+    /// Enrolments left; `None`: any number. With none left it is only good for an enrolment whose answer was lost.
     pub uses_left: Option<u64>,
     /// When it ends.
     pub expires_at_ms: u64,
@@ -39,33 +54,86 @@ struct TokenRow {
     labels: Labels,
     uses_left: Option<u64>,
     expires_at_ms: Option<u64>,
+    is_used: bool,
+    number: u64,
 }
 
-const VALID_TOKEN: &str = "SELECT digest, robot_id, labels, uses_left, expires_at_ms FROM tokens
+/// An enrolment token without a use left is still good while a token that it made was never used: the answer with that
+/// one may have been lost.
+const VALID_TOKEN: &str = "SELECT digest, robot_id, labels, uses_left, expires_at_ms, used_at_ms, number FROM tokens
      WHERE id = $1 AND kind = $2 AND revoked_at_ms IS NULL AND (expires_at_ms IS NULL OR expires_at_ms > $3)
-       AND (uses_left IS NULL OR uses_left > 0)";
+       AND (uses_left IS NULL OR uses_left > 0 OR EXISTS (SELECT 1 FROM tokens made
+            WHERE made.made_by = tokens.id AND made.used_at_ms IS NULL AND made.revoked_at_ms IS NULL))";
 
 impl Store {
-    /// Whom `token` stands for at `now_ms`; `None` if it is unknown, wrong, used up, expired or revoked.
+    /// Whom `token` stands for at `now_ms`; `None` if it is unknown, wrong, used up, expired or revoked. Changes nothing.
     pub async fn token_holder(&self, token: &Token, now_ms: u64) -> Result<Option<TokenHolder>, StoreError> {
+        let row = self.valid_token(token, now_ms).await?;
+        Ok(row.and_then(|row| row.holder(token.kind())))
+    }
+
+    /// The same for whoever shows the token to come in. A robot's first use of a token ends its other ones.
+    pub async fn admit(&self, token: &Token, now_ms: u64) -> Result<Option<Admitted>, StoreError> {
+        let Some(row) = self.valid_token(token, now_ms).await? else { return Ok(None) };
+        let is_unused = token.kind() == TokenKind::Robot && !row.is_used;
+        let Some(holder) = row.holder(token.kind()) else { return Ok(None) };
+        if is_unused && !self.use_first(token, now_ms).await? {
+            // Somebody was faster: either with this token or with a later one.
+            let holder = self.token_holder(token, now_ms).await?;
+            return Ok(holder.map(|holder| Admitted { holder, is_first_use: false }));
+        }
+        Ok(Some(Admitted { holder, is_first_use: is_unused }))
+    }
+
+    async fn valid_token(&self, token: &Token, now_ms: u64) -> Result<Option<TokenRow>, StoreError> {
         let row = sqlx::query(VALID_TOKEN)
             .bind(token.id())
             .bind(kind_text(token.kind()))
             .bind(stored(now_ms))
             .fetch_optional(&self.reads)
             .await?;
-        let Some(row) = row.map(token_row).transpose()?.filter(|row| row.has_secret_of(token)) else { return Ok(None) };
-        Ok(match token.kind() {
-            TokenKind::Operator => Some(TokenHolder::Operator),
-            TokenKind::Enrolment => Some(TokenHolder::Enrolment),
-            TokenKind::Robot => row.robot.map(TokenHolder::Robot),
-        })
+        Ok(row.map(token_row).transpose()?.filter(|row| row.has_secret_of(token)))
+    }
+
+    /// Marks a robot's token as the one it uses; false if it is used or ended already.
+    async fn use_first(&self, token: &Token, now_ms: u64) -> Result<bool, StoreError> {
+        let mut write = self.begin().await?;
+        let row = sqlx::query(
+            "UPDATE tokens SET used_at_ms = $2 WHERE id = $1 AND used_at_ms IS NULL AND revoked_at_ms IS NULL
+             RETURNING robot_id, made_by, number",
+        )
+        .bind(token.id())
+        .bind(stored(now_ms))
+        .fetch_optional(write.connection())
+        .await?;
+        let Some(row) = row else { return Ok(false) };
+        let robot: RobotId = id("tokens.robot_id", row.try_get("robot_id")?)?;
+        let (made_by, number): (Option<String>, i64) = (row.try_get("made_by")?, row.try_get("number")?);
+        sqlx::query(
+            "UPDATE tokens SET revoked_at_ms = $3
+             WHERE robot_id = $1 AND kind = 'robot' AND id <> $2 AND revoked_at_ms IS NULL",
+        )
+        .bind(robot.as_str())
+        .bind(token.id())
+        .bind(stored(now_ms))
+        .execute(write.connection())
+        .await?;
+        sqlx::query("UPDATE robots SET token_number = $2 WHERE id = $1")
+            .bind(robot.as_str())
+            .bind(number)
+            .execute(write.connection())
+            .await?;
+        if made_by.is_some() {
+            write.forget_report(&robot).await?;
+        }
+        write.commit().await?;
+        Ok(true)
     }
 
     /// Stores an operator's token that does not expire.
     pub async fn create_operator_token(&self, token: &Token, now_ms: u64) -> Result<(), StoreError> {
         let mut write = self.begin().await?;
-        write.insert_token(token, None, now_ms).await?;
+        write.insert_token(token, None, None, now_ms).await?;
         write.commit().await
     }
 }
@@ -107,7 +175,7 @@ impl Write {
         terms: &EnrolmentTerms,
         now_ms: u64,
     ) -> Result<(), StoreError> {
-        self.insert_token(token, terms.robot.as_ref(), now_ms).await?;
+        self.insert_token(token, terms.robot.as_ref(), None, now_ms).await?;
         sqlx::query("UPDATE tokens SET labels = $2, uses_left = $3, expires_at_ms = $4 WHERE id = $1")
             .bind(token.id())
             .bind(json(&terms.labels))
@@ -118,28 +186,42 @@ impl Write {
         Ok(())
     }
 
-    /// Makes `token` the only one of `robot`.
-    pub async fn replace_robot_token(&mut self, token: &Token, robot: &RobotId, now_ms: u64) -> Result<(), StoreError> {
-        self.revoke_tokens(robot, Some(TokenKind::Robot), now_ms).await?;
-        self.insert_token(token, Some(robot), now_ms).await
-    }
-
-    /// Ends the tokens made for `robot`, of one kind or of all.
-    pub async fn revoke_tokens(
+    /// Makes `token` the one that `robot` may go over to, in the place of another that it never used. `made_by` is the
+    /// enrolment token it came by; `None`: the robot itself asked for it.
+    pub async fn offer_robot_token(
         &mut self,
+        token: &Token,
         robot: &RobotId,
-        kind: Option<TokenKind>,
+        made_by: Option<&Token>,
         now_ms: u64,
     ) -> Result<(), StoreError> {
-        sqlx::query(
-            "UPDATE tokens SET revoked_at_ms = $2
-             WHERE robot_id = $1 AND revoked_at_ms IS NULL AND (kind = $3 OR $3 = '')",
+        sqlx::query("DELETE FROM tokens WHERE robot_id = $1 AND kind = 'robot' AND used_at_ms IS NULL")
+            .bind(robot.as_str())
+            .execute(self.connection())
+            .await?;
+        self.insert_token(token, Some(robot), made_by, now_ms).await
+    }
+
+    /// Whether `robot` was given a token by an enrolment, by `made_by` or by any, that nobody has used yet.
+    pub async fn awaits_first_use(&mut self, robot: &RobotId, made_by: Option<&Token>) -> Result<bool, StoreError> {
+        let found: Option<String> = sqlx::query_scalar(
+            "SELECT id FROM tokens WHERE robot_id = $1 AND kind = 'robot' AND used_at_ms IS NULL
+                 AND revoked_at_ms IS NULL AND made_by IS NOT NULL AND (made_by = $2 OR $2 = '')",
         )
         .bind(robot.as_str())
-        .bind(stored(now_ms))
-        .bind(kind.map_or("", kind_text))
-        .execute(self.connection())
+        .bind(made_by.map(Token::id).unwrap_or_default())
+        .fetch_optional(self.connection())
         .await?;
+        Ok(found.is_some())
+    }
+
+    /// Ends all tokens made for `robot`.
+    pub async fn revoke_tokens(&mut self, robot: &RobotId, now_ms: u64) -> Result<(), StoreError> {
+        sqlx::query("UPDATE tokens SET revoked_at_ms = $2 WHERE robot_id = $1 AND revoked_at_ms IS NULL")
+            .bind(robot.as_str())
+            .bind(stored(now_ms))
+            .execute(self.connection())
+            .await?;
         Ok(())
     }
 
@@ -148,7 +230,9 @@ impl Write {
     pub async fn forget_ended_tokens(&mut self, now_ms: u64) -> Result<(), StoreError> {
         sqlx::query(
             "DELETE FROM tokens
-             WHERE kind <> 'operator' AND (revoked_at_ms IS NOT NULL OR expires_at_ms <= $1 OR uses_left = 0)",
+             WHERE kind <> 'operator' AND (revoked_at_ms IS NOT NULL OR expires_at_ms <= $1
+                 OR uses_left = 0 AND NOT EXISTS (SELECT 1 FROM tokens made
+                     WHERE made.made_by = tokens.id AND made.used_at_ms IS NULL AND made.revoked_at_ms IS NULL))",
         )
         .bind(stored(now_ms))
         .execute(self.connection())
@@ -156,20 +240,40 @@ impl Write {
         Ok(())
     }
 
-    async fn insert_token(&mut self, token: &Token, robot: Option<&RobotId>, now_ms: u64) -> Result<(), StoreError> {
-        sqlx::query("INSERT INTO tokens (id, kind, digest, robot_id, created_at_ms) VALUES ($1, $2, $3, $4, $5)")
-            .bind(token.id())
-            .bind(kind_text(token.kind()))
-            .bind(token.secret_digest().to_string())
-            .bind(robot.map(|robot| robot.as_str().to_owned()))
-            .bind(stored(now_ms))
-            .execute(self.connection())
-            .await?;
+    async fn insert_token(
+        &mut self,
+        token: &Token,
+        robot: Option<&RobotId>,
+        made_by: Option<&Token>,
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
+        let number = stored(self.turn());
+        sqlx::query(
+            "INSERT INTO tokens (id, kind, digest, robot_id, made_by, number, created_at_ms)
+             VALUES ($1, $2, $3, $4, $5, $6, $7)",
+        )
+        .bind(token.id())
+        .bind(kind_text(token.kind()))
+        .bind(token.secret_digest().to_string())
+        .bind(robot.map(|robot| robot.as_str().to_owned()))
+        .bind(made_by.map(Token::id))
+        .bind(number)
+        .bind(stored(now_ms))
+        .execute(self.connection())
+        .await?;
         Ok(())
     }
 }
 
 impl TokenRow {
+    fn holder(self, kind: TokenKind) -> Option<TokenHolder> {
+        match kind {
+            TokenKind::Operator => Some(TokenHolder::Operator),
+            TokenKind::Enrolment => Some(TokenHolder::Enrolment),
+            TokenKind::Robot => self.robot.map(|robot| TokenHolder::Robot { robot, token_number: self.number }),
+        }
+    }
+
     fn has_secret_of(&self, token: &Token) -> bool {
         self.digest.as_bytes().ct_eq(token.secret_digest().to_string().as_bytes()).into()
     }
@@ -183,6 +287,8 @@ fn token_row(row: sqlx::any::AnyRow) -> Result<TokenRow, StoreError> {
         labels: from_optional_json("tokens.labels", row.try_get("labels")?)?.unwrap_or_default(),
         uses_left: row.try_get::<Option<i64>, _>("uses_left")?.map(number),
         expires_at_ms: row.try_get::<Option<i64>, _>("expires_at_ms")?.map(number),
+        is_used: row.try_get::<Option<i64>, _>("used_at_ms")?.is_some(),
+        number: number(row.try_get("number")?),
     })
 }
 

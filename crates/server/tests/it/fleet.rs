@@ -29,7 +29,7 @@ pub struct Fleet {
 /// A robot's own view: what it has accepted and what it says.
 pub struct Robot {
     pub id: RobotId,
-    start: u64,
+    pub start: u64,
     seq: u64,
     pub observed: Generation,
     pub tasks: BTreeMap<String, TaskReport>,
@@ -107,7 +107,7 @@ impl Fleet {
     }
 
     pub async fn report(&self, robot: &mut Robot) -> Generation {
-        self.writer.submit(robot.next_report()).await.expect("stored").generation
+        self.writer.submit(robot.next_report(), 0).await.expect("stored").generation
     }
 }
 

@@ -18,4 +18,5 @@ mod page;
 mod registry;
 mod serve;
 mod story;
+mod tokens;
 mod uplink;

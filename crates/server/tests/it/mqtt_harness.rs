@@ -33,7 +33,7 @@ impl Gatekeeper for Door {
                 "outage" => Err(Refusal::Unavailable),
                 "slow" => std::future::pending().await,
                 password => match password.strip_prefix("pw-").map(str::parse) {
-                    Some(Ok(robot)) if !user.is_empty() => Ok(Principal::Robot(robot)),
+                    Some(Ok(robot)) if !user.is_empty() => Ok(Principal::Robot { robot, token_number: 0 }),
                     _ => Err(Refusal::BadCredentials),
                 },
             }

@@ -7,17 +7,14 @@ use task_proto::api::{CreateEnrollmentToken, DeploymentState, EditRobot};
 use task_proto::desired::Wanted;
 use task_proto::manifest::TaskKind;
 use task_proto::report::Phase;
-use task_proto::token::{Token, TokenKind};
 use taskd::actions::{ActionError, Actions, TaskOrder};
 use taskd::report_writer::ReportError;
-use taskd::store::{Store, TokenHolder};
+use taskd::store::Store;
 
 use crate::database::{TestDatabase, on_both_databases};
 use crate::fleet::{Fleet, Robot, mac, order_of, package, random_key};
 
 on_both_databases! {
-    enrolment_gives_identities_by_mac,
-    tokens_stand_for_their_holder_until_they_end,
     a_removed_robot_leaves_its_mac_and_name,
     an_order_reaches_all_that_match_and_settles,
     an_idempotency_key_orders_once,
@@ -35,68 +32,8 @@ on_both_databases! {
     a_reopened_database_knows_everything,
 }
 
-fn code<T>(result: Result<T, ActionError>) -> &'static str {
+pub fn code<T>(result: Result<T, ActionError>) -> &'static str {
     result.err().expect("refused").code()
-}
-
-async fn enrolment_gives_identities_by_mac(database: TestDatabase) {
-    let fleet = Fleet::new(database);
-    let labels = [("site".parse().expect("key"), "lab".parse().expect("value"))].into();
-    let token = fleet.enrolment_token(CreateEnrollmentToken { uses: Some(2), labels, ..Default::default() }).await;
-    let one = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("enrols");
-    assert_eq!(code(fleet.try_enroll(&token, mac(1), Some("other")).await), "mac_known");
-    assert_eq!(code(fleet.try_enroll(&token, mac(2), Some("atlas")).await), "name_taken");
-    let two = fleet.try_enroll(&token, mac(2), None).await.expect("enrols");
-    assert_eq!(code(fleet.try_enroll(&token, mac(3), None).await), "unauthorized");
-    assert_ne!(one.robot_id, two.robot_id);
-    let views = fleet.database.store.robots().await.expect("reads");
-    assert_eq!(views.iter().map(|view| view.name.as_str()).collect::<Vec<_>>(), ["atlas", two.name.as_str()]);
-    assert!(views.iter().all(|view| view.labels.len() == 1));
-    assert_eq!(fleet.database.store.find_robot("atlas").await.expect("reads"), Some(one.robot_id.clone()));
-
-    // With a token that was made for it, a robot comes back as itself; nobody else does.
-    let bound = CreateEnrollmentToken { robot: Some("atlas".to_owned()), ..Default::default() };
-    let bound = fleet.enrolment_token(bound).await;
-    assert_eq!(code(fleet.try_enroll(&bound, mac(9), None).await), "token_for_other_robot");
-    assert_eq!(code(fleet.try_enroll(&bound, mac(2), None).await), "mac_known");
-    let again = fleet.try_enroll(&bound, mac(1), Some("renamed")).await.expect("enrols");
-    assert_eq!((again.robot_id.clone(), again.name.as_str()), (one.robot_id.clone(), "atlas"));
-    let now_ms = fleet.clock.now_ms();
-    let store = &fleet.database.store;
-    assert_eq!(store.token_holder(&one.token, now_ms).await.expect("reads"), None);
-    let holder = store.token_holder(&again.token, now_ms).await.expect("reads");
-    assert_eq!(holder, Some(TokenHolder::Robot(one.robot_id)));
-}
-
-async fn tokens_stand_for_their_holder_until_they_end(database: TestDatabase) {
-    let fleet = Fleet::new(database);
-    let store = &fleet.database.store;
-    let operator = Token::random(TokenKind::Operator);
-    let now_ms = fleet.clock.now_ms();
-    assert_eq!(store.token_holder(&operator, now_ms).await.expect("reads"), None);
-    store.create_operator_token(&operator, now_ms).await.expect("stored");
-    assert_eq!(store.token_holder(&operator, now_ms).await.expect("reads"), Some(TokenHolder::Operator));
-    let enrolment = fleet.enrolment_token(CreateEnrollmentToken { ttl_s: Some(60), ..Default::default() }).await;
-    assert_eq!(store.token_holder(&enrolment, now_ms).await.expect("reads"), Some(TokenHolder::Enrolment));
-    fleet.clock.advance_ms(60_000);
-    let now_ms = fleet.clock.now_ms();
-    assert_eq!(store.token_holder(&enrolment, now_ms).await.expect("reads"), None);
-    assert_eq!(code(fleet.try_enroll(&enrolment, mac(1), None).await), "unauthorized");
-    assert_eq!(code(fleet.try_enroll(&operator, mac(1), None).await), "unauthorized");
-    let lasting = fleet.enrolment_token(CreateEnrollmentToken::default()).await;
-    fleet.actions.expire().await.expect("forgets the one that has ended");
-    assert_eq!(store.token_holder(&lasting, now_ms).await.expect("reads"), Some(TokenHolder::Enrolment));
-    let mut write = store.begin().await.expect("begins");
-    assert_eq!(write.enrolment_terms(&enrolment, now_ms - 60_000).await.expect("reads"), None, "it is gone");
-    drop(write);
-    for unusable in ["no robot\0", "rob\u{e9}"] {
-        let order = CreateEnrollmentToken { robot: Some(unusable.to_owned()), ..Default::default() };
-        assert_eq!(code(fleet.actions.create_enrollment_token(&order).await), "not_found");
-    }
-    for ttl_s in [0, u64::MAX] {
-        let order = CreateEnrollmentToken { ttl_s: Some(ttl_s), ..Default::default() };
-        assert_eq!(code(fleet.actions.create_enrollment_token(&order).await), "invalid_request");
-    }
 }
 
 async fn a_removed_robot_leaves_its_mac_and_name(database: TestDatabase) {
@@ -109,7 +46,7 @@ async fn a_removed_robot_leaves_its_mac_and_name(database: TestDatabase) {
     assert_eq!(fleet.phases(&deployment).await, [Phase::Cancelled]);
     assert_eq!(code(fleet.actions.remove_robot(&old.robot_id).await), "not_found");
     assert_eq!(code(fleet.actions.desired(&old.robot_id).await), "not_found");
-    let report = fleet.writer.submit(robot.next_report()).await;
+    let report = fleet.writer.submit(robot.next_report(), 0).await;
     assert!(matches!(report, Err(ReportError::RobotNotFound(_))));
     let now_ms = fleet.clock.now_ms();
     assert_eq!(fleet.database.store.token_holder(&old.token, now_ms).await.expect("reads"), None);
@@ -388,7 +325,7 @@ async fn late_reports_change_nothing(database: TestDatabase) {
     let late = robot.next_report();
     robot.accept(&desired, Phase::Running);
     fleet.report(robot).await;
-    assert_eq!(fleet.writer.submit(late).await.expect("acknowledged").generation, Generation(1));
+    assert_eq!(fleet.writer.submit(late, 0).await.expect("acknowledged").generation, Generation(1));
     assert_eq!(fleet.phases(&id).await, [Phase::Running]);
     robot.accept(&desired, Phase::Failed);
     fleet.report(robot).await;
@@ -407,7 +344,7 @@ async fn reports_at_once_are_all_acknowledged(database: TestDatabase) {
         for phase in [Phase::Fetching, Phase::Unpacking, Phase::Running] {
             robot.accept(&desired, phase);
             let (writer, report) = (fleet.writer.clone(), robot.next_report());
-            submissions.spawn(async move { writer.submit(report).await.expect("stored") });
+            submissions.spawn(async move { writer.submit(report, 0).await.expect("stored") });
         }
     }
     assert_eq!(submissions.join_all().await.len(), 60);
@@ -418,7 +355,7 @@ async fn a_report_that_can_not_be_stored_is_answered_so(database: TestDatabase) 
     let fleet = Fleet::new(database);
     let mut robots = fleet.enroll(1).await;
     fleet.database.store.close().await;
-    let refused = fleet.writer.submit(robots[0].next_report()).await;
+    let refused = fleet.writer.submit(robots[0].next_report(), 0).await;
     assert!(matches!(refused, Err(ReportError::NotStored)));
 }
 

@@ -6,10 +6,11 @@ use std::time::Duration;
 use reqwest::Method;
 use rumqttc::{AsyncClient, Event, EventLoop, MqttOptions, Packet, QoS};
 use serde_json::json;
+use task_proto::api::RobotToken;
 use task_proto::desired::{DesiredState, Doorbell};
 use task_proto::report::Phase;
 
-use crate::harness::{TestRobot, TestServer, opened};
+use crate::harness::{TestRobot, TestServer, answer, opened, refusal};
 
 /// More than anything here takes, unless it hangs.
 const PATIENCE: Duration = Duration::from_secs(10);
@@ -35,6 +36,16 @@ impl Session {
         options.set_credentials(id, token).set_max_packet_size(256 * 1024, 256 * 1024);
         let (client, packets) = AsyncClient::new(options, 16);
         Self { client, packets, topics: format!("taskd/v1/r/{id}") }
+    }
+
+    async fn is_let_in(server: &TestServer, robot: &TestRobot, token: &str) -> bool {
+        let mut session = Self::dial(server, robot.id.as_str(), token);
+        tokio::time::timeout(PATIENCE, session.packets.poll()).await.expect("an answer").is_ok()
+    }
+
+    async fn hung_up(&mut self) {
+        let hung_up = tokio::time::timeout(PATIENCE, async { while self.packets.poll().await.is_ok() {} });
+        hung_up.await.expect("the connection ends");
     }
 
     async fn until(&mut self, mut wanted: impl FnMut(&Packet) -> bool) -> Packet {
@@ -133,10 +144,44 @@ async fn a_removed_robot_is_hung_up_on_and_not_let_in_again() {
     session.told(&server, 0).await;
     let path = format!("/api/v1/robots/{}", robot.id);
     server.request(Method::DELETE, &path).send().await.expect("an answer");
-    let hung_up = tokio::time::timeout(PATIENCE, async { while session.packets.poll().await.is_ok() {} });
-    hung_up.await.expect("the connection ends");
-    let mut again = Session::dial(&server, robot.id.as_str(), &robot.token);
-    assert!(tokio::time::timeout(PATIENCE, again.packets.poll()).await.expect("an answer").is_err());
+    session.hung_up().await;
+    assert!(!Session::is_let_in(&server, &robot, &robot.token).await);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_new_token_leaves_the_old_session_alone_until_it_is_used() {
+    let server = TestServer::start().await;
+    let mut robot = server.enroll("atlas").await;
+    let mut session = Session::open(&server, &robot).await;
+    let state = session.told(&server, 0).await;
+    let path = format!("/api/v1/robots/{}/token", robot.id);
+    let next = async |token: &str| -> RobotToken { answer(server.bare(Method::POST, &path).bearer_auth(token)).await };
+    let report = serde_json::to_vec(&robot.next_report(&state, Phase::Running)).expect("json");
+    let over_http = next(&robot.token).await.token;
+    session
+        .client
+        .publish(format!("{}/report", session.topics), QoS::AtLeastOnce, false, report)
+        .await
+        .expect("queued");
+    session.until(|packet| matches!(packet, Packet::PubAck(_))).await;
+
+    // Used over HTTP: whoever came in by the old one has to go and is not let in again.
+    let old = std::mem::replace(&mut robot.token, over_http);
+    server.desired(&robot).await;
+    session.hung_up().await;
+    assert_eq!(refusal(server.bare(Method::POST, &path).bearer_auth(&old)).await, (401, "unauthorized".to_owned()));
+    assert!(!Session::is_let_in(&server, &robot, &old).await);
+
+    // Used over MQTT: it takes over the session of the old one.
+    let over_mqtt = next(&robot.token).await.token;
+    let mut session = Session::open(&server, &robot).await;
+    session.told(&server, 0).await;
+    let old = std::mem::replace(&mut robot.token, over_mqtt);
+    let mut newer = Session::open(&server, &robot).await;
+    newer.told(&server, 0).await;
+    session.hung_up().await;
+    assert!(!Session::is_let_in(&server, &robot, &old).await);
+    assert!(server.report(&mut robot, &state, Phase::Running).await.status().is_success());
 }
 
 #[tokio::test(flavor = "multi_thread")]

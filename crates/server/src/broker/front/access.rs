@@ -8,7 +8,10 @@ use crate::broker::router::CANARY_TOPIC;
 /// Who a session belongs to.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Visitor {
-    Robot(RobotId),
+    Robot {
+        robot: RobotId,
+        token_number: u64,
+    },
     Operator,
     /// Our own watchdog.
     Canary,
@@ -42,7 +45,7 @@ pub(super) fn may_publish(visitor: &Visitor, prefix: &TopicPrefix, topic: &str) 
     match visitor {
         Visitor::Canary => (topic == CANARY_TOPIC).then_some(Route::Canary),
         Visitor::Operator => None,
-        Visitor::Robot(robot) => match prefix.parse(topic)? {
+        Visitor::Robot { robot, .. } => match prefix.parse(topic)? {
             Topic::Robot(owner, last) if owner == *robot => match last {
                 RobotTopic::Report | RobotTopic::Status | RobotTopic::Reply => Some(Route::Inbox(last)),
                 RobotTopic::Telemetry | RobotTopic::Log => Some(Route::Listeners),
@@ -61,7 +64,7 @@ pub(super) fn may_subscribe(visitor: &Visitor, prefix: &TopicPrefix, filter: &st
         Visitor::Operator => {
             filter.strip_prefix(prefix.as_str()).is_some_and(|rest| rest.starts_with('/')).then_some(Hearing::Router)
         }
-        Visitor::Robot(robot) => match prefix.parse(filter)? {
+        Visitor::Robot { robot, .. } => match prefix.parse(filter)? {
             Topic::Robot(owner, RobotTopic::Desired) if owner == *robot => Some(Hearing::Desired),
             Topic::Robot(owner, RobotTopic::Request) if owner == *robot => Some(Hearing::Request),
             // Direct-push opens this to the packages that are assigned to the robot.
@@ -90,7 +93,7 @@ mod tests {
     use super::*;
 
     fn robot() -> Visitor {
-        Visitor::Robot("r00000000000000a1".parse().expect("valid"))
+        Visitor::Robot { robot: "r00000000000000a1".parse().expect("valid"), token_number: 0 }
     }
 
     #[test]

@@ -94,7 +94,7 @@ where
         return Err(answer(ConnectReturnCode::NotAuthorized, "a will on a topic that is not its own"));
     }
     let seat_name = match &visitor {
-        Visitor::Robot(robot) => SeatName::Robot(robot.clone()),
+        Visitor::Robot { robot, .. } => SeatName::Robot(robot.clone()),
         Visitor::Canary => SeatName::Canary,
         Visitor::Operator if connect.client_id.is_empty() => SeatName::Unnamed(rand::random()),
         Visitor::Operator => SeatName::Operator(connect.client_id),
@@ -177,16 +177,16 @@ async fn admit(context: &Context, connect: &Connect, peer: SocketAddr) -> Result
             Err(answer(ConnectReturnCode::ClientIdentifierNotValid, "a client id that is too long"))
         }
         Ok(Principal::Operator) => Ok(Visitor::Operator),
-        Ok(Principal::Robot(_)) if connect.client_id.is_empty() => {
+        Ok(Principal::Robot { .. }) if connect.client_id.is_empty() => {
             Err(answer(ConnectReturnCode::ClientIdentifierNotValid, "a robot's credentials without a client id"))
         }
         // A robot's name on another robot's token, or the other way round.
-        Ok(Principal::Robot(robot))
+        Ok(Principal::Robot { robot, .. })
             if connect.client_id != robot.as_str() || connect.user_name.as_deref() != Some(robot.as_str()) =>
         {
             Err(answer(ConnectReturnCode::NotAuthorized, "a client id or user name that is not the token's robot id"))
         }
-        Ok(Principal::Robot(robot)) => Ok(Visitor::Robot(robot)),
+        Ok(Principal::Robot { robot, token_number }) => Ok(Visitor::Robot { robot, token_number }),
     }
 }
 

@@ -95,7 +95,7 @@ where
     let guest = welcome(context, stream, peer).await?;
     let seat = context.seats.take(guest.seat_name.clone()).await;
     let listening = match guest.visitor {
-        Visitor::Robot(_) => return Ok((guest, seat, None)),
+        Visitor::Robot { .. } => return Ok((guest, seat, None)),
         Visitor::Operator => Listening::Everything,
         Visitor::Canary => Listening::Canary,
     };
@@ -177,7 +177,7 @@ struct Attendance<'a> {
 
 impl<'a> Attendance<'a> {
     fn begin(context: &'a Context, visitor: &Visitor, peer: SocketAddr, connection: u64) -> Option<Self> {
-        let Visitor::Robot(robot) = visitor else { return None };
+        let Visitor::Robot { robot, .. } = visitor else { return None };
         context.inbox.connected(robot, peer, connection);
         Some(Self { inbox: &*context.inbox, robot: robot.clone(), connection })
     }
@@ -375,8 +375,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
             }
         }
         match (route, &self.visitor) {
-            (Route::Inbox(topic), Visitor::Robot(robot)) => {
-                let message = self.message(robot, topic, publish.payload.clone());
+            (Route::Inbox(topic), &Visitor::Robot { ref robot, token_number }) => {
+                let message = self.message(robot, token_number, topic, publish.payload.clone());
                 let stored = Box::pin(store(self.context, message));
                 self.storing = Some(Storing { publish, stored });
             }
@@ -435,7 +435,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
 
     /// Sends what is said to this robot alone.
     fn send_own(&mut self, last: RobotTopic, hearing: Hearing, payload: Bytes) {
-        if let (Visitor::Robot(robot), Some(granted)) = (&self.visitor, self.qos_of(hearing)) {
+        if let (Visitor::Robot { robot, .. }, Some(granted)) = (&self.visitor, self.qos_of(hearing)) {
             let topic = self.context.prefix.format(&Topic::Robot(robot.clone(), last));
             self.send_message(topic, payload, lower(granted, QoS::AtLeastOnce));
         }
@@ -459,14 +459,15 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         encode(packet, &mut self.output);
     }
 
-    fn message(&self, robot: &RobotId, topic: RobotTopic, payload: Bytes) -> RobotMessage {
-        RobotMessage { robot: robot.clone(), topic, payload, peer: self.peer, connection: self.seat.number() }
+    fn message(&self, robot: &RobotId, token_number: u64, topic: RobotTopic, payload: Bytes) -> RobotMessage {
+        let (robot, peer, connection) = (robot.clone(), self.peer, self.seat.number());
+        RobotMessage { robot, topic, payload, peer, connection, token_number }
     }
 
     async fn say_will(&mut self, will: Will) {
         match (may_publish(&self.visitor, &self.context.prefix, &will.topic), &self.visitor) {
-            (Some(Route::Inbox(topic)), Visitor::Robot(robot)) => {
-                if store(self.context, self.message(robot, topic, will.payload.clone())).await.is_err() {
+            (Some(Route::Inbox(topic)), &Visitor::Robot { ref robot, token_number }) => {
+                if store(self.context, self.message(robot, token_number, topic, will.payload.clone())).await.is_err() {
                     tracing::warn!(%robot, "a robot's will could not be stored");
                     return;
                 }

@@ -1,0 +1,193 @@
+//! The story of tokens and of those who hold them, told on every database: enrolment, going over to a new token, answers
+//! that were lost.
+
+use task_proto::RobotId;
+use task_proto::api::CreateEnrollmentToken;
+use task_proto::token::{Token, TokenKind};
+use taskd::report_writer::ReportError;
+use taskd::store::{Admitted, Store, TokenHolder};
+
+use crate::database::{TestDatabase, on_both_databases};
+use crate::fleet::{Fleet, Robot, mac};
+use crate::story::code;
+
+on_both_databases! {
+    enrolment_gives_identities_by_mac,
+    tokens_stand_for_their_holder_until_they_end,
+    a_new_token_ends_the_old_one_when_it_is_first_used,
+    a_first_use_by_two_at_once_is_one,
+    a_lost_answer_to_an_enrolment_is_mended_by_asking_again,
+}
+
+async fn enrolment_gives_identities_by_mac(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let labels = [("site".parse().expect("key"), "lab".parse().expect("value"))].into();
+    let token = fleet.enrolment_token(CreateEnrollmentToken { uses: Some(2), labels, ..Default::default() }).await;
+    let one = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("enrols");
+    let now_ms = fleet.clock.now_ms();
+    let store = fleet.database.store.clone();
+    assert!(store.admit(&one.token, now_ms).await.expect("reads").is_some());
+    assert_eq!(code(fleet.try_enroll(&token, mac(1), Some("other")).await), "mac_known");
+    assert_eq!(code(fleet.try_enroll(&token, mac(2), Some("atlas")).await), "name_taken");
+    let two = fleet.try_enroll(&token, mac(2), None).await.expect("enrols");
+    assert_eq!(code(fleet.try_enroll(&token, mac(3), None).await), "unauthorized");
+    assert_ne!(one.robot_id, two.robot_id);
+    let views = fleet.database.store.robots().await.expect("reads");
+    assert_eq!(views.iter().map(|view| view.name.as_str()).collect::<Vec<_>>(), ["atlas", two.name.as_str()]);
+    assert!(views.iter().all(|view| view.labels.len() == 1));
+    assert_eq!(fleet.database.store.find_robot("atlas").await.expect("reads"), Some(one.robot_id.clone()));
+
+    // With a token that was made for it, a robot comes back as itself; nobody else does.
+    let bound = CreateEnrollmentToken { robot: Some("atlas".to_owned()), ..Default::default() };
+    let bound = fleet.enrolment_token(bound).await;
+    assert_eq!(code(fleet.try_enroll(&bound, mac(9), None).await), "token_for_other_robot");
+    assert_eq!(code(fleet.try_enroll(&bound, mac(2), None).await), "mac_known");
+    let again = fleet.try_enroll(&bound, mac(1), Some("renamed")).await.expect("enrols");
+    assert_eq!((again.robot_id.clone(), again.name.as_str()), (one.robot_id.clone(), "atlas"));
+    assert_eq!(robot_of(&store, &again.token).await, Some(one.robot_id));
+}
+
+async fn tokens_stand_for_their_holder_until_they_end(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let store = &fleet.database.store;
+    let operator = Token::random(TokenKind::Operator);
+    let now_ms = fleet.clock.now_ms();
+    assert_eq!(store.token_holder(&operator, now_ms).await.expect("reads"), None);
+    store.create_operator_token(&operator, now_ms).await.expect("stored");
+    assert_eq!(store.token_holder(&operator, now_ms).await.expect("reads"), Some(TokenHolder::Operator));
+    let enrolment = fleet.enrolment_token(CreateEnrollmentToken { ttl_s: Some(60), ..Default::default() }).await;
+    assert_eq!(store.token_holder(&enrolment, now_ms).await.expect("reads"), Some(TokenHolder::Enrolment));
+    fleet.clock.advance_ms(60_000);
+    let now_ms = fleet.clock.now_ms();
+    assert_eq!(store.token_holder(&enrolment, now_ms).await.expect("reads"), None);
+    assert_eq!(code(fleet.try_enroll(&enrolment, mac(1), None).await), "unauthorized");
+    assert_eq!(code(fleet.try_enroll(&operator, mac(1), None).await), "unauthorized");
+    let lasting = fleet.enrolment_token(CreateEnrollmentToken::default()).await;
+    fleet.actions.expire().await.expect("forgets the one that has ended");
+    assert_eq!(store.token_holder(&lasting, now_ms).await.expect("reads"), Some(TokenHolder::Enrolment));
+    let mut write = store.begin().await.expect("begins");
+    assert_eq!(write.enrolment_terms(&enrolment, now_ms - 60_000).await.expect("reads"), None, "it is gone");
+    drop(write);
+    for unusable in ["no robot\0", "rob\u{e9}"] {
+        let order = CreateEnrollmentToken { robot: Some(unusable.to_owned()), ..Default::default() };
+        assert_eq!(code(fleet.actions.create_enrollment_token(&order).await), "not_found");
+    }
+    for ttl_s in [0, u64::MAX] {
+        let order = CreateEnrollmentToken { ttl_s: Some(ttl_s), ..Default::default() };
+        assert_eq!(code(fleet.actions.create_enrollment_token(&order).await), "invalid_request");
+    }
+}
+
+/// The robot that `token` stands for; looking changes nothing.
+async fn robot_of(store: &Store, token: &Token) -> Option<RobotId> {
+    match store.token_holder(token, 1_000_000).await.expect("reads")? {
+        TokenHolder::Robot { robot, .. } => Some(robot),
+        other => panic!("{other:?} is no robot"),
+    }
+}
+
+async fn a_new_token_ends_the_old_one_when_it_is_first_used(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let store = fleet.database.store.clone();
+    let admit = async |token: &Token| match store.admit(token, 1_000_000).await.expect("reads") {
+        Some(Admitted { holder: TokenHolder::Robot { token_number, .. }, is_first_use }) => {
+            Some((token_number, is_first_use))
+        }
+        _ => None,
+    };
+    let token = fleet.enrolment_token(CreateEnrollmentToken::default()).await;
+    let old = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("enrols");
+    let (old_number, is_first_use) = admit(&old.token).await.expect("valid");
+    assert!(is_first_use && old_number > 0);
+    assert_eq!(admit(&old.token).await, Some((old_number, false)));
+    let mut old_agent = Robot::new(old.robot_id.clone());
+    old_agent.start = 57;
+    fleet.writer.submit(old_agent.next_report(), old_number).await.expect("stored");
+
+    let bound = CreateEnrollmentToken { robot: Some("atlas".to_owned()), uses: Some(1), ..Default::default() };
+    let bound = fleet.enrolment_token(bound).await;
+    let new = fleet.try_enroll(&bound, mac(1), None).await.expect("enrols");
+    assert_eq!(new.robot_id, old.robot_id);
+    // Both are good, and the old agent's reports count, until the new one is used.
+    assert_eq!(admit(&old.token).await, Some((old_number, false)));
+    fleet.writer.submit(old_agent.next_report(), old_number).await.expect("stored");
+    assert_eq!(code(fleet.actions.next_robot_token(&old.robot_id).await), "enrolled_anew");
+    let (new_number, is_first_use) = admit(&new.token).await.expect("valid");
+    assert!(is_first_use && new_number > old_number);
+    assert_eq!(admit(&old.token).await, None);
+    // What the old agent had under way comes too late, and does not stand before the new one's first start.
+    let late = fleet.writer.submit(old_agent.next_report(), old_number);
+    let mut new_agent = Robot::new(new.robot_id.clone());
+    let first = fleet.writer.submit(new_agent.next_report(), new_number);
+    let (late, first) = tokio::join!(late, first);
+    assert!(matches!(late, Err(ReportError::TokenEnded(_))), "{late:?}");
+    first.expect("stored");
+    let mut write = store.begin().await.expect("begins");
+    let stored = write.reported_robots(std::slice::from_ref(&new.robot_id)).await.expect("reads");
+    assert_eq!((stored[0].last_report, stored[0].token_number), ((1, 1), new_number));
+    drop(write);
+
+    // The robot goes over by itself: its reports go on counting, and there are never more than two.
+    let next = fleet.actions.next_robot_token(&new.robot_id).await.expect("made");
+    let later = fleet.actions.next_robot_token(&new.robot_id).await.expect("made");
+    assert_eq!(admit(&next).await, None, "the one after it took its place");
+    assert_eq!(admit(&new.token).await, Some((new_number, false)));
+    let (later_number, is_first_use) = admit(&later).await.expect("valid");
+    assert!(is_first_use);
+    assert_eq!(admit(&new.token).await, None);
+    let mut write = store.begin().await.expect("begins");
+    let stored = write.reported_robots(std::slice::from_ref(&new.robot_id)).await.expect("reads");
+    assert_eq!((stored[0].last_report, stored[0].token_number), ((1, 1), later_number));
+    drop(write);
+    fleet.actions.remove_robot(&new.robot_id).await.expect("removed");
+    assert_eq!(admit(&later).await, None);
+}
+
+async fn a_first_use_by_two_at_once_is_one(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let token = fleet.enrolment_token(CreateEnrollmentToken::default()).await;
+    let robot = fleet.try_enroll(&token, mac(1), None).await.expect("enrols");
+    let mut uses = tokio::task::JoinSet::new();
+    for _ in 0..8 {
+        let (store, token) = (fleet.database.store.clone(), robot.token.clone());
+        uses.spawn(async move { store.admit(&token, 1_000_000).await.expect("reads").expect("valid").is_first_use });
+    }
+    let uses = uses.join_all().await;
+    assert_eq!(uses.iter().filter(|is_first_use| **is_first_use).count(), 1, "{uses:?}");
+}
+
+async fn a_lost_answer_to_an_enrolment_is_mended_by_asking_again(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let store = fleet.database.store.clone();
+    let order = || CreateEnrollmentToken { uses: Some(1), ..Default::default() };
+    let (token, other) = (fleet.enrolment_token(order()).await, fleet.enrolment_token(order()).await);
+    let lost = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("enrols");
+    // Nobody else gets in by it: not by another token, and not under another MAC.
+    assert_eq!(code(fleet.try_enroll(&other, mac(1), None).await), "mac_known");
+    assert_eq!(code(fleet.try_enroll(&token, mac(2), None).await), "unauthorized");
+    fleet.actions.expire().await.expect("forgets what has ended, which this token has not");
+    let again = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("mended");
+    assert_eq!((&again.robot_id, &again.name), (&lost.robot_id, &lost.name));
+    assert_eq!(robot_of(&store, &lost.token).await, None);
+    store.admit(&again.token, 1_000_000).await.expect("reads").expect("valid");
+    assert_eq!(code(fleet.try_enroll(&token, mac(1), Some("atlas")).await), "unauthorized");
+    fleet.actions.expire().await.expect("forgets it now");
+    assert_eq!(store.token_holder(&token, 0).await.expect("reads"), None);
+    assert_eq!(robot_of(&store, &again.token).await, Some(lost.robot_id));
+
+    // The same where a robot comes back as itself.
+    let bound = CreateEnrollmentToken { robot: Some("atlas".to_owned()), ..order() };
+    let bound = fleet.enrolment_token(bound).await;
+    let lost = fleet.try_enroll(&bound, mac(1), None).await.expect("enrols");
+    let mended = fleet.try_enroll(&bound, mac(1), None).await.expect("mended");
+    assert_eq!(robot_of(&store, &lost.token).await, None);
+    assert_eq!(robot_of(&store, &again.token).await, Some(again.robot_id.clone()), "until the new one is used");
+    store.admit(&mended.token, 1_000_000).await.expect("reads").expect("valid");
+    assert_eq!(robot_of(&store, &again.token).await, None);
+    // A token for many is spent on a robot as soon as that one is in.
+    let many = fleet.enrolment_token(CreateEnrollmentToken::default()).await;
+    let first = fleet.try_enroll(&many, mac(3), None).await.expect("enrols");
+    let first = fleet.try_enroll(&many, mac(3), None).await.map(|_| first).expect("mended");
+    assert_eq!(robot_of(&store, &first.token).await, None);
+    assert_eq!(code(fleet.try_enroll(&many, mac(1), None).await), "mac_known");
+}

@@ -1,6 +1,7 @@
 //! The robot's half: everything `task-agent` does. Imports run downward only; see ARCHITECTURE.md.
 
 pub mod admission;
+pub mod answers;
 pub mod builder;
 pub mod clock;
 pub mod commands;

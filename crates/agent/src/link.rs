@@ -8,6 +8,8 @@ use std::time::Duration;
 use task_proto::api::ReportReply;
 use task_proto::envelope::Envelope;
 use task_proto::report::Report;
+use task_proto::request::Request;
+use task_proto::topic::RobotTopic;
 use tokio::sync::{Notify, mpsc, watch};
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
@@ -63,6 +65,24 @@ pub struct Shared {
     pub post: Arc<Notify>,
     /// The agent ends.
     pub shutdown: CancellationToken,
+}
+
+/// What goes between an MQTT session and those in the agent who answer and tell. Both ways are bounded and lossy: nothing
+/// in them outlives its moment.
+pub struct Talk {
+    /// Where questions that came in go.
+    pub requests: mpsc::Sender<Request>,
+    /// What is to be published.
+    pub messages: mpsc::Receiver<Message>,
+}
+
+/// Something a robot says that is neither report nor status.
+#[derive(Debug)]
+pub struct Message {
+    /// On which of its topics.
+    pub topic: RobotTopic,
+    /// The bytes.
+    pub payload: Vec<u8>,
 }
 
 /// How often to poll.

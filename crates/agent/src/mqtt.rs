@@ -1,6 +1,6 @@
 //! The MQTT half of the link, and the only place that names rumqttc: one session after another, each with a last will;
-//! the doorbell in, status and the newest report out. A report is confirmed by its PUBACK, which the server sends once
-//! the report is stored. It never decides what to do with what it hears.
+//! the doorbell and questions in, status, the newest report, answers and log lines out. A report is confirmed by its
+//! PUBACK, which the server sends once the report is stored. It never decides what to do with what it hears.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -9,11 +9,12 @@ use rumqttc::{AsyncClient, ConnectReturnCode, ConnectionError, Event, LastWill, 
 use task_proto::RobotId;
 use task_proto::desired::{Doorbell, MAX_PUSHED_ENVELOPE_BYTES};
 use task_proto::report::Status;
+use task_proto::request::Request;
 use task_proto::topic::{RobotTopic, Topic, TopicPrefix};
 use tokio::sync::mpsc;
 use tokio::time::Instant;
 
-use crate::link::{Heard, Shared};
+use crate::link::{Heard, Message, Shared, Talk};
 use crate::plan::backoff_ms;
 
 /// How often the broker hears from an idle robot.
@@ -59,12 +60,12 @@ enum Ended {
 }
 
 /// Keeps a session up until the agent ends; after each end it waits with full jitter.
-pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Heard>) {
+pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Heard>, mut talk: Talk) {
     let mut failures = 0u32;
     loop {
         access.status.connection += 1;
         let begun = Instant::now();
-        let ended = session(&access, &shared, &heard).await;
+        let ended = session(&access, &shared, &heard, &mut talk).await;
         shared.mqtt_up.send_replace(false);
         failures = if begun.elapsed() >= GOOD_SESSION { 1 } else { failures.saturating_add(1) };
         let max_ms = match ended {
@@ -95,9 +96,11 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
 enum Published {
     Status,
     Report { seq: u64 },
+    Message,
 }
 
-async fn session(access: &MqttAccess, shared: &Shared, heard: &mpsc::Sender<Heard>) -> Ended {
+async fn session(access: &MqttAccess, shared: &Shared, heard: &mpsc::Sender<Heard>, talk: &mut Talk) -> Ended {
+    let Talk { requests, messages } = talk;
     let (client, mut event_loop) = AsyncClient::new(options(access), QUEUED_REQUESTS);
     event_loop.network_options.set_connection_timeout(CONNECT_TIMEOUT_S);
     let (events_in, mut events) = mpsc::channel(QUEUED_REQUESTS);
@@ -120,7 +123,7 @@ async fn session(access: &MqttAccess, shared: &Shared, heard: &mpsc::Sender<Hear
     };
     tokio::pin!(pump);
     let mut session =
-        Session { access, shared, heard, client, up: false, unsent: VecDeque::new(), sent: VecDeque::new() };
+        Session { access, shared, heard, requests, client, up: false, unsent: VecDeque::new(), sent: VecDeque::new() };
     loop {
         tokio::select! {
             // Cancel-safe: the future is pinned outside of the loop and goes on where it was.
@@ -129,6 +132,10 @@ async fn session(access: &MqttAccess, shared: &Shared, heard: &mpsc::Sender<Hear
             Some(event) = events.recv() => session.take(event).await,
             // Cancel-safe: a watch remembers that it changed.
             Ok(()) = reports.changed() => session.publish_report(),
+            // Cancel-safe: a message stays in the channel until it is received.
+            Some(Message { topic, payload }) = messages.recv(), if session.up => {
+                session.publish(topic, payload, Published::Message);
+            }
             // Cancel-safe: a token can be awaited again.
             () = shared.shutdown.cancelled() => {
                 // Without DISCONNECT the broker publishes the will, which says just what is true.
@@ -142,6 +149,7 @@ struct Session<'a> {
     access: &'a MqttAccess,
     shared: &'a Shared,
     heard: &'a mpsc::Sender<Heard>,
+    requests: &'a mpsc::Sender<Request>,
     client: AsyncClient,
     up: bool,
     /// Handed to rumqttc, which has not given them a packet id yet.
@@ -178,6 +186,9 @@ impl Session<'_> {
     }
 
     async fn hear(&self, topic: &str, payload: &[u8]) {
+        if topic == topic_name(self.access, RobotTopic::Request) {
+            return self.hear_request(payload);
+        }
         if topic != topic_name(self.access, RobotTopic::Desired) {
             return;
         }
@@ -188,6 +199,18 @@ impl Session<'_> {
             }
             Ok(Doorbell::Notice { .. }) => self.shared.poll.notify_one(),
             Err(error) => tracing::warn!(%error, "the desired topic holds something else"),
+        }
+    }
+
+    fn hear_request(&self, payload: &[u8]) {
+        match serde_json::from_slice::<Request>(payload) {
+            // Who asks waits only so long; a question that finds no room may be asked again.
+            Ok(request) => {
+                if self.requests.try_send(request).is_err() {
+                    tracing::warn!("too many questions at a time");
+                }
+            }
+            Err(error) => tracing::warn!(%error, "the request topic holds something else"),
         }
     }
 

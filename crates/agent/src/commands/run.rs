@@ -14,6 +14,7 @@ use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
 use super::DataDir;
+use crate::answers::Answers;
 use crate::config::{Config, parse_server};
 use crate::driver::{Driver, Speaker};
 use crate::effects::Robot;
@@ -21,13 +22,15 @@ use crate::fetch::{FetchSettings, Fetcher};
 use crate::identity::Identity;
 use crate::layout::DataDir as Layout;
 use crate::ledger::{Found, Ledger};
-use crate::link::{self, Intervals, Shared};
+use crate::link::{self, Intervals, Shared, Talk};
 use crate::mqtt::{self, MqttAccess};
 use crate::server::{self, Server};
 use crate::{clock, process};
 
 /// Messages from the link that the driver has not taken yet.
 const QUEUED_MESSAGES: usize = 16;
+/// Questions that wait to be answered.
+const QUEUED_QUESTIONS: usize = 32;
 /// How long what is left may take after a signal.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(3);
 
@@ -88,7 +91,11 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
         let host = identity.mqtt.host.clone().or_else(|| base.host_str().map(str::to_owned)).unwrap_or_default();
         let (port, prefix) = (identity.mqtt.port, identity.mqtt.prefix.clone());
         let access = MqttAccess { host, port, prefix, robot: identity.robot_id, token: identity.token, status };
-        tokio::spawn(mqtt::run(access, shared, heard));
+        let answers = Answers { robot_id: access.robot.clone() };
+        let (requests, asked) = mpsc::channel(QUEUED_QUESTIONS);
+        let (messages, said) = mpsc::channel(QUEUED_MESSAGES);
+        tokio::spawn(answers.run(asked, messages));
+        tokio::spawn(mqtt::run(access, shared, heard, Talk { requests, messages: said }));
     }
     let stop = tokio::spawn(cancel_on_signal(shutdown));
     driver.run(messages).await;

@@ -1,0 +1,77 @@
+//! Answers to the server's questions: each is answered by itself, within the time it has, and a few at a time. It looks and
+//! passes on; what lasts comes with the desired state and goes through the driver.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use task_proto::RobotId;
+use task_proto::request::{Answer, Ask, MAX_REPLY_BYTES, MAX_TTL_MS, Outcome, Refusal, Reply, Request};
+use task_proto::topic::RobotTopic;
+use tokio::sync::mpsc;
+use tokio::task::JoinSet;
+
+use crate::link::Message;
+
+/// Questions answered at the same time; a lifecycle transition may take seconds and should not hold up a list.
+const AT_A_TIME: usize = 8;
+
+/// Who answers.
+pub struct Answers {
+    /// The robot.
+    pub robot_id: RobotId,
+}
+
+/// A refusal with `code` and `text`.
+fn refusal(code: &str, text: impl Into<String>) -> Refusal {
+    Refusal { code: code.to_owned(), text: text.into() }
+}
+
+impl Answers {
+    /// Answers until nobody can ask any more.
+    pub async fn run(self, mut requests: mpsc::Receiver<Request>, messages: mpsc::Sender<Message>) {
+        let answers = Arc::new(self);
+        let mut under_way = JoinSet::new();
+        loop {
+            tokio::select! {
+                // Cancel-safe: a request stays in the channel until it is received.
+                request = requests.recv(), if under_way.len() < AT_A_TIME => {
+                    let Some(request) = request else { return };
+                    let (answers, messages) = (answers.clone(), messages.clone());
+                    under_way.spawn(async move { answers.reply(request, &messages).await });
+                }
+                // Cancel-safe: what has ended stays in the set until it is taken.
+                Some(_) = under_way.join_next() => {}
+            }
+        }
+    }
+
+    async fn reply(&self, request: Request, messages: &mpsc::Sender<Message>) {
+        let Request { id, ttl_ms, ask } = request;
+        let patience = Duration::from_millis(ttl_ms.min(MAX_TTL_MS));
+        let answer = tokio::time::timeout(patience, self.answer(ask)).await;
+        let answer = answer.unwrap_or_else(|_| Err(refusal("timeout", "the robot had no answer in time")));
+        let written = |answer: Result<Answer, Refusal>| {
+            let outcome = answer.map_or_else(Outcome::Refusal, Outcome::Answer);
+            serde_json::to_vec(&Reply { robot_id: self.robot_id.clone(), id: id.clone(), outcome })
+        };
+        let payload = match written(answer) {
+            Ok(payload) if payload.len() > MAX_REPLY_BYTES => {
+                let text = format!("the answer has {} bytes, more than a message may have", payload.len());
+                written(Err(refusal("too_large", text)))
+            }
+            written => written,
+        };
+        match payload {
+            // Without a session, or with one that is too slow, the answer is of no use any more.
+            Ok(payload) => drop(messages.try_send(Message { topic: RobotTopic::Reply, payload })),
+            Err(error) => tracing::error!(%error, "an answer can't be written as JSON"),
+        }
+    }
+
+    async fn answer(&self, ask: Ask) -> Result<Answer, Refusal> {
+        match ask {
+            Ask::Unknown => Err(refusal("unsupported", "this agent does not know the question; it may be too old")),
+            _ => Err(refusal("no_ros", "this robot has no ROS graph to look at")),
+        }
+    }
+}

@@ -8,7 +8,9 @@ use reqwest::header::RETRY_AFTER;
 use reqwest::{Method, RequestBuilder, Response, StatusCode};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+use task_proto::RobotName;
 use task_proto::api::{BASE, ErrorBody, IDEMPOTENCY_KEY};
+use task_proto::request::{Answer, Ask};
 use task_proto::token::{InvalidToken, Token};
 
 use super::{CommandError, Connection, Outcome};
@@ -158,6 +160,16 @@ impl Client {
             .await
     }
 
+    /// Asks a robot something. Tried once only: the robot may have done what was asked though no answer came.
+    pub(crate) async fn ask(&self, robot: &RobotName, ask: &Ask) -> Result<Answer, ClientError> {
+        let request = self.request(Method::POST, &format!("{BASE}/robots/{robot}/ask")).json(ask);
+        let response = request.send().await.map_err(|source| self.unreachable(source))?;
+        match response.status().is_success() {
+            true => self.body(response).await,
+            false => Err(self.refusal(response).await),
+        }
+    }
+
     /// A request with the token, to a path below the server's URL or to a whole URL of the same server.
     pub(crate) fn request(&self, method: Method, path: &str) -> RequestBuilder {
         let url = if path.starts_with('/') { format!("{}{path}", self.base) } else { path.to_owned() };
@@ -165,7 +177,11 @@ impl Client {
     }
 
     async fn answer<T: DeserializeOwned>(&self, request: impl Fn() -> RequestBuilder) -> Result<T, ClientError> {
-        let mut response = self.send(request).await?;
+        let response = self.send(request).await?;
+        self.body(response).await
+    }
+
+    async fn body<T: DeserializeOwned>(&self, mut response: Response) -> Result<T, ClientError> {
         let status = response.status();
         let mut body = Vec::new();
         while let Some(chunk) = response.chunk().await.map_err(|source| self.unreachable(source))? {

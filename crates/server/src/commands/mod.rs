@@ -19,6 +19,7 @@ mod output;
 mod progress;
 mod push;
 mod robot;
+mod ros;
 mod task;
 mod upload;
 mod view;
@@ -55,6 +56,26 @@ pub enum Command {
     Stop(task::TaskOrder),
     /// Stop a task and remove it from robots
     Remove(task::TaskOrder),
+    /// Look at the nodes on a robot's ROS graph
+    Node {
+        /// What to do.
+        #[command(subcommand)]
+        action: ros::NodeAction,
+    },
+    /// Look at the topics on a robot's ROS graph
+    Topic {
+        /// What to do.
+        #[command(subcommand)]
+        action: ros::TopicAction,
+    },
+    /// Look at a node's parameters, or set one
+    Param {
+        /// What to do.
+        #[command(subcommand)]
+        action: ros::ParamAction,
+    },
+    /// Ask a lifecycle node for a transition
+    Lifecycle(ros::LifecycleOrder),
 }
 
 /// Where the server is and who asks. Each option may stand before the command or after it.
@@ -163,6 +184,10 @@ async fn dispatch(connection: &Connection, command: Command) -> Result<Outcome, 
         Command::Start(order) => task::run(&connection.open()?, task::Verb::Start, order).await,
         Command::Stop(order) => task::run(&connection.open()?, task::Verb::Stop, order).await,
         Command::Remove(order) => task::run(&connection.open()?, task::Verb::Remove, order).await,
+        Command::Node { action } => ros::node(&connection.open()?, action).await,
+        Command::Topic { action } => ros::topic(&connection.open()?, action).await,
+        Command::Param { action } => ros::param(&connection.open()?, action).await,
+        Command::Lifecycle(order) => ros::lifecycle(&connection.open()?, order).await,
     }
 }
 

@@ -37,7 +37,7 @@ impl From<RequestError> for ApiError {
             RequestError::NotConnected(_) => Self::conflict("robot_offline", message),
             RequestError::Busy => Self::unavailable(message),
             RequestError::TimedOut { .. } => Self::new(StatusCode::GATEWAY_TIMEOUT, "robot_silent", message),
-            RequestError::Refused(refusal) => Self::new(StatusCode::UNPROCESSABLE_ENTITY, code(&refusal), message),
+            RequestError::Refused(refusal) => Self::conflict(code(&refusal), message),
             RequestError::Unwritable(_) => Self::internal(&error),
         }
     }

@@ -138,7 +138,8 @@ impl<E: Effects> Driver<E> {
                 }
             }
         }
-        let robot = effects.robot_facts();
+        // Which ROS there is is looked at when it is needed.
+        let robot = RobotFacts { installations: None, ..effects.robot_facts() };
         let held = effects.is_held();
         Self {
             effects,

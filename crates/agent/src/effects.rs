@@ -41,8 +41,12 @@ pub trait Effects: Send + Sync + 'static {
     /// Whether a person at the robot said `hold`.
     fn is_held(&self) -> bool;
 
-    /// What packages may require of this robot, apart from the labels the server knows better.
+    /// What packages may require of this robot, apart from the labels the server knows better, with the ROS that was
+    /// last seen.
     fn robot_facts(&self) -> RobotFacts;
+
+    /// Looks at what ROS there is now: a person may have installed what a task lacked.
+    fn look_for_ros(&self) -> impl Future<Output = ()> + Send;
 
     /// What the reports say of the machine.
     fn host_facts(&self) -> HostFacts;

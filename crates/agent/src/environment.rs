@@ -3,6 +3,10 @@
 
 use std::collections::BTreeMap;
 
+use task_proto::report::RosFacts;
+
+use crate::installation::{Installation, RosVersion};
+
 /// Passed on from the agent, with what to use where the agent has none.
 const PASSED_ON: [(&str, Option<&str>); 6] = [
     ("PATH", Some("/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin")),
@@ -11,6 +15,20 @@ const PASSED_ON: [(&str, Option<&str>); 6] = [
     ("USER", None),
     ("LOGNAME", None),
     ("TZ", None),
+];
+
+/// Variables that say how a robot's nodes find each other and what carries them; tasks get the agent's, where it has them.
+/// `ROS_DOMAIN_ID` is a setting of its own.
+pub const ROS_VARIABLES: [&str; 9] = [
+    "ROS_AUTOMATIC_DISCOVERY_RANGE",
+    "ROS_STATIC_PEERS",
+    "ROS_LOCALHOST_ONLY",
+    "RMW_IMPLEMENTATION",
+    "CYCLONEDDS_URI",
+    "FASTRTPS_DEFAULT_PROFILES_FILE",
+    "ROS_MASTER_URI",
+    "ROS_IP",
+    "ROS_HOSTNAME",
 ];
 
 /// The environment made of the robot's settings (`ROS_DOMAIN_ID` and the like, which win) and of what `inherited` says
@@ -35,9 +53,50 @@ pub fn of_this_robot(settings: &BTreeMap<String, String>) -> BTreeMap<String, St
     explicit(settings, |name| std::env::var(name).ok())
 }
 
+/// How tasks that ask for nothing special meet ROS: the best of `installations` under their `environment`. `None` where
+/// there is no ROS.
+pub fn ros_facts(installations: &[Installation], environment: &BTreeMap<String, String>) -> Option<RosFacts> {
+    let best = installations.last()?;
+    let variable = |name: &str| environment.get(name).map(String::as_str).filter(|value| !value.is_empty());
+    let distro = best.distros.last().map_or("unknown", String::as_str).to_owned();
+    if best.versions == [RosVersion::Ros1] {
+        let own = variable("ROS_HOSTNAME").or(variable("ROS_IP"));
+        let localhost_only = own.is_some_and(|name| name == "localhost" || name.starts_with("127.") || name == "::1");
+        return Some(RosFacts { distro, rmw: None, domain_id: None, localhost_only });
+    }
+    let default = if distro == "galactic" { "rmw_cyclonedds_cpp" } else { "rmw_fastrtps_cpp" };
+    let rmw = best.rmw.as_deref().or(variable("RMW_IMPLEMENTATION")).unwrap_or(default).to_owned();
+    let domain_id = variable("ROS_DOMAIN_ID").and_then(|id| id.parse().ok()).unwrap_or(0);
+    let localhost_only = variable("ROS_LOCALHOST_ONLY") == Some("1")
+        || matches!(variable("ROS_AUTOMATIC_DISCOVERY_RANGE"), Some("LOCALHOST" | "OFF"));
+    Some(RosFacts { distro, rmw: Some(rmw), domain_id: Some(domain_id), localhost_only })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_robot_says_how_its_tasks_meet_ros() {
+        let environment = |pairs: &[(&str, &str)]| {
+            pairs.iter().map(|(name, value)| ((*name).to_owned(), (*value).to_owned())).collect::<BTreeMap<_, _>>()
+        };
+        assert_eq!(ros_facts(&[], &environment(&[])), None);
+        let installation = |distro: &str, version| Installation {
+            distros: vec![distro.to_owned()],
+            versions: vec![version],
+            ..Installation::default()
+        };
+        let facts = |distro: &str, rmw: Option<&str>, domain_id, localhost_only| {
+            Some(RosFacts { distro: distro.to_owned(), rmw: rmw.map(str::to_owned), domain_id, localhost_only })
+        };
+        let all = [installation("noetic", RosVersion::Ros1), installation("humble", RosVersion::Ros2)];
+        assert_eq!(ros_facts(&all, &environment(&[])), facts("humble", Some("rmw_fastrtps_cpp"), Some(0), false));
+        let given = [("ROS_DOMAIN_ID", "7"), ("ROS_LOCALHOST_ONLY", "1"), ("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp")];
+        assert_eq!(ros_facts(&all, &environment(&given)), facts("humble", Some("rmw_cyclonedds_cpp"), Some(7), true));
+        let given = environment(&[("ROS_IP", "127.0.0.1"), ("ROS_DOMAIN_ID", "7")]);
+        assert_eq!(ros_facts(&all[..1], &given), facts("noetic", None, None, true));
+    }
 
     #[test]
     fn only_what_is_listed_passes_and_settings_win() {

@@ -1,10 +1,14 @@
 //! What is true on the robot, whatever the ledger says: processes and what lies on the disk. Plain values, filled by the
 //! effects and read by the plan.
 
+use std::collections::BTreeSet;
+
 use task_proto::Digest;
 use task_proto::id::Labels;
-use task_proto::manifest::{Requires, TaskManifest};
+use task_proto::manifest::TaskManifest;
 
+use crate::installation::{self, Installation};
+use crate::launch;
 use crate::process::ExitStatus;
 
 /// What is on the disk of one version, and which versions there are.
@@ -54,13 +58,21 @@ pub struct RobotFacts {
     pub arch: String,
     /// The labels the server holds; `None` until it has said.
     pub labels: Option<Labels>,
-    /// ROS distributions found.
-    pub ros_distros: Vec<String>,
+    /// The ROS installations, the best last; `None` while they have to be looked at.
+    pub installations: Option<Vec<Installation>>,
 }
 
 impl RobotFacts {
-    /// What `requires` asks for and this robot lacks, each as a sentence part; empty when it has all.
-    pub fn lacks(&self, requires: &Requires) -> Vec<String> {
+    /// Whether this robot's ROS has to be known to tell if `manifest` can run here.
+    pub fn must_know_ros(manifest: &TaskManifest) -> bool {
+        launch::of(manifest).ros.is_some()
+            || !manifest.requires.ros_distro.is_empty()
+            || !manifest.exec_depends.is_empty()
+    }
+
+    /// What `manifest` needs and this robot lacks, each as a sentence part; empty when it has all that can be told.
+    pub fn lacks(&self, manifest: &TaskManifest) -> Vec<String> {
+        let requires = &manifest.requires;
         let mut lacks = Vec::new();
         for (key, value) in &requires.labels {
             match self.labels.as_ref().and_then(|labels| labels.get(key)) {
@@ -72,10 +84,15 @@ impl RobotFacts {
         if !requires.arch.is_empty() && !requires.arch.contains(&self.arch) {
             lacks.push(format!("arch {} (it is {})", requires.arch.join(" or "), self.arch));
         }
-        if !requires.ros_distro.is_empty() && !self.ros_distros.iter().any(|have| requires.ros_distro.contains(have)) {
-            let have = if self.ros_distros.is_empty() { "none".to_owned() } else { self.ros_distros.join(", ") };
-            lacks.push(format!("ros_distro {} (it has {have})", requires.ros_distro.join(" or ")));
-        }
+        let Some(installations) = &self.installations else { return lacks };
+        let lacks_of = |chosen: &Installation| -> Vec<String> {
+            chosen.lacks(&manifest.exec_depends).into_iter().map(|name| format!("ROS package {name}")).collect()
+        };
+        lacks.extend(match installation::choose(installations, launch::of(manifest).ros, &requires.ros_distro) {
+            Ok(Some(chosen)) => lacks_of(chosen),
+            Ok(None) => lacks_of(&Installation { packages: Some(BTreeSet::new()), ..Installation::default() }),
+            Err(error) => vec![error.to_string()],
+        });
         lacks
     }
 }
@@ -102,29 +119,64 @@ impl Exit {
 
 #[cfg(test)]
 mod tests {
+    use task_proto::manifest::Requires;
+
     use super::*;
+    use crate::installation::RosVersion;
+
+    fn manifest(tool: &str, exec_depends: &[&str]) -> TaskManifest {
+        serde_json::from_value(serde_json::json!({
+            "name": "talker", "version": "1.0.0", "build": {"tool": tool}, "run": {"exec": ["true"]},
+            "exec_depends": exec_depends,
+            "content": {"tar_digest": Digest::of(b""), "tar_size": 0, "entries": 0},
+        }))
+        .expect("manifest")
+    }
+
+    fn robot(installations: Vec<Installation>) -> RobotFacts {
+        RobotFacts { arch: "x86_64".to_owned(), labels: Some(Labels::new()), installations: Some(installations) }
+    }
+
+    fn jazzy() -> Installation {
+        Installation {
+            distros: vec!["jazzy".to_owned()],
+            versions: vec![RosVersion::Ros2],
+            packages: Some(["std_msgs".to_owned()].into()),
+            ..Installation::default()
+        }
+    }
 
     #[test]
     fn what_is_lacking_is_listed_by_the_packages_keys() {
-        let robot = RobotFacts {
-            arch: "x86_64".to_owned(),
-            labels: Some([("base".parse().expect("valid"), "husky".parse().expect("valid"))].into()),
-            ros_distros: vec!["jazzy".to_owned()],
-        };
-        let mut requires = Requires::default();
-        assert_eq!(robot.lacks(&requires), Vec::<String>::new());
-        requires.labels.insert("base".parse().expect("valid"), "turtlebot".parse().expect("valid"));
-        requires.arch = vec!["aarch64".to_owned()];
-        requires.ros_distro = vec!["humble".to_owned(), "iron".to_owned()];
+        let mut robot = robot(vec![jazzy()]);
+        robot.labels = Some([("base".parse().expect("valid"), "husky".parse().expect("valid"))].into());
+        let mut manifest = manifest("colcon", &["std_msgs", "nav2_bringup", "python3-numpy", "slam_toolbox"]);
+        manifest.requires.labels.insert("base".parse().expect("valid"), "turtlebot".parse().expect("valid"));
+        manifest.requires.arch = vec!["aarch64".to_owned()];
         assert_eq!(
-            robot.lacks(&requires),
+            robot.lacks(&manifest),
             [
                 "label base=turtlebot (it has base=husky)",
                 "arch aarch64 (it is x86_64)",
-                "ros_distro humble or iron (it has jazzy)"
+                "ROS package nav2_bringup",
+                "ROS package slam_toolbox",
             ]
         );
-        requires = Requires { ros_distro: vec!["jazzy".to_owned()], ..Requires::default() };
-        assert!(robot.lacks(&requires).is_empty());
+        manifest.requires = Requires { ros_distro: vec!["humble".to_owned()], ..Requires::default() };
+        assert_eq!(robot.lacks(&manifest), ["ros_distro humble (it has jazzy)"]);
+        manifest.requires.ros_distro = vec!["jazzy".to_owned()];
+        manifest.exec_depends.truncate(1);
+        assert!(robot.lacks(&manifest).is_empty());
+    }
+
+    #[test]
+    fn a_robot_without_ros_lacks_it_for_ros_packages_only() {
+        let robot = robot(Vec::new());
+        assert_eq!(robot.lacks(&manifest("colcon", &["rclpy"])), ["ROS 2 (no ROS 2 found)"]);
+        assert_eq!(robot.lacks(&manifest("catkin", &["rospy"])), ["ROS 1 (no ROS 1 found)"]);
+        assert_eq!(robot.lacks(&manifest("none", &["nav_msgs", "ffmpeg"])), ["ROS package nav_msgs"]);
+        assert!(robot.lacks(&manifest("none", &["ffmpeg"])).is_empty());
+        assert!(!RobotFacts::must_know_ros(&manifest("none", &[])));
+        assert!(RobotFacts::must_know_ros(&manifest("colcon", &[])));
     }
 }

@@ -83,6 +83,8 @@ pub enum Next {
 pub enum Step {
     /// Pull the manifest.
     PullManifest(PackageRef),
+    /// Look at what ROS there is, to tell whether the version can run here.
+    LookForRos(PackageRef),
     /// Pull and unpack the content.
     PullContent(PackageRef),
     /// Build it.
@@ -118,7 +120,7 @@ impl Step {
     /// The lane it runs in.
     pub fn lane(&self) -> Lane {
         match self {
-            Self::PullManifest(_) | Self::PullContent(_) | Self::Build(_) => Lane::Prepare,
+            Self::PullManifest(_) | Self::LookForRos(_) | Self::PullContent(_) | Self::Build(_) => Lane::Prepare,
             Self::Start(_) | Self::Stop { .. } | Self::Prune { .. } | Self::Remove => Lane::Run,
         }
     }
@@ -128,7 +130,7 @@ impl Step {
     pub fn deadline(&self) -> Option<Duration> {
         let seconds = match self {
             Self::PullContent(_) | Self::Build(_) => return None,
-            Self::PullManifest(_) | Self::Start(_) => STEP_DEADLINE_S,
+            Self::PullManifest(_) | Self::LookForRos(_) | Self::Start(_) => STEP_DEADLINE_S,
             Self::Stop { stop_timeout_s, .. } => STEP_DEADLINE_S + 2 * u64::from(*stop_timeout_s),
             Self::Prune { .. } | Self::Remove => DELETE_DEADLINE_S,
         };
@@ -144,7 +146,10 @@ impl Step {
     /// [`Lane::Run`] are short and are finished.
     pub fn is_wanted(&self, desired: Option<&DesiredTask>) -> bool {
         match self {
-            Self::PullManifest(package) | Self::PullContent(package) | Self::Build(package) => {
+            Self::PullManifest(package)
+            | Self::LookForRos(package)
+            | Self::PullContent(package)
+            | Self::Build(package) => {
                 desired.is_some_and(|task| task.wanted == Wanted::Running && task.package == *package)
             }
             Self::Start(_) | Self::Stop { .. } | Self::Prune { .. } | Self::Remove => true,
@@ -205,7 +210,10 @@ pub fn prepare(s: &Situation<'_>) -> Next {
     if s.robot.labels.is_none() && !manifest.requires.labels.is_empty() {
         return NOTHING;
     }
-    let lacks = s.robot.lacks(&manifest.requires);
+    if s.robot.installations.is_none() && RobotFacts::must_know_ros(manifest) {
+        return Next::Act(Step::LookForRos(order.package.clone()));
+    }
+    let lacks = s.robot.lacks(manifest);
     if !lacks.is_empty() {
         let text =
             format!("this robot lacks what {} {} requires: {}", order.task, order.package.version, lacks.join(", "));
@@ -313,6 +321,7 @@ pub fn run_dir_name(run: &ActiveRun, start: u64) -> String {
 pub fn describe(task: &TaskName, step: &Step) -> String {
     match step {
         Step::PullManifest(package) => format!("pull the manifest of {task} {}", package.version),
+        Step::LookForRos(package) => format!("look for the ROS that {task} {} needs", package.version),
         Step::PullContent(package) => format!("pull {task} {}", package.version),
         Step::Build(package) => format!("build {task} {}", package.version),
         Step::Start(run) => format!("start {task} {} (run {})", run.package.version, run.run),

@@ -13,6 +13,7 @@ use serde::{Deserialize, Serialize};
 use task_proto::DeploymentId;
 
 use crate::durable;
+use crate::launch::Interrupt;
 use crate::process::{ExitStatus, ProcessIdentity};
 
 /// One start of a task, by its directory.
@@ -30,6 +31,9 @@ pub struct RunSpec {
     pub directory: PathBuf,
     /// The whole environment; nothing is inherited. The supervisor adds `TASKD_ASSIGNMENT` and `TASKD_RUN_DIR`.
     pub environment: BTreeMap<String, String>,
+    /// Who gets the SIGINT of a stop.
+    #[serde(default)]
+    pub interrupt: Interrupt,
     /// Where the task's output goes.
     pub log: LogSpec,
 }

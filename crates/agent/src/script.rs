@@ -1,4 +1,5 @@
-//! The scripts that are generated from a manifest: `run.sh`, which starts the task, and `build.sh`, which builds it.
+//! The scripts that are generated: `run.sh`, which starts the task, `build.sh`, which builds it, and the survey's, which
+//! asks what an underlay brings.
 //! Pure text. A value from a manifest only ever appears in single quotes, never as shell.
 //!
 //! Where a task runs: a built one in its version's directory, so that `exec = ["install/talker/lib/talker/talker"]`
@@ -9,6 +10,7 @@ use std::path::{Path, PathBuf};
 
 use task_proto::manifest::{BuildTool, TaskManifest};
 
+use crate::launch;
 use crate::layout::VersionDir;
 
 /// ROS setup files read unset variables and let commands fail, so the scripts must not `set -u` or `set -e`. They are
@@ -28,7 +30,13 @@ pub fn run_directory(tool: BuildTool, version: &VersionDir) -> PathBuf {
 pub fn run_script(manifest: &TaskManifest, version: &VersionDir, underlays: &[PathBuf]) -> String {
     let tool = manifest.build.tool;
     let mut script = HEAD.to_owned();
+    // A SIGINT that comes for the first process alone would else be lost while a setup file runs a program. What is
+    // executed in the end begins with the default again.
+    script.push_str("trap 'exit 130' INT\n");
     source_underlays(&mut script, underlays);
+    if tool == BuildTool::Catkin {
+        system_first(&mut script);
+    }
     let overlays = match tool {
         BuildTool::None => vec![version.src(), version.src().join("install")],
         BuildTool::Colcon | BuildTool::Catkin => vec![version.install()],
@@ -38,7 +46,7 @@ pub fn run_script(manifest: &TaskManifest, version: &VersionDir, underlays: &[Pa
         script.push_str(&format!("if [ -r {setup} ]; then . {setup}; fi\n"));
     }
     enter(&mut script, &run_directory(tool, version));
-    let words = command(manifest).iter().map(|word| quote(word)).collect::<Vec<_>>();
+    let words = launch::of(manifest).command.iter().map(|word| quote(word)).collect::<Vec<_>>();
     script.push_str(&format!("exec -- {}\n", words.join(" ")));
     script
 }
@@ -57,8 +65,7 @@ pub fn build_script(tool: BuildTool, version: &VersionDir, underlays: &[PathBuf]
             );
         }
         BuildTool::Catkin => {
-            // Debian's ROS 1 belongs to the system's Python, which another one earlier in PATH would hide.
-            script.push_str("if [ -z \"${ROS_DISTRO-}\" ]; then PATH=/usr/bin:/bin:$PATH; fi\n");
+            system_first(&mut script);
             need(&mut script, "catkin_make");
             // A catkin workspace has its packages one level below its source directory; ours may be the package.
             script.push_str(
@@ -71,6 +78,15 @@ pub fn build_script(tool: BuildTool, version: &VersionDir, underlays: &[PathBuf]
     Some(script)
 }
 
+/// The script that writes what the `variables` are after sourcing `underlays` into the file `answer`, each ended by NUL.
+pub fn survey_script(underlays: &[PathBuf], variables: &[&str], answer: &Path) -> String {
+    let mut script = HEAD.to_owned();
+    source_underlays(&mut script, underlays);
+    let values = variables.iter().map(|name| format!("\"${{{name}-}}\"")).collect::<Vec<_>>();
+    script.push_str(&format!("printf '%s\\0' {} > {}\n", values.join(" "), quote_path(answer)));
+    script
+}
+
 /// `value` as one word of bash, whatever is in it (but NUL, which no argument can hold).
 pub fn quote(value: &str) -> String {
     format!("'{}'", value.replace('\'', r"'\''"))
@@ -78,20 +94,6 @@ pub fn quote(value: &str) -> String {
 
 fn quote_path(path: &Path) -> String {
     quote(&path.to_string_lossy())
-}
-
-/// The command of a manifest: `exec` as it is, or the launcher of its ROS.
-fn command(manifest: &TaskManifest) -> Vec<String> {
-    if let Some(exec) = &manifest.run.exec {
-        return exec.clone();
-    }
-    let launcher: &[&str] = match manifest.build.tool {
-        BuildTool::Catkin => &["roslaunch"],
-        BuildTool::Colcon | BuildTool::None => &["ros2", "launch"],
-    };
-    let arguments = manifest.run.args.iter().map(|(name, value)| format!("{name}:={value}"));
-    let file = manifest.run.launch.iter().flatten().cloned();
-    launcher.iter().map(|word| (*word).to_owned()).chain(file).chain(arguments).collect()
 }
 
 /// bash goes on when a file to source is missing, so the script looks first.
@@ -102,6 +104,11 @@ fn source_underlays(script: &mut String, underlays: &[PathBuf]) {
             "if [ ! -r {setup} ]; then printf 'the underlay %s is not there\\n' {setup} >&2; exit 1; fi\n. {setup}\n"
         ));
     }
+}
+
+/// Debian's ROS 1 has no setup file and belongs to the system's Python, which another one earlier in PATH would hide.
+fn system_first(script: &mut String) {
+    script.push_str("if [ -z \"${ROS_DISTRO-}\" ]; then PATH=/usr/bin:/bin:$PATH; fi\n");
 }
 
 fn enter(script: &mut String, directory: &Path) {
@@ -159,6 +166,7 @@ mod tests {
         let script = run_script(&manifest(BuildTool::Colcon, run), &version, &["/opt/ros/jazzy/setup.bash".into()]);
         let expected = r#"#!/bin/bash
 # Generated by task-agent: a change made here is lost.
+trap 'exit 130' INT
 if [ ! -r '/opt/ros/jazzy/setup.bash' ]; then printf 'the underlay %s is not there\n' '/opt/ros/jazzy/setup.bash' >&2; exit 1; fi
 . '/opt/ros/jazzy/setup.bash'
 if [ -r 'ROOT/install/local_setup.bash' ]; then . 'ROOT/install/local_setup.bash'; fi

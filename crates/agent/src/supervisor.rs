@@ -14,8 +14,9 @@ use std::time::Duration;
 use nix::sys::signal::Signal;
 
 use crate::containment::{ASSIGNMENT_VARIABLE, Containment, ContainmentError, RUN_DIR_VARIABLE};
+use crate::launch::Interrupt;
 use crate::process;
-use crate::process::ExitStatus;
+use crate::process::{ExitStatus, ProcessIdentity};
 use crate::run_dir::{RunDir, RunDirError, RunSpec, Started};
 use crate::shim::Answer;
 
@@ -158,7 +159,8 @@ impl Supervisor {
         }
     }
 
-    /// Ends the run at `path`: SIGINT to the task's process group, `grace`, SIGTERM to all of it, `grace`, SIGKILL.
+    /// Ends the run at `path`: SIGINT to the task's process group, or to its first process alone where its launcher wants
+    /// that; `grace`; SIGTERM to all of it; `grace`; SIGKILL.
     /// Afterwards none of its processes is left, wherever they had hidden. Dropping the future leaves a run that may
     /// still be ending; calling again begins with SIGINT again, and on a run that has ended only makes sure.
     pub async fn stop(&self, path: &Path, grace: Duration) -> Result<Observed, SupervisorError> {
@@ -169,7 +171,7 @@ impl Supervisor {
         let (dir, started) = read(path).await?;
         let containment = Containment::new(dir.path(), started.as_ref().map(|started| started.shim.clone()));
         if let (Observed::Running { .. }, Some(started)) = (&observed, &started) {
-            observed = self.end_run(path, &containment, started.task.pid, grace).await?;
+            observed = self.end_run(&dir, &containment, &started.task, grace).await?;
         }
         containment.end(KILL_TIMEOUT).await?;
         Ok(observed)
@@ -177,13 +179,18 @@ impl Supervisor {
 
     async fn end_run(
         &self,
-        path: &Path,
+        dir: &RunDir,
         containment: &Containment,
-        group: u32,
+        task: &ProcessIdentity,
         grace: Duration,
     ) -> Result<Observed, SupervisorError> {
-        let signalled = failed("signal the task");
-        containment.signal_group(group, Signal::SIGINT).map_err(&signalled)?;
+        let (path, signalled) = (dir.path(), failed("signal the task"));
+        match dir.spec()?.map(|spec| spec.interrupt).unwrap_or_default() {
+            // The task's first process leads its group.
+            Interrupt::Group => containment.signal_group(task.pid, Signal::SIGINT),
+            Interrupt::Leader => task.signal(Signal::SIGINT),
+        }
+        .map_err(&signalled)?;
         if let Ok(ended) = tokio::time::timeout(grace, self.wait(path)).await {
             return ended;
         }

@@ -1,91 +1,99 @@
-//! The ROS installations that a task builds and runs on: the ones a person configured, else what is in `/opt/ros`. It
-//! finds and names them; sourcing them is the generated scripts' work. Nothing is ever written into an underlay.
+//! The ROS installations that a task builds and runs on: the ones a person configured, else what is in `/opt/ros` and the
+//! ROS 1 of the operating system. It finds and names them; sourcing them is the generated scripts' work. Nothing is ever
+//! written into an underlay.
 
 use std::ffi::OsStr;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Where ROS installs itself.
-pub const SYSTEM_ROOT: &str = "/opt/ros";
+use crate::installation::{Installation, NoInstallation, RosVersion, choose};
 
-/// A setup file and the distribution it belongs to.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Underlay {
-    /// The file that bash sources: a `setup.bash`, or a Python virtual environment's `activate`.
-    pub setup: PathBuf,
-    /// The distribution, for example `jazzy`, where it can be told.
-    pub distro: Option<String>,
+/// The distribution's name where ROS 1 comes with the operating system (Debian and Ubuntu have `catkin` and `roslaunch`
+/// in `/usr`, without a setup file): what it calls itself, in lower case.
+const SYSTEM_DISTRO: &str = "debian";
+
+/// Where to look.
+#[derive(Debug, Clone)]
+pub struct Places {
+    /// Where ROS installs itself, a directory for each distribution.
+    pub distros: PathBuf,
+    /// Where the operating system has its programs.
+    pub system: PathBuf,
 }
 
-/// What this robot has.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Underlays {
-    /// A person chose these; they are sourced in this order, all of them.
-    Configured(Vec<Underlay>),
-    /// Found by looking; a task uses one of them.
-    Found(Vec<Underlay>),
-}
-
-/// A robot without what a task needs.
+/// No setup files for a task.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum UnderlayError {
     /// A configured file is not there.
     #[error("underlays: {} is not there", .0.display())]
     Missing(PathBuf),
-    /// None of the distributions the task accepts is installed.
-    #[error("requires.ros_distro: the task needs one of [{}], this robot has [{}]", wanted.join(", "), found.join(", "))]
-    NoDistro {
-        /// What the task accepts.
-        wanted: Vec<String>,
-        /// What the robot has.
-        found: Vec<String>,
-    },
+    /// The robot does not have it.
+    #[error("this robot lacks what the task needs: {0}")]
+    NotInstalled(NoInstallation),
 }
 
-impl Underlays {
-    /// The `configured` setup files if there are any, else every distribution below `system_root`.
-    pub fn find(configured: &[PathBuf], system_root: &Path) -> Self {
-        let underlay = |setup: PathBuf| Underlay { distro: distro_of(&setup), setup };
-        if !configured.is_empty() {
-            return Self::Configured(configured.iter().cloned().map(underlay).collect());
-        }
-        let setups = children(system_root).into_iter().map(|dir| dir.join("setup.bash"));
-        Self::Found(setups.filter(|setup| setup.is_file()).map(underlay).collect())
+impl Places {
+    /// Those of this machine.
+    pub fn of_this_machine() -> Self {
+        Self { distros: "/opt/ros".into(), system: "/usr".into() }
     }
+}
 
-    /// The distributions, sorted.
-    pub fn distros(&self) -> Vec<String> {
-        let (Self::Configured(underlays) | Self::Found(underlays)) = self;
-        let mut distros: Vec<_> = underlays.iter().filter_map(|underlay| underlay.distro.clone()).collect();
-        distros.sort();
-        distros.dedup();
-        distros
+/// What tasks can use, the best last: the `configured` setup files, which are sourced all together, or everything there
+/// is, ROS 2 after ROS 1 and newer after older (the names of distributions rise with the alphabet).
+pub fn find(configured: &[PathBuf], places: &Places) -> Vec<Installation> {
+    let mut found: Vec<Installation> = Vec::new();
+    if ["catkin", "roslaunch"].iter().any(|name| places.system.join("share").join(name).join("package.xml").is_file()) {
+        let distros = vec![SYSTEM_DISTRO.to_owned()];
+        found.push(Installation { distros, versions: vec![RosVersion::Ros1], ..Installation::default() });
     }
+    if !configured.is_empty() {
+        found.push(together(configured));
+        return found;
+    }
+    let setups = children(&places.distros).into_iter().map(|dir| dir.join("setup.bash"));
+    found.extend(setups.filter(|setup| setup.is_file()).map(|setup| together(&[setup])));
+    // Stable: of one version they stay in the order of their names, the system's first.
+    found.sort_by(|one, other| one.versions.cmp(&other.versions));
+    found
+}
 
-    /// The setup files for a task that accepts the distributions `wanted` (none: any), in the order to source them.
-    pub fn for_task(&self, wanted: &[String]) -> Result<Vec<PathBuf>, UnderlayError> {
-        let accepted = |underlay: &&Underlay| underlay.distro.as_ref().is_some_and(|distro| wanted.contains(distro));
-        let none = || UnderlayError::NoDistro { wanted: wanted.to_vec(), found: self.distros() };
-        match self {
-            Self::Configured(underlays) => {
-                if let Some(missing) = underlays.iter().find(|underlay| !underlay.setup.is_file()) {
-                    return Err(UnderlayError::Missing(missing.setup.clone()));
-                }
-                if !wanted.is_empty() && !underlays.iter().any(|underlay| accepted(&underlay)) {
-                    return Err(none());
-                }
-                Ok(underlays.iter().map(|underlay| underlay.setup.clone()).collect())
-            }
-            // The names of distributions rise with the alphabet, so the last of several is the newest.
-            Self::Found(underlays) if wanted.is_empty() => {
-                Ok(underlays.last().map(|underlay| underlay.setup.clone()).into_iter().collect())
-            }
-            Self::Found(underlays) => {
-                let chosen = underlays.iter().rfind(accepted).ok_or_else(none)?;
-                Ok(vec![chosen.setup.clone()])
-            }
-        }
+/// The setup files for a task that needs `version` (`None`: any) of one of `distros` (none: any), in the order to source
+/// them.
+pub fn setup_files(
+    installations: &[Installation],
+    version: Option<RosVersion>,
+    distros: &[String],
+) -> Result<Vec<PathBuf>, UnderlayError> {
+    let chosen = choose(installations, version, distros).map_err(UnderlayError::NotInstalled)?;
+    let setups = chosen.map(|found| found.setups.clone()).unwrap_or_default();
+    match setups.iter().find(|setup| !setup.is_file()) {
+        Some(missing) => Err(UnderlayError::Missing(missing.clone())),
+        None => Ok(setups),
     }
+}
+
+fn together(setups: &[PathBuf]) -> Installation {
+    let mut versions: Vec<_> = setups.iter().filter_map(|setup| version_of(setup)).collect();
+    versions.sort();
+    versions.dedup();
+    Installation {
+        distros: setups.iter().filter_map(|setup| distro_of(setup)).collect(),
+        versions,
+        setups: setups.to_vec(),
+        ..Installation::default()
+    }
+}
+
+/// Which ROS a setup file belongs to; a workspace on top of another does not say.
+fn version_of(setup: &Path) -> Option<RosVersion> {
+    let dir = setup.parent()?;
+    if dir.join(".catkin").exists() {
+        return Some(RosVersion::Ros1);
+    }
+    let holds_ros_2 = dir.join("share/ament_index").is_dir() || wheels_of(dir).is_some();
+    // Every distribution in the place of distributions that catkin did not make is of ROS 2.
+    (holds_ros_2 || is_below_ros(dir)).then_some(RosVersion::Ros2)
 }
 
 /// The distribution a setup file belongs to: what its installation says, else the ROS wheels in its virtual environment
@@ -96,13 +104,18 @@ fn distro_of(setup: &Path) -> Option<String> {
     if let Some(distro) = said.as_deref().and_then(|text| text.trim().strip_prefix("set;ROS_DISTRO;")) {
         return Some(distro.to_owned());
     }
-    let pythons = children(&dir.parent()?.join("lib"));
+    wheels_of(dir).or_else(|| is_below_ros(dir).then(|| dir.file_name()?.to_str().map(str::to_owned)).flatten())
+}
+
+/// The distribution of the ROS wheels in the virtual environment whose programs are in `bin`.
+fn wheels_of(bin: &Path) -> Option<String> {
+    let pythons = children(&bin.parent()?.join("lib"));
     let mut installed = pythons.iter().flat_map(|python| children(&python.join("site-packages")));
-    if let Some(distro) = installed.find_map(|path| wheel_distro(path.file_name()?.to_str()?)) {
-        return Some(distro);
-    }
-    let is_below_ros = dir.parent()?.file_name() == Some(OsStr::new("ros"));
-    is_below_ros.then(|| dir.file_name()?.to_str().map(str::to_owned)).flatten()
+    installed.find_map(|path| wheel_distro(path.file_name()?.to_str()?))
+}
+
+fn is_below_ros(dir: &Path) -> bool {
+    dir.parent().and_then(Path::file_name) == Some(OsStr::new("ros")) && !dir.ends_with("bin")
 }
 
 /// `ros_kilted_rclpy-9.1.2.dist-info` is of `kilted`.
@@ -120,6 +133,7 @@ fn children(dir: &Path) -> Vec<PathBuf> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::installation::all_distros;
 
     fn touch(path: PathBuf) -> PathBuf {
         fs::create_dir_all(path.parent().unwrap()).unwrap();
@@ -127,18 +141,27 @@ mod tests {
         path
     }
 
+    fn places(root: &Path) -> Places {
+        Places { distros: root.join("opt/ros"), system: root.join("usr") }
+    }
+
     #[test]
     fn the_newest_installed_distribution_is_used_unless_the_task_says_which() {
         let temp = tempfile::tempdir().unwrap();
-        let root = temp.path().join("ros");
-        let [humble, jazzy] = ["humble", "jazzy"].map(|distro| touch(root.join(distro).join("setup.bash")));
-        fs::create_dir(root.join("removed")).unwrap();
-        let underlays = Underlays::find(&[], &root);
-        assert_eq!(underlays.distros(), ["humble", "jazzy"]);
-        assert_eq!(underlays.for_task(&[]), Ok(vec![jazzy]));
-        assert_eq!(underlays.for_task(&["humble".to_owned()]), Ok(vec![humble]));
-        let text = underlays.for_task(&["kilted".to_owned()]).unwrap_err().to_string();
-        assert!(text.contains("[kilted]") && text.contains("[humble, jazzy]"), "{text}");
+        let places = places(temp.path());
+        let [humble, jazzy] = ["humble", "jazzy"].map(|distro| touch(places.distros.join(distro).join("setup.bash")));
+        // Its name comes last, but it is of ROS 1.
+        let noetic = touch(places.distros.join("noetic/setup.bash"));
+        touch(places.distros.join("noetic/.catkin"));
+        fs::create_dir(places.distros.join("removed")).unwrap();
+        let found = find(&[], &places);
+        assert_eq!(all_distros(&found), ["humble", "jazzy", "noetic"]);
+        assert_eq!(setup_files(&found, None, &[]), Ok(vec![jazzy.clone()]));
+        assert_eq!(setup_files(&found, Some(RosVersion::Ros2), &[]), Ok(vec![jazzy]));
+        assert_eq!(setup_files(&found, Some(RosVersion::Ros1), &[]), Ok(vec![noetic]));
+        assert_eq!(setup_files(&found, None, &["humble".to_owned()]), Ok(vec![humble]));
+        let text = setup_files(&found, None, &["kilted".to_owned()]).unwrap_err().to_string();
+        assert!(text.contains("kilted") && text.contains("humble, jazzy"), "{text}");
     }
 
     #[test]
@@ -148,17 +171,27 @@ mod tests {
         let venv = temp.path().join("ros");
         let activate = touch(venv.join("bin/activate"));
         touch(venv.join("lib/python3.11/site-packages/ros_kilted_rclpy-9.1.2.dist-info/METADATA"));
-        let underlays = Underlays::find(std::slice::from_ref(&activate), Path::new(SYSTEM_ROOT));
-        assert_eq!(underlays.distros(), ["kilted"]);
-        assert_eq!(underlays.for_task(&[]), Ok(vec![activate]));
+        let found = find(std::slice::from_ref(&activate), &places(temp.path()));
+        assert_eq!((all_distros(&found), &found[0].versions), (vec!["kilted".to_owned()], &vec![RosVersion::Ros2]));
+        assert_eq!(setup_files(&found, None, &[]), Ok(vec![activate]));
         let gone = temp.path().join("gone/setup.bash");
-        let missing = Underlays::find(std::slice::from_ref(&gone), Path::new(SYSTEM_ROOT));
-        assert_eq!(missing.for_task(&[]), Err(UnderlayError::Missing(gone)));
+        let found = find(std::slice::from_ref(&gone), &places(temp.path()));
+        assert_eq!(setup_files(&found, None, &[]), Err(UnderlayError::Missing(gone)));
     }
 
     #[test]
-    fn no_ros_at_all_is_fine_for_a_task_that_asks_for_none() {
-        let underlays = Underlays::find(&[], Path::new("/nonexistent"));
-        assert_eq!(underlays.for_task(&[]), Ok(vec![]));
+    fn the_ros_1_of_the_operating_system_needs_no_setup_file() {
+        let temp = tempfile::tempdir().unwrap();
+        let places = places(temp.path());
+        assert_eq!(setup_files(&find(&[], &places), None, &[]), Ok(vec![]));
+        touch(places.system.join("share/roslaunch/package.xml"));
+        let found = find(&[], &places);
+        assert_eq!((all_distros(&found), found.len()), (vec!["debian".to_owned()], 1));
+        assert_eq!(setup_files(&found, Some(RosVersion::Ros1), &["debian".to_owned()]), Ok(vec![]));
+        // It stays usable beside a ROS 2 that a person configured.
+        let jazzy = touch(places.distros.join("jazzy/setup.bash"));
+        let found = find(std::slice::from_ref(&jazzy), &places);
+        assert_eq!(setup_files(&found, Some(RosVersion::Ros1), &[]), Ok(vec![]));
+        assert_eq!(setup_files(&found, Some(RosVersion::Ros2), &[]), Ok(vec![jazzy]));
     }
 }

@@ -15,7 +15,7 @@ use crate::config::{FILE_NAME, Settings, parse_server};
 use crate::durable;
 use crate::identity;
 use crate::layout::DataDir as Layout;
-use crate::underlay::{SYSTEM_ROOT, Underlays};
+use crate::underlay::{self, Places};
 
 /// Arguments of `configure`.
 #[derive(Debug, clap::Args)]
@@ -96,7 +96,7 @@ fn ask_for_the_rest(settings: &mut Settings, arguments: &Arguments) -> anyhow::R
     if arguments.underlays.is_empty() {
         let underlays = match &settings.underlays {
             Some(underlays) => underlays.clone(),
-            None => Underlays::find(&[], Path::new(SYSTEM_ROOT)).for_task(&[]).unwrap_or_default(),
+            None => underlay::find(&[], &Places::of_this_machine()).pop().map(|best| best.setups).unwrap_or_default(),
         };
         let shown = underlays.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(":");
         settings.underlays = ask("ROS setup file (a:b for several)", &shown, |text| {

@@ -55,7 +55,8 @@ impl<E: Effects> Driver<E> {
                     tracing::info!(generation = %state.generation, tasks = state.tasks.len(), "accepted a desired state");
                     self.ledger.accepted = Some(Accepted { generation: state.generation, envelope });
                     // The order may be for a label that the robot was given just before it: ask again.
-                    self.robot.labels = None;
+                    // Likewise for what a person has installed since the last one.
+                    (self.robot.labels, self.robot.installations) = (None, None);
                     self.shared.post.notify_one();
                     self.desired = Some(state);
                     self.dirty = true;

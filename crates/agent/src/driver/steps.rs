@@ -34,6 +34,10 @@ impl<E: Effects> Driver<E> {
             let work = async {
                 match &doing {
                     Step::PullManifest(package) => effects.pull_manifest(package, &stop).await.map(done),
+                    Step::LookForRos(_) => {
+                        effects.look_for_ros().await;
+                        Ok(None)
+                    }
                     Step::PullContent(package) => effects.pull_content(package, &progress, &stop).await.map(done),
                     Step::Build(package) => effects.build(package, &stop).await.map(done),
                     Step::Start(run) => effects.start(&name, run).await.map(Some),
@@ -109,6 +113,9 @@ impl<E: Effects> Driver<E> {
             self.views.remove(task);
             self.dirty = true;
             return;
+        }
+        if matches!(step, Step::LookForRos(_)) {
+            self.robot.installations = Some(self.effects.robot_facts().installations.unwrap_or_default());
         }
         let (Some(record), Some(view)) = (self.ledger.tasks.get(task), self.views.get(task)) else { return };
         let now = self.effects.now();

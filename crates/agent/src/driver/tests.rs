@@ -11,6 +11,7 @@ use task_proto::report::{Failure, FailureCode, HostFacts, Phase, Report};
 use task_proto::{DeploymentId, Digest, Generation};
 
 use super::*;
+use crate::installation::Installation;
 use crate::ledger::{ActiveRun, LedgerError, ProcessRecord};
 
 /// How long a test waits for what should come at once.
@@ -34,6 +35,10 @@ struct State {
     ledgers: Vec<Ledger>,
     held: bool,
     disk_full: bool,
+    /// What packages say they need, what the robot has, and what of it was seen.
+    exec_depends: Vec<String>,
+    ros_packages: BTreeSet<String>,
+    seen_packages: BTreeSet<String>,
 }
 
 impl Fake {
@@ -60,7 +65,13 @@ impl Effects for Fake {
     }
 
     fn robot_facts(&self) -> RobotFacts {
-        RobotFacts::default()
+        let packages = self.state(|state| state.seen_packages.clone());
+        let seen = Installation { packages: Some(packages), ..Installation::default() };
+        RobotFacts { installations: Some(vec![seen]), ..RobotFacts::default() }
+    }
+
+    async fn look_for_ros(&self) {
+        self.state(|state| state.seen_packages = state.ros_packages.clone());
     }
 
     fn host_facts(&self) -> HostFacts {
@@ -74,7 +85,8 @@ impl Effects for Fake {
     async fn prepared(&self, package: &PackageRef) -> Prepared {
         self.state(|state| {
             let content = state.contents.contains(&package.manifest.digest);
-            let manifest = state.manifests.contains(&package.manifest.digest).then(|| manifest(package));
+            let manifest = || TaskManifest { exec_depends: state.exec_depends.clone(), ..manifest(package) };
+            let manifest = state.manifests.contains(&package.manifest.digest).then(manifest);
             Prepared { manifest, content, built: content, versions: Vec::new() }
         })
     }
@@ -266,6 +278,26 @@ async fn an_order_runs_and_its_withdrawal_removes_it() {
     bench.report(|report| report.tasks.is_empty()).await;
     assert!(bench.fake.state(|state| state.alive.is_empty()));
     assert!(bench.end().await.tasks.is_empty());
+}
+
+#[tokio::test]
+async fn a_robot_that_lacks_a_package_says_so_before_it_pulls_and_runs_it_once_it_is_installed() {
+    let bench = Bench::new().await;
+    bench.fake.state(|state| {
+        state.exec_depends = ["nav2_bringup", "python3-numpy", "std_msgs", "slam_toolbox"].map(str::to_owned).into();
+        state.ros_packages = ["std_msgs".to_owned()].into();
+    });
+    bench.order(1, vec![order("1.0")]).await;
+    let report = bench.phase(Phase::Unmet).await;
+    let failure = report.tasks[0].failure.clone().expect("why");
+    assert_eq!(failure.code, FailureCode::REQUIREMENTS_UNMET);
+    let list = "lacks what talker 1.0 requires: ROS package nav2_bringup, ROS package slam_toolbox";
+    assert!(failure.text.contains(list), "{failure}");
+    assert!(bench.fake.state(|state| state.contents.is_empty()), "nothing was pulled");
+    // A person installs them; the same package is ordered again.
+    bench.fake.state(|state| state.ros_packages.extend(["nav2_bringup", "slam_toolbox"].map(str::to_owned)));
+    bench.order(2, vec![order("1.0")]).await;
+    bench.phase(Phase::Running).await;
 }
 
 #[tokio::test]

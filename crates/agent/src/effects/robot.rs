@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use std::error::Error;
 use std::io::{Read as _, Seek as _, SeekFrom};
 use std::path::{Path, PathBuf};
+use std::sync::{PoisonError, RwLock};
 use std::time::Duration;
 
 use task_proto::desired::PackageRef;
@@ -18,37 +19,34 @@ use super::{Effects, Now};
 use crate::builder::{self, BuildError, BuildLimits, BuildOrder};
 use crate::config::Config;
 use crate::fetch::{self, FetchError, Fetcher};
+use crate::installation::Installation;
 use crate::layout::{DataDir, VersionDir};
 use crate::ledger::{ActiveRun, Ledger, LedgerError, ProcessRecord};
 use crate::observed::{Exit, Prepared, ProcessState, RobotFacts};
 use crate::plan::StepFailure;
 use crate::run_dir::{LogSpec, RunSpec};
 use crate::supervisor::{Observed, Supervisor, SupervisorError};
-use crate::underlay::{self, Underlays};
-use crate::{clock, disk, durable, environment, script};
+use crate::underlay::{self, Places};
+use crate::{clock, disk, durable, environment, installation, launch, script, survey};
 
 /// Written into a version's directory once it is built.
 const BUILT_MARKER: &str = "built";
 /// Written into a run's directory before its start: what the ledger says of the run, should the ledger be lost.
 const RUN_RECORD: &str = "run.json";
+/// Where looking into ROS installations has its files.
+const SURVEY_DIR: &str = "survey";
 /// How much of a log's end goes into a failure's text.
 const TAIL_BYTES: u64 = 2048;
-/// Variables of the agent's own environment that say how ROS finds its peers; the tasks get them too.
-const ROS_VARIABLES: [&str; 6] = [
-    "ROS_AUTOMATIC_DISCOVERY_RANGE",
-    "ROS_STATIC_PEERS",
-    "ROS_LOCALHOST_ONLY",
-    "RMW_IMPLEMENTATION",
-    "CYCLONEDDS_URI",
-    "FASTRTPS_DEFAULT_PROFILES_FILE",
-];
 
 /// This robot.
 pub struct Robot {
     data: DataDir,
     fetcher: Fetcher,
     supervisor: Supervisor,
-    underlays: Underlays,
+    /// The configured setup files.
+    underlays: Vec<PathBuf>,
+    /// The ROS that was last seen.
+    ros: RwLock<Vec<Installation>>,
     environment: BTreeMap<String, String>,
     build_limits: BuildLimits,
     log_bytes: Option<u64>,
@@ -58,8 +56,10 @@ pub struct Robot {
 impl Robot {
     /// The robot whose data is in `data`.
     pub fn new(data: DataDir, fetcher: Fetcher, config: &Config, mac: MacAddress) -> Self {
-        let mut settings: BTreeMap<String, String> =
-            ROS_VARIABLES.iter().filter_map(|name| Some(((*name).to_owned(), std::env::var(name).ok()?))).collect();
+        let mut settings: BTreeMap<String, String> = environment::ROS_VARIABLES
+            .iter()
+            .filter_map(|name| Some(((*name).to_owned(), std::env::var(name).ok()?)))
+            .collect();
         settings.extend(config.ros_domain_id.map(|id| ("ROS_DOMAIN_ID".to_owned(), id.to_string())));
         let mut build_limits = BuildLimits::of_this_machine();
         if let Some(timeout_s) = config.limits.build_timeout_s {
@@ -70,7 +70,8 @@ impl Robot {
             data,
             fetcher,
             supervisor: Supervisor::of_this_program(),
-            underlays: Underlays::find(&config.underlays, Path::new(underlay::SYSTEM_ROOT)),
+            ros: RwLock::new(underlay::find(&config.underlays, &Places::of_this_machine())),
+            underlays: config.underlays.clone(),
             environment: environment::of_this_robot(&settings),
             build_limits,
             log_bytes: config.limits.log_bytes,
@@ -97,8 +98,13 @@ impl Robot {
         log
     }
 
+    fn installations(&self) -> Vec<Installation> {
+        self.ros.read().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
     fn setup_files(&self, manifest: &TaskManifest) -> Result<Vec<PathBuf>, StepFailure> {
-        let found = self.underlays.for_task(&manifest.requires.ros_distro);
+        let version = launch::of(manifest).ros;
+        let found = underlay::setup_files(&self.installations(), version, &manifest.requires.ros_distro);
         found.map_err(|error| finally(FailureCode::REQUIREMENTS_UNMET, &error))
     }
 
@@ -130,11 +136,28 @@ impl Effects for Robot {
     }
 
     fn robot_facts(&self) -> RobotFacts {
-        RobotFacts { arch: std::env::consts::ARCH.to_owned(), labels: None, ros_distros: self.underlays.distros() }
+        let installations = Some(self.installations());
+        RobotFacts { arch: std::env::consts::ARCH.to_owned(), labels: None, installations }
+    }
+
+    async fn look_for_ros(&self) {
+        let found = underlay::find(&self.underlays, &Places::of_this_machine());
+        let seen = survey::survey(found, &self.environment, &self.data.root().join(SURVEY_DIR)).await;
+        *self.ros.write().unwrap_or_else(PoisonError::into_inner) = seen;
     }
 
     fn host_facts(&self) -> HostFacts {
-        host_facts(self.data.root(), self.mac, self.underlays.distros())
+        let installations = self.installations();
+        HostFacts {
+            agent_version: env!("CARGO_PKG_VERSION").to_owned(),
+            hostname: std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default().trim().to_owned(),
+            arch: std::env::consts::ARCH.to_owned(),
+            mac: Some(self.mac),
+            ros_distros: installation::all_distros(&installations),
+            disk_free_bytes: disk::room(self.data.root()).map_or(0, |room| room.free),
+            ros: environment::ros_facts(&installations, &self.environment),
+            isolation: Isolation::None,
+        }
     }
 
     async fn survivors(&self) -> Vec<(TaskName, ActiveRun)> {
@@ -246,6 +269,7 @@ impl Effects for Robot {
             script: version.run_script(),
             directory: script::run_directory(manifest.build.tool, &version),
             environment: self.environment.clone(),
+            interrupt: launch::of(&manifest).interrupt,
             log: self.log(task),
         };
         let run_dir = self.run_dir(task, process);
@@ -343,18 +367,4 @@ pub(crate) fn chain(error: &dyn Error) -> String {
         cause = error.source();
     }
     text
-}
-
-/// What the reports say of the machine.
-fn host_facts(data_dir: &Path, mac: MacAddress, ros_distros: Vec<String>) -> HostFacts {
-    HostFacts {
-        agent_version: env!("CARGO_PKG_VERSION").to_owned(),
-        hostname: std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default().trim().to_owned(),
-        arch: std::env::consts::ARCH.to_owned(),
-        mac: Some(mac),
-        ros_distros,
-        disk_free_bytes: disk::room(data_dir).map_or(0, |room| room.free),
-        ros: None,
-        isolation: Isolation::None,
-    }
 }

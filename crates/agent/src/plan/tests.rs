@@ -10,6 +10,7 @@ use task_proto::report::{Failure, FailureCode, Phase};
 use task_proto::{DeploymentId, Digest};
 
 use super::*;
+use crate::installation::Installation;
 use crate::observed::Exit;
 use crate::process::ExitStatus;
 
@@ -33,6 +34,7 @@ struct World {
     held: bool,
     may_begin: bool,
     manifest: Run,
+    ros_seen: bool,
 }
 
 /// What can happen.
@@ -103,6 +105,10 @@ fn order(deployment: u8, package_number: u8, run: u64, wanted: Wanted) -> Desire
     }
 }
 
+fn ros() -> Installation {
+    Installation { packages: Some(["std_msgs".to_owned()].into()), ..Installation::default() }
+}
+
 impl World {
     fn new(manifest: Run) -> Self {
         Self {
@@ -118,6 +124,7 @@ impl World {
             now_ms: 1000,
             held: false,
             may_begin: true,
+            ros_seen: false,
             manifest,
         }
     }
@@ -227,7 +234,7 @@ impl World {
             process: &process,
             preparing: self.steps.iter().any(|(step, _)| step.lane() == Lane::Prepare),
             deleting: self.steps.iter().any(|(step, _)| step.deletes()),
-            robot: &RobotFacts::default(),
+            robot: &RobotFacts { installations: self.ros_seen.then(|| vec![ros()]), ..RobotFacts::default() },
             may_begin: self.may_begin,
             held: self.held,
             boot_id: &self.boot.to_string(),
@@ -249,6 +256,7 @@ impl World {
         }
         match &step {
             Step::PullManifest(package) => self.raise(package, 1),
+            Step::LookForRos(_) => self.ros_seen = true,
             Step::PullContent(package) => self.raise(package, 2),
             Step::Build(package) => self.raise(package, 3),
             Step::Start(run) => {
@@ -322,7 +330,7 @@ fn manifest(run: &Run) -> TaskManifest {
         outputs: Outputs::default(),
         requires: Requires::default(),
         limits: task_proto::manifest::Limits::default(),
-        exec_depends: Vec::new(),
+        exec_depends: vec!["std_msgs".to_owned()],
         content: ContentFacts { tar_digest: Digest::of(b""), tar_size: 0, entries: 0 },
     }
 }

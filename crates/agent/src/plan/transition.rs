@@ -44,7 +44,7 @@ pub fn adopted(record: &TaskRecord, order: &DesiredTask, now_ms: u64) -> TaskRec
 pub fn begun(record: &TaskRecord, step: &Step, boot_id: &str, start: u64, now_ms: u64) -> TaskRecord {
     let mut record = record.clone();
     let phase = match step {
-        Step::PullManifest(_) | Step::PullContent(_) => Some(Phase::Fetching),
+        Step::PullManifest(_) | Step::LookForRos(_) | Step::PullContent(_) => Some(Phase::Fetching),
         Step::Build(_) => Some(Phase::Building),
         Step::Start(_) | Step::Stop { .. } | Step::Prune { .. } | Step::Remove => None,
     };
@@ -77,7 +77,10 @@ pub fn begun(record: &TaskRecord, step: &Step, boot_id: &str, start: u64, now_ms
 pub fn finished(s: &Situation<'_>, step: &Step, outcome: Result<Option<u32>, StepFailure>) -> TaskRecord {
     let mut record = s.record.clone();
     match (step, outcome) {
-        (Step::PullManifest(package) | Step::PullContent(package) | Step::Build(package), outcome) => {
+        (
+            Step::PullManifest(package) | Step::LookForRos(package) | Step::PullContent(package) | Step::Build(package),
+            outcome,
+        ) => {
             // The step of an order that was replaced meanwhile says nothing about the new one.
             if record.order.package == *package {
                 prepared(&mut record.preparation, s, outcome.err());

@@ -2,15 +2,17 @@
 
 use std::collections::BTreeMap;
 use std::os::unix::fs::PermissionsExt;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Duration;
 
 use task_agent::builder::{self, BuildError, BuildLimits, BuildOrder};
+use task_agent::installation::RosVersion;
+use task_agent::launch::Interrupt;
 use task_agent::layout::DataDir;
 use task_agent::process::ExitStatus;
 use task_agent::run_dir::{LogSpec, RunSpec};
 use task_agent::supervisor::Observed;
-use task_agent::underlay::{SYSTEM_ROOT, Underlays};
+use task_agent::underlay::{self, Places};
 use task_agent::{environment, process, script};
 use task_proto::Digest;
 use task_proto::manifest::{BuildTool, TaskManifest};
@@ -123,8 +125,9 @@ def main():
 
 #[tokio::test]
 async fn a_real_ros_package_is_built_and_runs_under_its_shim() {
-    let underlays = Underlays::find(&[ros()], Path::new(SYSTEM_ROOT));
-    let mut build = TestBuild::new(underlays.for_task(&["kilted".to_owned()]).expect("kilted is there"));
+    let found = underlay::find(&[ros()], &Places::of_this_machine());
+    let setups = underlay::setup_files(&found, Some(RosVersion::Ros2), &["kilted".to_owned()]);
+    let mut build = TestBuild::new(setups.expect("kilted is there"));
     build.order.environment.insert("ROS_DOMAIN_ID".to_owned(), "47".to_owned());
     write_ament_package(&build);
     build.run().await.unwrap_or_else(|error| panic!("{error}: {}", build.log()));
@@ -146,6 +149,7 @@ async fn a_real_ros_package_is_built_and_runs_under_its_shim() {
         script: version.run_script(),
         directory: script::run_directory(BuildTool::Colcon, version),
         environment: build.order.environment.clone(),
+        interrupt: Interrupt::Group,
         log: LogSpec::at(build.dir.path().join("task.log")),
     };
     supervisor().start(&run_dir, &spec).await.expect("started");

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use task_agent::environment;
+use task_agent::launch::Interrupt;
 use task_agent::process::ProcessEntry;
 use task_agent::run_dir::{LogSpec, RunSpec};
 use task_agent::supervisor::Supervisor;
@@ -50,6 +51,7 @@ impl TestRun {
             script: path,
             directory: dir.path().to_owned(),
             environment: environment::of_this_robot(&BTreeMap::new()),
+            interrupt: Interrupt::Group,
             log: LogSpec::at(dir.path().join("task.log")),
         };
         Self { dir, supervisor: supervisor(), spec }

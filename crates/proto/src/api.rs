@@ -44,6 +44,49 @@ pub struct ServerInfo {
     pub mqtt: String,
     /// The server's clock.
     pub now_ms: u64,
+    /// What went over MQTT since the server started.
+    #[serde(default)]
+    pub traffic: MqttTraffic,
+}
+
+/// What went over MQTT, all connections together, the server's own watchdog excepted.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct MqttTraffic {
+    /// Robots that are connected now.
+    pub robots_connected: u64,
+    /// Clients that were let in.
+    pub connections_accepted: u64,
+    /// Clients that were turned away: too many, too slow, a wrong password, no MQTT.
+    pub connections_refused: u64,
+    /// Messages that were sent where their sender may not, or could not be stored.
+    pub messages_refused: u64,
+    /// Messages that a listener would have got, had it kept up.
+    pub messages_dropped: u64,
+    /// The connections' own figures, added up.
+    pub all: Traffic,
+}
+
+/// What went over an MQTT connection since it began. In is towards the server.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Traffic {
+    /// Bytes, with those that were refused.
+    pub bytes_in: u64,
+    /// Likewise.
+    pub bytes_out: u64,
+    /// MQTT control packets, CONNECT included.
+    pub packets_in: u64,
+    /// MQTT control packets, CONNACK included.
+    pub packets_out: u64,
+    /// PUBLISH.
+    pub messages_in: u64,
+    /// PUBLISH.
+    pub messages_out: u64,
+    /// PUBACK.
+    pub acks_in: u64,
+    /// PUBACK.
+    pub acks_out: u64,
 }
 
 /// `POST /enroll` (enrolment token).
@@ -155,6 +198,18 @@ pub struct RobotView {
     pub host: Option<HostFacts>,
     /// Its tasks, sorted by name.
     pub tasks: Vec<RobotTask>,
+    /// Its MQTT connection, if it has one; only in `GET /robots/{robot}`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mqtt: Option<MqttConnection>,
+}
+
+/// A robot's MQTT connection.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct MqttConnection {
+    /// When it began.
+    pub since_ms: u64,
+    /// What went over it.
+    pub traffic: Traffic,
 }
 
 /// A task on a robot: what is ordered, and where it stands.

@@ -8,7 +8,9 @@ use std::path::Path;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
-use task_proto::api::{CreateDeployment, EnrollRequest, EnrollResponse, ErrorBody, Event, MqttEndpoint, ReportReply};
+use task_proto::api::{
+    CreateDeployment, EnrollRequest, EnrollResponse, ErrorBody, Event, MqttEndpoint, ReportReply, RobotToken,
+};
 use task_proto::desired::{BlobRef, Delivery, DesiredState, DesiredTask, Doorbell, PackageRef, Wanted};
 use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
 use task_proto::log::{LogBatch, LogLevel, LogLine, LogSource};
@@ -330,6 +332,7 @@ fn documents_of_the_api() {
             mqtt: MqttEndpoint { host: None, port: 1883, prefix: TopicPrefix::default() },
         },
     );
+    check_text("robot_token.json", &RobotToken { token: "tskr_…".to_owned() });
     check_text(
         "create_deployment.json",
         &CreateDeployment {

@@ -14,6 +14,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use futures_util::future::BoxFuture;
 use task_proto::RobotId;
+use task_proto::api::{MqttTraffic, Traffic};
 use task_proto::topic::{RobotTopic, TopicPrefix};
 use tokio::sync::watch;
 
@@ -247,6 +248,16 @@ impl Broker {
     /// Ends the robot's session, if it has one: its token was revoked or it was removed.
     pub fn disconnect(&self, robot: &RobotId) {
         self.front.disconnect(robot);
+    }
+
+    /// What went over MQTT so far.
+    pub fn traffic(&self) -> MqttTraffic {
+        self.front.traffic()
+    }
+
+    /// What went over the robot's connection, if it has one.
+    pub fn traffic_of(&self, robot: &RobotId) -> Option<Traffic> {
+        self.front.traffic_of(robot)
     }
 
     /// How many robots are connected.

@@ -2,7 +2,7 @@
 //! or filters unchecked, because its thread dies of some of them; and since the router keeps a log for each filter and a
 //! record for each link name for ever, it gets two filters and a fixed set of names. Listeners pick out what they want.
 
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -34,6 +34,7 @@ pub(super) struct Router {
     slots: Mutex<Vec<usize>>,
     max_listeners: usize,
     listeners: AtomicUsize,
+    dropped: AtomicU64,
     current: Mutex<Arc<Running>>,
     trouble: Notify,
 }
@@ -87,6 +88,7 @@ impl Router {
             slots: Mutex::new((0..max_listeners).rev().collect()),
             max_listeners,
             listeners: AtomicUsize::new(0),
+            dropped: AtomicU64::new(0),
             current: Mutex::new(Arc::new(running)),
             trouble: Notify::new(),
         }))
@@ -110,6 +112,7 @@ impl Router {
         let mut publisher = lock(&running.publisher);
         let is_behind = publisher.buffer().len() >= MAX_BACKLOG;
         if is_behind {
+            self.dropped.fetch_add(1, Ordering::Relaxed);
             tracing::debug!(topic, "the router is behind, a message for listeners is dropped");
         } else {
             // Inside the router all is QoS 0, so the real one travels as one more level of the topic.
@@ -124,6 +127,11 @@ impl Router {
             // The note itself must not make the backlog longer.
             publisher.buffer().pop_back();
         }
+    }
+
+    /// Messages dropped so far.
+    pub(super) fn dropped(&self) -> u64 {
+        self.dropped.load(Ordering::Relaxed)
     }
 
     /// A new listener, which hears what is published from now on.

@@ -1,4 +1,4 @@
-//! Asks before many robots are changed. It decides nothing else.
+//! Asks before many robots are changed, and before what can't be undone. It decides nothing else.
 
 use std::io::IsTerminal as _;
 
@@ -16,7 +16,22 @@ pub(super) fn confirm(what: &str, robots: usize, yes: bool) -> Result<(), Comman
     if !std::io::stdin().is_terminal() {
         return Err(CommandError::Usage(format!("{what} means {robots} robots: give --yes for more than {ASK_ABOVE}")));
     }
-    say(&format!("{what} means {robots} robots. Go on? [y/N]"));
+    ask(&format!("{what} means {robots} robots. Go on? [y/N]"))
+}
+
+/// The same for what can't be undone, however few are meant.
+pub(super) fn always(what: &str, yes: bool) -> Result<(), CommandError> {
+    if yes {
+        return Ok(());
+    }
+    if !std::io::stdin().is_terminal() {
+        return Err(CommandError::Usage(format!("{what}: this can't be undone, give --yes")));
+    }
+    ask(&format!("{what}? This can't be undone. [y/N]"))
+}
+
+fn ask(question: &str) -> Result<(), CommandError> {
+    say(question);
     let mut answer = String::new();
     std::io::stdin()
         .read_line(&mut answer)

@@ -20,6 +20,7 @@ mod progress;
 mod push;
 mod robot;
 mod ros;
+mod server;
 mod task;
 mod upload;
 mod view;
@@ -33,6 +34,12 @@ pub enum Command {
         /// What to do.
         #[command(subcommand)]
         action: robot::Action,
+    },
+    /// Look at the server
+    Server {
+        /// What to do.
+        #[command(subcommand)]
+        action: server::Action,
     },
     /// Make the tokens that robots enrol with
     EnrollToken {
@@ -76,6 +83,7 @@ pub enum Command {
     },
     /// Ask a lifecycle node for a transition
     Lifecycle(ros::LifecycleOrder),
+    Remove(task::RemoveOrder),
 }
 
 /// Where the server is and who asks. Each option may stand before the command or after it.
@@ -178,6 +186,7 @@ async fn dispatch(connection: &Connection, command: Command) -> Result<Outcome, 
     match command {
         Command::Pack(pack) => push::pack(&Output::new(connection.output), pack).await,
         Command::Robot { action } => robot::run(&connection.open()?, action).await,
+        Command::Server { action } => server::run(&connection.open()?, action).await,
         Command::EnrollToken { action } => enroll_token::run(&connection.open()?, action).await,
         Command::Push(push) => push::run(&connection.open()?, push).await,
         Command::Deploy { action } => deploy::run(&connection.open()?, action).await,
@@ -188,6 +197,7 @@ async fn dispatch(connection: &Connection, command: Command) -> Result<Outcome, 
         Command::Topic { action } => ros::topic(&connection.open()?, action).await,
         Command::Param { action } => ros::param(&connection.open()?, action).await,
         Command::Lifecycle(order) => ros::lifecycle(&connection.open()?, order).await,
+        Command::Remove(order) => task::remove(&connection.open()?, order).await,
     }
 }
 

@@ -5,6 +5,7 @@ use task_proto::RobotName;
 use task_proto::api::{RobotList, RobotTask, RobotView};
 use task_proto::selector::Selector;
 
+use super::confirm::always;
 use super::output::{printable, say, table, time};
 use super::{CommandError, Outcome, Session};
 
@@ -26,6 +27,9 @@ pub enum Action {
     Rm {
         /// Its name or id
         robot: RobotName,
+        /// Don't ask
+        #[arg(short, long)]
+        yes: bool,
     },
 }
 
@@ -36,11 +40,13 @@ pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, Co
             session.output.result(&list, &HEADER, |list| list.robots.iter().map(row).collect())?;
         }
         Action::Info { robot } => {
-            let robot = one(session, &robot).await?;
+            let robot = one(session, &robot).await?.id;
+            let robot: RobotView = session.client.get(&format!("/robots/{robot}"), &[]).await?;
             session.output.described(&robot, describe)?;
         }
-        Action::Rm { robot } => {
+        Action::Rm { robot, yes } => {
             let robot = one(session, &robot).await?;
+            always(&format!("remove the robot {}", robot.name), yes)?;
             session.client.delete(&format!("/robots/{}", robot.id)).await?;
             say(&format!("removed {} ({})", robot.name, robot.id));
         }
@@ -102,6 +108,11 @@ fn describe(robot: &RobotView) -> String {
         facts.push(("host", format!("{} {} agent {}", host.hostname, host.arch, host.agent_version)));
         facts.push(("ros", if host.ros_distros.is_empty() { "-".to_owned() } else { host.ros_distros.join(" ") }));
         facts.push(("disk free", super::output::bytes(host.disk_free_bytes)));
+    }
+    if let Some(mqtt) = &robot.mqtt {
+        facts.push(("connected", time(mqtt.since_ms)));
+        facts.push(("mqtt in", super::server::inward(&mqtt.traffic)));
+        facts.push(("mqtt out", super::server::outward(&mqtt.traffic)));
     }
     facts.extend(robot.conditions.iter().map(|c| ("condition", format!("{}: {}", c.code, c.text))));
     let mut text: String = facts.iter().map(|(key, value)| format!("{key:<12}{}\n", printable(value))).collect();

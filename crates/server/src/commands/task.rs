@@ -1,15 +1,19 @@
 //! `taskd start|stop|remove`: orders on tasks that robots already have.
 
+use std::time::Duration;
+
 use clap::Args;
 use task_proto::TaskName;
-use task_proto::api::{MatchedRobots, OrderTask};
+use task_proto::api::{MatchedRobots, OrderTask, RobotView};
 use task_proto::selector::Selector;
+use tokio::time::{Instant, sleep, timeout_at};
 
 use super::client::ClientError;
 use super::confirm::confirm;
 use super::output::{robots, say};
 use super::view::print_matched;
-use super::{CommandError, Outcome, Session};
+use super::{CommandError, Outcome, Session, robot, wait};
+use crate::config::lifetime;
 
 /// Which task on which robots.
 #[derive(Debug, Args)]
@@ -28,6 +32,19 @@ pub struct TaskOrder {
     /// Makes a repeated command the same order
     #[arg(long, value_name = "KEY")]
     idempotency_key: Option<String>,
+}
+
+/// Which task to remove, and whether to wait until it is gone.
+#[derive(Debug, Args)]
+pub struct RemoveOrder {
+    #[command(flatten)]
+    order: TaskOrder,
+    /// Wait until it is gone from every robot
+    #[arg(long, conflicts_with = "dry_run")]
+    wait: bool,
+    /// How long to wait
+    #[arg(long, value_name = "TIME", value_parser = lifetime, default_value = "2m", requires = "wait")]
+    timeout: Duration,
 }
 
 /// What is ordered.
@@ -49,6 +66,67 @@ impl Verb {
 }
 
 pub(super) async fn run(session: &Session, verb: Verb, order: TaskOrder) -> Result<Outcome, CommandError> {
+    give(session, verb, order).await?;
+    Ok(Outcome::Succeeded)
+}
+
+pub(super) async fn remove(session: &Session, order: RemoveOrder) -> Result<Outcome, CommandError> {
+    let RemoveOrder { order, wait, timeout } = order;
+    let (task, on) = (order.task.clone(), order.on.clone());
+    let ordered = give(session, Verb::Remove, order).await?;
+    if !wait {
+        return Ok(Outcome::Succeeded);
+    }
+    until_gone(session, &task, &on, &ordered, timeout).await
+}
+
+/// Waits until none of `ordered` has the task any more. Whoever was removed meanwhile has not.
+async fn until_gone(
+    session: &Session,
+    task: &TaskName,
+    on: &Selector,
+    ordered: &MatchedRobots,
+    timeout: Duration,
+) -> Result<Outcome, CommandError> {
+    let deadline = Instant::now() + timeout;
+    let mut left: Option<Vec<RobotView>> = None;
+    while Instant::now() < deadline {
+        match timeout_at(deadline, robot::matching(session, on)).await {
+            Err(_) => break,
+            Ok(Err(CommandError::Client(error))) if wait::may_pass(&error) => {}
+            Ok(Err(error)) => return Err(error),
+            Ok(Ok(list)) => {
+                let is_meant = |robot: &RobotView| ordered.robots.iter().any(|meant| meant.id == robot.id);
+                let robots = list.robots.into_iter().filter(is_meant);
+                let robots: Vec<RobotView> = robots.filter(|robot| has_still(robot, task)).collect();
+                if robots.is_empty() {
+                    say(&format!("{task} is gone from {}", self::robots(ordered.robots.len() as u64)));
+                    return Ok(Outcome::Succeeded);
+                }
+                left = Some(robots);
+            }
+        }
+        sleep(wait::MAX_PAUSE.min(deadline.saturating_duration_since(Instant::now()))).await;
+    }
+    match left {
+        None => say("timed out: the server did not say how the robots stand"),
+        Some(left) => {
+            for robot in left {
+                let why = if robot.online { "not done in time" } else { "offline, follows when it is back" };
+                say(&format!("{}: {why}", robot.name));
+            }
+        }
+    }
+    Ok(Outcome::TimedOut)
+}
+
+/// Whether the robot has not followed its newest order yet, or is still getting rid of the task.
+fn has_still(robot: &RobotView, task: &TaskName) -> bool {
+    robot.observed_generation < robot.generation || robot.tasks.iter().any(|known| known.task == *task)
+}
+
+/// Gives the order; the robots it was for.
+async fn give(session: &Session, verb: Verb, order: TaskOrder) -> Result<MatchedRobots, CommandError> {
     let TaskOrder { task, on, dry_run, yes, idempotency_key } = order;
     let path = format!("/tasks/{task}/{}", verb.as_str());
     // With a key this may be an order that was carried out before, whose tasks are gone by now: the server knows.
@@ -65,7 +143,7 @@ pub(super) async fn run(session: &Session, verb: Verb, order: TaskOrder) -> Resu
     }
     if dry_run {
         print_matched(session, &matched)?;
-        return Ok(Outcome::Succeeded);
+        return Ok(matched);
     }
     confirm(&format!("{} {task} on {on}", verb.as_str()), matched.robots.len(), yes)?;
     let ordered: MatchedRobots = session.client.order(&path, &OrderTask { selector: on, dry_run: false }, &key).await?;
@@ -75,5 +153,5 @@ pub(super) async fn run(session: &Session, verb: Verb, order: TaskOrder) -> Resu
     if offline > 0 {
         say(&format!("{offline} of them are offline and follow when they are back"));
     }
-    Ok(Outcome::Succeeded)
+    Ok(ordered)
 }

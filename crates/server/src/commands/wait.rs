@@ -15,7 +15,7 @@ use super::{CommandError, Outcome, Session, view};
 /// The first pause between two looks; it doubles while nothing changes.
 const MIN_PAUSE: Duration = Duration::from_millis(100);
 /// The longest pause.
-const MAX_PAUSE: Duration = Duration::from_secs(1);
+pub(super) const MAX_PAUSE: Duration = Duration::from_secs(1);
 
 /// Waits, then prints the deployment and the reasons of every robot that did not make it.
 pub(super) async fn until_settled(
@@ -60,7 +60,7 @@ async fn look(session: &Session, id: &DeploymentId) -> Result<DeploymentView, Cl
 }
 
 /// Whether the server may answer if it is asked again: it is restarting, or something stands before it that is not it.
-fn may_pass(error: &ClientError) -> bool {
+pub(super) fn may_pass(error: &ClientError) -> bool {
     match error {
         ClientError::Refused { status, .. } | ClientError::NotTheServer { status, .. } => status.is_server_error(),
         ClientError::Unreachable { .. } => true,

@@ -55,12 +55,13 @@ async fn is_writable(data: &Path) -> std::io::Result<()> {
     tokio::fs::write(&probe, b"ready\n").await
 }
 
-/// `GET /server`: what it is and where MQTT listens.
+/// `GET /server`: what it is, where MQTT listens and what went over it.
 pub(super) async fn server(State(app): State<App>) -> Json<ServerInfo> {
     Json(ServerInfo {
         version: env!("CARGO_PKG_VERSION").to_owned(),
         key: app.key.clone(),
         mqtt: app.broker.local_addr().to_string(),
         now_ms: app.clock.now_ms(),
+        traffic: app.broker.traffic(),
     })
 }

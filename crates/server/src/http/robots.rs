@@ -7,7 +7,7 @@ use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
 use http::{HeaderMap, StatusCode, header};
 use serde::Deserialize;
-use task_proto::api::{EditRobot, ReportReply, RobotList, RobotToken, RobotView};
+use task_proto::api::{EditRobot, MqttConnection, ReportReply, RobotList, RobotToken, RobotView};
 use task_proto::report::Report;
 use task_proto::selector::Selector;
 use task_proto::{Digest, RobotId, RobotName};
@@ -46,7 +46,11 @@ pub(super) async fn show(
     PathParam(robot): PathParam<RobotName>,
 ) -> Result<Json<RobotView>, ApiError> {
     let id = find(&app, &robot).await?;
-    view(&app, &id).await.map(Json)
+    let mut view = view(&app, &id).await?;
+    let since_ms = app.presence.get(&id, app.clock.now_ms()).and_then(|sighting| sighting.connected_since_ms);
+    view.mqtt =
+        since_ms.zip(app.broker.traffic_of(&id)).map(|(since_ms, traffic)| MqttConnection { since_ms, traffic });
+    Ok(Json(view))
 }
 
 /// `PATCH /robots/{robot}`: changes name or labels.

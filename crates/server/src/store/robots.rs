@@ -319,6 +319,7 @@ fn robot_view(row: &sqlx::any::AnyRow, mut tasks: Vec<RobotTask>) -> Result<Robo
         conditions,
         host,
         tasks,
+        mqtt: None,
     })
 }
 

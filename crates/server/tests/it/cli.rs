@@ -123,11 +123,6 @@ impl Bench {
 
     /// Robot `robot` says that it has everything it was told to, and that the task of `deployment` is in `phase`.
     async fn report(&self, robot: &Robot, deployment: &Value, phase: &str) {
-        let id = &robot.identity.robot_id;
-        let view: RobotView =
-            serde_json::from_value(self.taskd(&["robot", "info", id.as_str(), "-o", "json"]).await.json()).unwrap();
-        let seq = robot.seq.get() + 1;
-        robot.seq.set(seq);
         let mut task = json!({
             "task": "hello", "deployment": deployment["id"], "package": deployment["package"], "wanted": "running",
             "run": 1, "kind": "service", "phase": phase, "phase_ms": 1,
@@ -135,10 +130,24 @@ impl Bench {
         if phase == "failed" {
             task["failure"] = json!({ "code": "process_exited", "text": "exit code 3" });
         }
+        self.report_tasks(robot, json!([task])).await;
+    }
+
+    /// Robot `robot` says that it has done everything it was told to and has no task left.
+    async fn report_absence(&self, robot: &Robot) {
+        self.report_tasks(robot, json!([])).await;
+    }
+
+    async fn report_tasks(&self, robot: &Robot, tasks: Value) {
+        let id = &robot.identity.robot_id;
+        let view: RobotView =
+            serde_json::from_value(self.taskd(&["robot", "info", id.as_str(), "-o", "json"]).await.json()).unwrap();
+        let seq = robot.seq.get() + 1;
+        robot.seq.set(seq);
         let report = json!({
             "robot_id": id, "start": 1, "instance": "i0123456789abcdef", "boot_id": "b", "seq": seq,
             "observed_generation": view.generation, "uptime_ms": 1,
-            "host": { "agent_version": "1", "hostname": "h", "arch": "x86_64" }, "tasks": [task],
+            "host": { "agent_version": "1", "hostname": "h", "arch": "x86_64" }, "tasks": tasks,
         });
         let url = self.url(&format!("/robots/{id}/report"));
         let answer = self.http.post(url).bearer_auth(&robot.identity.token).json(&report).send().await.unwrap();
@@ -281,8 +290,32 @@ async fn robots_and_deployments_are_shown_and_removed() {
     let cancelled = bench.taskd(&["deploy", "cancel", deployment, "-o", "json"]).await.expect(0, "cancel");
     assert_eq!(cancelled.json()["state"], "cancelled");
     bench.taskd(&["deploy", "info", "d0000000000000000"]).await.expect(1, "not_found");
-    bench.taskd(&["robot", "rm", "robot-7"]).await.expect(0, id);
+    bench.taskd(&["robot", "rm", "robot-7"]).await.expect(2, "give --yes");
+    bench.taskd(&["robot", "rm", "robot-7", "--yes"]).await.expect(0, id);
     bench.taskd(&["robot", "info", "robot-7"]).await.expect(2, "no robot has the name or id robot-7");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn removing_a_task_can_be_waited_for() {
+    let bench = Bench::start().await;
+    let robot = bench.enroll(1).await;
+    let push = ["push", &bench.package("1", ""), "--to", "*", "-o", "json"];
+    let deployment = bench.taskd(&push).await.expect(0, "").json();
+    bench.report(&robot, &deployment, "running").await;
+    let remove = ["remove", "hello", "--on", "*", "--idempotency-key", "k", "--wait"];
+    let late = [&remove[..], &["--timeout", "1s"]].concat();
+    bench.taskd(&late).await.expect(5, "robot-1: not done in time");
+    bench.report_absence(&robot).await;
+    bench.taskd(&remove).await.expect(0, "hello is gone from 1 robot");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_server_says_what_went_over_it() {
+    let bench = Bench::start().await;
+    let told = bench.taskd(&["server", "info"]).await.expect(0, "");
+    assert!(told.stdout.contains("0 accepted, 0 refused"), "{}", told.stdout);
+    let told = bench.taskd(&["server", "info", "-o", "json"]).await.expect(0, "").json();
+    assert_eq!(told["traffic"]["all"]["bytes_in"], 0);
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -6,6 +6,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use rumqttc::{AsyncClient, Event, MqttOptions, Packet, QoS, SubscribeReasonCode};
 use task_proto::RobotId;
+use task_proto::api::Traffic;
 use task_proto::topic::RobotTopic;
 use tokio::time::timeout;
 
@@ -255,6 +256,51 @@ async fn silence_beyond_the_keepalive_ends_the_session() {
     let begin = tokio::time::Instant::now();
     raw.expect_close().await;
     assert!((Duration::from_millis(1400)..Duration::from_secs(5)).contains(&begin.elapsed()));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_goes_over_a_connection_is_counted_for_it_and_for_all() {
+    let broker = TestBroker::start().await;
+    let (robot, other) = (RobotId::random(), RobotId::random());
+    let (report, desired) = (topic(&robot, RobotTopic::Report), topic(&robot, RobotTopic::Desired));
+    assert_eq!(broker.broker.traffic_of(&robot), None);
+    let mut raw = broker.robot(&robot).await;
+    let connect = Connect::robot(&robot).packet().len() as u64;
+    let mut expected = Traffic { bytes_in: connect, bytes_out: 4, packets_in: 1, packets_out: 1, ..Traffic::default() };
+    assert_eq!(broker.broker.traffic_of(&robot), Some(expected));
+
+    let (listen, say, told) =
+        (subscribe(3, &[(&desired, 1)]), publish(&report, 1, 1, b"report"), publish(&desired, 1, 1, b"ding"));
+    raw.send(&listen).await;
+    raw.expect(&[0x90, 3, 0, 3, 1]).await;
+    raw.send(&say).await;
+    raw.expect(&[0x40, 2, 0, 1]).await;
+    broker.broker.ring(&robot, Bytes::from_static(b"ding")).unwrap();
+    raw.expect(&told).await;
+    raw.send(&[0x40, 2, 0, 1]).await;
+    raw.expect_nothing().await;
+    expected.bytes_in += (listen.len() + say.len() + 4 + 2) as u64;
+    expected.bytes_out += (5 + 4 + told.len() + 2) as u64;
+    (expected.packets_in, expected.packets_out) = (5, 5);
+    (expected.messages_in, expected.messages_out, expected.acks_in, expected.acks_out) = (1, 1, 1, 1);
+    assert_eq!(broker.broker.traffic_of(&robot), Some(expected));
+    let all = broker.broker.traffic();
+    assert_eq!((all.robots_connected, all.connections_accepted, all.connections_refused), (1, 1, 0));
+    assert_eq!((all.messages_refused, all.messages_dropped, all.all), (0, 0, expected));
+
+    // Others count for themselves and for all: one whose password is wrong, one that says what it may not.
+    let wrong = Connect { password: Some("wrong".to_owned()), ..Connect::robot(&other) }.packet();
+    let mut refused = broker.raw_with(&wrong).await;
+    refused.expect(&[0x20, 2, 0, 4]).await;
+    let mut forger = broker.robot(&other).await;
+    let forged = publish(&report, 1, 1, b"forged");
+    forger.send(&forged).await;
+    forger.expect_close().await;
+    let all = broker.broker.traffic();
+    assert_eq!((all.connections_accepted, all.connections_refused, all.messages_refused), (2, 1, 1));
+    assert_eq!(all.all.messages_in, 2);
+    assert_eq!(all.all.bytes_in, expected.bytes_in + (wrong.len() + connect as usize + forged.len()) as u64);
+    assert_eq!(broker.broker.traffic_of(&robot), Some(expected), "the others' are not this one's");
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -6,7 +6,7 @@ use std::time::Duration;
 use reqwest::Method;
 use rumqttc::{AsyncClient, Event, EventLoop, MqttOptions, Packet, QoS};
 use serde_json::json;
-use task_proto::api::RobotToken;
+use task_proto::api::{RobotToken, ServerInfo};
 use task_proto::desired::{DesiredState, Doorbell};
 use task_proto::report::Phase;
 
@@ -99,6 +99,11 @@ async fn a_connected_robot_is_told_and_its_report_is_stored_before_the_acknowled
     let view = server.robot(&robot).await;
     assert_eq!(view.tasks[0].phase, Phase::Running);
     assert!(view.online && view.address.is_some());
+    let mqtt = view.mqtt.expect("connected");
+    assert_eq!((mqtt.traffic.messages_in, mqtt.traffic.acks_out), (1, 1));
+    assert!(mqtt.since_ms > 0 && mqtt.traffic.bytes_out > 0);
+    let info: ServerInfo = server.get("/api/v1/server").await;
+    assert_eq!((info.traffic.robots_connected, info.traffic.connections_accepted), (1, 1));
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -30,6 +30,7 @@ pub(super) async fn run(front: Arc<Front>, listener: TcpListener) {
         };
         let Ok(place) = places.clone().try_acquire_owned() else {
             tracing::debug!(%peer, "as many MQTT connections as there may be, one more is closed");
+            front.context.totals.refuse(None);
             continue;
         };
         // Small packets, each of which somebody waits for. If it can't be set, they come a little later.

@@ -11,6 +11,7 @@ mod listener;
 mod outgoing;
 mod session;
 mod takeover;
+mod traffic;
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -18,6 +19,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use task_proto::RobotId;
+use task_proto::api::{MqttTraffic, Traffic};
 use task_proto::topic::TopicPrefix;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
@@ -28,6 +30,7 @@ use crate::anteroom::Anteroom;
 use crate::backlog::listen;
 pub(super) use entrance::{CANARY_ID, CanaryPass};
 use takeover::Seats;
+use traffic::Totals;
 
 /// The running front.
 pub(super) struct Front {
@@ -44,6 +47,7 @@ struct Context {
     inbox: Arc<dyn Inbox>,
     router: Arc<Router>,
     seats: Arc<Seats>,
+    totals: Totals,
     canary_pass: Arc<CanaryPass>,
     /// Who has not sent CONNECT yet.
     anteroom: Arc<Anteroom>,
@@ -69,6 +73,7 @@ impl Front {
             inbox,
             router,
             seats: Arc::default(),
+            totals: Totals::default(),
             canary_pass: Arc::default(),
             anteroom,
             stop: CancellationToken::new(),
@@ -90,6 +95,18 @@ impl Front {
 
     pub(super) fn disconnect(&self, robot: &RobotId) {
         self.context.seats.ask_to_leave(robot);
+    }
+
+    pub(super) fn traffic(&self) -> MqttTraffic {
+        MqttTraffic {
+            robots_connected: self.connected_count() as u64,
+            messages_dropped: self.context.router.dropped(),
+            ..self.context.totals.read()
+        }
+    }
+
+    pub(super) fn traffic_of(&self, robot: &RobotId) -> Option<Traffic> {
+        self.context.seats.meter(robot).map(|meter| meter.read())
     }
 
     pub(super) fn connected_count(&self) -> usize {

@@ -23,6 +23,7 @@ use super::codec::{DecodeError, Publish, Received, Will, decode, encode, encode_
 use super::entrance::{Guest, Rejection, connack, reject, welcome};
 use super::outgoing::Outgoing;
 use super::takeover::Seat;
+use super::traffic::{Count, Meter, Metered};
 use crate::broker::router::{Heard, Listener, Listening, RouterError};
 use crate::broker::{Inbox, NotStored, RobotMessage};
 
@@ -62,20 +63,26 @@ enum End {
 }
 
 /// Serves one connection to its end. For TLS, `stream` is what the handshake returns.
-pub(super) async fn serve<S>(context: Arc<Context>, mut stream: S, peer: SocketAddr)
+pub(super) async fn serve<S>(context: Arc<Context>, stream: S, peer: SocketAddr)
 where
     S: AsyncRead + AsyncWrite + Send + Unpin,
 {
+    let meter = Arc::new(Meter::default());
+    let mut stream = Metered { stream, meter: meter.clone() };
     let entered = tokio::select! {
-        entered = enter(&context, &mut stream, peer) => entered,
+        entered = enter(&context, &mut stream, peer, &meter) => entered,
         () = context.stop.cancelled() => return,
     };
     match entered {
         Err(rejection) => {
             tracing::debug!(%peer, "MQTT client turned away: {rejection}");
+            context.totals.refuse(Some(&meter));
             reject(&context, &mut stream, rejection).await;
         }
         Ok((guest, seat, listener)) => {
+            if guest.visitor != Visitor::Canary {
+                context.totals.accept(&meter);
+            }
             let end = live(&context, &mut stream, peer, guest, seat, listener).await;
             tracing::debug!(%peer, "MQTT client {end}");
         }
@@ -88,12 +95,13 @@ async fn enter<S>(
     context: &Context,
     stream: &mut S,
     peer: SocketAddr,
+    meter: &Arc<Meter>,
 ) -> Result<(Guest, Seat, Option<Listener>), Rejection>
 where
     S: AsyncRead + AsyncWrite + Unpin,
 {
     let guest = welcome(context, stream, peer).await?;
-    let seat = context.seats.take(guest.seat_name.clone()).await;
+    let seat = context.seats.take(guest.seat_name.clone(), meter.clone()).await;
     let listening = match guest.visitor {
         Visitor::Robot { .. } => return Ok((guest, seat, None)),
         Visitor::Operator => Listening::Everything,
@@ -127,6 +135,8 @@ where
     let (reader, writer) = tokio::io::split(stream);
     let mut output = BytesMut::new();
     connack(ConnectReturnCode::Success, &mut output);
+    seat.meter().add(Count::PacketsIn, 1);
+    seat.meter().add(Count::PacketsOut, 1);
     let now = Instant::now();
     let mut session = Session {
         context,
@@ -329,10 +339,12 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
     }
 
     fn act_on_packet(&mut self, received: Received) -> Result<(), End> {
+        self.count(Count::PacketsIn);
         match received {
             Received::Connect(_) => return Err(End::Violation("sends a second CONNECT")),
             Received::Publish(publish) => self.publish(publish)?,
             Received::PubAck(id) => {
+                self.count(Count::AcksIn);
                 self.outgoing.acknowledged(id);
                 self.progress_at = self.heard_at;
             }
@@ -362,7 +374,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
     }
 
     fn publish(&mut self, publish: Publish) -> Result<(), End> {
+        self.count(Count::MessagesIn);
         let Some(route) = may_publish(&self.visitor, &self.context.prefix, &publish.topic) else {
+            self.context.totals.refuse_message();
             return Err(End::Violation("publishes where it may not"));
         };
         if publish.qos == QoS::ExactlyOnce {
@@ -390,7 +404,10 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
 
     fn acknowledge_stored(&mut self, stored: Result<(), NotStored>) -> Result<(), End> {
         let Some(Storing { publish, .. }) = self.storing.take() else { return Ok(()) };
-        stored.map_err(|NotStored| End::NotStored)?;
+        if let Err(NotStored) = stored {
+            self.context.totals.refuse_message();
+            return Err(End::NotStored);
+        }
         self.acknowledge(&publish);
         self.context.router.publish(&publish.topic, publish.qos, publish.payload);
         self.heard_at = Instant::now();
@@ -401,7 +418,10 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         let pkid = publish.packet_id;
         match publish.qos {
             QoS::AtMostOnce => {}
-            QoS::AtLeastOnce => self.send(Packet::PubAck(PubAck { pkid, reason: PubAckReason::Success }, None)),
+            QoS::AtLeastOnce => {
+                self.count(Count::AcksOut);
+                self.send(Packet::PubAck(PubAck { pkid, reason: PubAckReason::Success }, None));
+            }
             QoS::ExactlyOnce => {
                 self.unreleased.insert(pkid);
                 self.send(Packet::PubRec(PubRec { pkid, reason: PubRecReason::Success }, None));
@@ -452,10 +472,17 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
 
     fn send_message(&mut self, topic: String, payload: Bytes, qos: QoS) {
         let packet_id = self.outgoing.begin(qos);
+        self.count(Count::PacketsOut);
+        self.count(Count::MessagesOut);
         encode_publish(&Publish { topic, qos, packet_id, payload }, &mut self.output);
     }
 
+    fn count(&self, count: Count) {
+        self.seat.meter().add(count, 1);
+    }
+
     fn send(&mut self, packet: Packet) {
+        self.count(Count::PacketsOut);
         encode(packet, &mut self.output);
     }
 

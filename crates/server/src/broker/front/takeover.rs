@@ -8,6 +8,7 @@ use task_proto::RobotId;
 use tokio_util::sync::CancellationToken;
 
 use super::doorbell::Doorbell;
+use super::traffic::Meter;
 
 /// What a session is known by. Robots and operators can't take over each other, whatever client id they give.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -37,6 +38,7 @@ struct Occupant {
     leave: CancellationToken,
     left: CancellationToken,
     doorbell: Arc<Doorbell>,
+    meter: Arc<Meter>,
 }
 
 /// A session's hold on its seat; dropping it says that the session has fully ended.
@@ -49,8 +51,8 @@ pub(super) struct Seat {
 impl Seats {
     /// Asks whoever has the seat to leave, waits until they have, and sits down. Sessions that want the same seat get it
     /// one after another in the order of their arrival; all but the last find that they should leave again.
-    pub(super) async fn take(self: &Arc<Self>, name: SeatName) -> Seat {
-        let (seat, before) = self.claim(name);
+    pub(super) async fn take(self: &Arc<Self>, name: SeatName, meter: Arc<Meter>) -> Seat {
+        let (seat, before) = self.claim(name, meter);
         if let Some(before) = before {
             before.leave.cancel();
             before.left.cancelled().await;
@@ -58,7 +60,7 @@ impl Seats {
         seat
     }
 
-    fn claim(self: &Arc<Self>, name: SeatName) -> (Seat, Option<Arc<Occupant>>) {
+    fn claim(self: &Arc<Self>, name: SeatName, meter: Arc<Meter>) -> (Seat, Option<Arc<Occupant>>) {
         let mut table = self.table();
         table.last_number += 1;
         let occupant = Arc::new(Occupant {
@@ -66,6 +68,7 @@ impl Seats {
             leave: CancellationToken::new(),
             left: CancellationToken::new(),
             doorbell: Arc::new(Doorbell::default()),
+            meter,
         });
         let before = table.occupants.insert(name.clone(), occupant.clone());
         if before.is_none() && matches!(name, SeatName::Robot(_)) {
@@ -77,6 +80,11 @@ impl Seats {
     /// The doorbell of the robot's session.
     pub(super) fn doorbell(&self, robot: &RobotId) -> Option<Arc<Doorbell>> {
         self.table().occupants.get(&SeatName::Robot(robot.clone())).map(|occupant| occupant.doorbell.clone())
+    }
+
+    /// The figures of the robot's session.
+    pub(super) fn meter(&self, robot: &RobotId) -> Option<Arc<Meter>> {
+        self.table().occupants.get(&SeatName::Robot(robot.clone())).map(|occupant| occupant.meter.clone())
     }
 
     /// Asks the robot's session to leave.
@@ -106,6 +114,11 @@ impl Seat {
     /// Ends when the session should leave.
     pub(super) fn leave(&self) -> &CancellationToken {
         &self.occupant.leave
+    }
+
+    /// What counts this session's traffic.
+    pub(super) fn meter(&self) -> &Meter {
+        &self.occupant.meter
     }
 
     /// What rings for this session.

@@ -1,0 +1,53 @@
+//! `taskd server`: what the server is and what went over it.
+
+use clap::Subcommand;
+use task_proto::api::{ServerInfo, Traffic};
+
+use super::output::{bytes, time};
+use super::{CommandError, Outcome, Session};
+
+/// What to do with the server.
+#[derive(Debug, Subcommand)]
+pub enum Action {
+    /// Show its version, its MQTT address and the traffic since it started
+    Info,
+}
+
+pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, CommandError> {
+    match action {
+        Action::Info => {
+            let info: ServerInfo = session.client.get("/server", &[]).await?;
+            session.output.described(&info, describe)?;
+        }
+    }
+    Ok(Outcome::Succeeded)
+}
+
+fn describe(info: &ServerInfo) -> String {
+    let traffic = &info.traffic;
+    let facts = [
+        ("version", info.version.clone()),
+        ("time", time(info.now_ms)),
+        ("mqtt", info.mqtt.clone()),
+        ("robots", format!("{} connected", traffic.robots_connected)),
+        ("connections", format!("{} accepted, {} refused", traffic.connections_accepted, traffic.connections_refused)),
+        ("messages", format!("{} refused, {} dropped", traffic.messages_refused, traffic.messages_dropped)),
+        ("in", inward(&traffic.all)),
+        ("out", outward(&traffic.all)),
+    ];
+    facts.iter().map(|(key, value)| format!("{key:<12}{value}\n")).collect()
+}
+
+/// What came in, in words.
+pub(super) fn inward(traffic: &Traffic) -> String {
+    words(traffic.bytes_in, traffic.packets_in, traffic.messages_in, traffic.acks_in)
+}
+
+/// What went out, in words.
+pub(super) fn outward(traffic: &Traffic) -> String {
+    words(traffic.bytes_out, traffic.packets_out, traffic.messages_out, traffic.acks_out)
+}
+
+fn words(count: u64, packets: u64, messages: u64, acks: u64) -> String {
+    format!("{}, {packets} packets, {messages} messages, {acks} acknowledgements", bytes(count))
+}

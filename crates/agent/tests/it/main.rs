@@ -6,6 +6,8 @@ mod agent;
 mod archive;
 mod build;
 mod fetch;
+mod graph;
 mod harness;
+mod ros;
 mod supervise;
 mod unpack;

@@ -1,0 +1,352 @@
+//! The agent's own ROS 2 node: it says what the graph shows, and performs calls. It decides nothing about tasks.
+//!
+//! This is the only place that names `ros2-client`. Of it the graph uses the message types and the DDS library below it
+//! (RustDDS), not its `Node`, `Spinner` and `Client`: those fix the length of a gid when they are compiled, so one agent
+//! could not serve Humble and newer robots, keep 8 events and lose the rest, never take back an endpoint they announced,
+//! and take whatever a stranger says about its nodes.
+//!
+//! It costs no C library. What it cannot do: see participants that speak neither UDP nor RTPS (Zenoh), or DDS Security.
+
+pub mod entities;
+pub mod names;
+pub mod parameters;
+pub mod rate;
+pub mod snapshot;
+
+mod endpoint;
+mod lifecycle;
+mod observer;
+mod own;
+mod services;
+
+use std::collections::BTreeSet;
+use std::error::Error;
+use std::net::{IpAddr, Ipv4Addr};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use ros2_client::dds::rustdds::{DomainParticipant, DomainParticipantBuilder};
+use task_proto::ros::{GraphName, LifecycleState, Transition};
+use tokio::runtime::Handle;
+use tokio::sync::watch;
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
+
+use self::endpoint::{Cdr, Delivery, Endpoints};
+use self::entities::GidForm;
+use self::names::Role;
+use self::observer::{Matches, Observer};
+use self::own::OwnNode;
+pub use self::parameters::{ParameterValue, SetResult};
+pub use self::rate::{Rate, RateMeter};
+use self::services::Clients;
+pub use self::snapshot::{EndpointId, Node, Participant, ParticipantId, Snapshot};
+
+/// The highest domain id whose ports exist.
+pub const MAX_DOMAIN_ID: u16 = 232;
+/// Of each participant's list of nodes only the last counts; this many wait to be read.
+const DISCOVERY_DEPTH: i32 = 200;
+/// The kernel's buffers for each socket of the participant.
+const SOCKET_BUFFER_BYTES: usize = 1024 * 1024;
+
+/// How the agent takes part in the graph. It reads no environment: whoever opens the graph has.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct GraphSettings {
+    /// `ROS_DOMAIN_ID`, at most [`MAX_DOMAIN_ID`].
+    pub domain_id: u16,
+    /// Whether only this host's nodes are met.
+    pub localhost_only: bool,
+    /// The agent's node. Two agents on one host, or in one domain, need two names.
+    pub node_name: GraphName,
+    /// The distribution of the robot's nodes, which decides the form in which the agent's node is announced; nodes of all
+    /// distributions are understood.
+    pub distro: Option<String>,
+}
+
+/// What can go wrong with the graph.
+#[derive(Debug, thiserror::Error)]
+pub enum GraphError {
+    /// No such domain.
+    #[error("ros_domain_id: {0} is not from 0 to {MAX_DOMAIN_ID}")]
+    DomainId(u16),
+    /// The agent could not take part.
+    #[error("cannot take part in ROS domain {domain_id}")]
+    Join {
+        /// The domain.
+        domain_id: u16,
+        /// Why.
+        source: Box<dyn Error + Send + Sync>,
+    },
+    /// A reader or writer could not be made.
+    #[error("cannot make a reader or writer for {topic}")]
+    Endpoint {
+        /// The DDS topic.
+        topic: String,
+        /// Why.
+        source: Box<dyn Error + Send + Sync>,
+    },
+    /// Not a type's name.
+    #[error("{0:?} is not a type like std_srvs/srv/Trigger")]
+    Kind(String),
+    /// A node's name to which nothing can be added.
+    #[error("{node}/{service} is longer than a ROS name may be")]
+    Name {
+        /// The node.
+        node: GraphName,
+        /// The service.
+        service: &'static str,
+    },
+    /// A message could not be put into bytes.
+    #[error("cannot encode the request")]
+    Encode(#[source] Box<dyn Error + Send + Sync>),
+    /// A message could not be sent.
+    #[error("cannot send the request: {reason}")]
+    Write {
+        /// Why, in the DDS library's words.
+        reason: String,
+    },
+    /// Nobody offers the service.
+    #[error("{service}: no server within {within:?}")]
+    NoServer {
+        /// The service.
+        service: GraphName,
+        /// How long was waited.
+        within: Duration,
+    },
+    /// There is a server, but no answer.
+    #[error("{service}: no answer within {within:?}")]
+    NoAnswer {
+        /// The service.
+        service: GraphName,
+        /// How long was waited.
+        within: Duration,
+    },
+    /// An answer that is none.
+    #[error("{service}: the answer is not of the service's type")]
+    Malformed {
+        /// The service.
+        service: GraphName,
+    },
+    /// Beyond a limit.
+    #[error("{node}: {found} {what} are too many")]
+    TooMany {
+        /// Of what.
+        what: &'static str,
+        /// The node.
+        node: GraphName,
+        /// How many.
+        found: usize,
+    },
+    /// The graph was closed, or the DDS library has ended.
+    #[error("the graph is closed")]
+    Closed,
+}
+
+impl GraphError {
+    fn endpoint(topic: impl Into<String>, source: impl Error + Send + Sync + 'static) -> Self {
+        Self::Endpoint { topic: topic.into(), source: Box::new(source) }
+    }
+}
+
+/// A handle on the graph; when the last one is dropped the agent's node leaves.
+#[derive(Clone)]
+pub struct Graph {
+    shared: Arc<Shared>,
+}
+
+struct Shared {
+    snapshot: watch::Receiver<Arc<Snapshot>>,
+    clients: Clients,
+    endpoints: Arc<Endpoints>,
+    tasks: Tasks,
+}
+
+/// What runs for the graph. It ends when this is dropped.
+struct Tasks {
+    closing: CancellationToken,
+    tracker: TaskTracker,
+    /// Taken when it is dropped, for that blocks until the library's threads have ended.
+    participant: Option<DomainParticipant>,
+}
+
+impl Graph {
+    /// Takes part in the domain.
+    pub async fn open(settings: &GraphSettings) -> Result<Self, GraphError> {
+        if settings.domain_id > MAX_DOMAIN_ID {
+            return Err(GraphError::DomainId(settings.domain_id));
+        }
+        let settings = settings.clone();
+        let opened = tokio::task::spawn_blocking(move || Self::join(&settings)).await;
+        opened.unwrap_or(Err(GraphError::Closed))
+    }
+
+    /// Opens sockets and starts the library's threads; it must run inside the runtime, on a thread that may block.
+    fn join(settings: &GraphSettings) -> Result<Self, GraphError> {
+        let domain_id = settings.domain_id;
+        let mut builder = DomainParticipantBuilder::new(domain_id)
+            .socket_receive_buffer_size(SOCKET_BUFFER_BYTES)
+            .socket_send_buffer_size(SOCKET_BUFFER_BYTES);
+        if settings.localhost_only {
+            builder = builder.with_only_networks([IpAddr::V4(Ipv4Addr::LOCALHOST)]);
+        }
+        let participant = builder.build().map_err(|source| GraphError::Join { domain_id, source: Box::new(source) })?;
+        let tasks = Tasks {
+            closing: CancellationToken::new(),
+            tracker: TaskTracker::new(),
+            participant: Some(participant.clone()),
+        };
+        let endpoints = Arc::new(Endpoints::of(&participant)?);
+        let lasting = |depth| Delivery::Lasting { depth };
+        let announcer = endpoints.writer(names::DISCOVERY_TOPIC, names::DISCOVERY_TYPE, lasting(1))?;
+        let discovery =
+            endpoints.reader::<Cdr>(names::DISCOVERY_TOPIC, names::DISCOVERY_TYPE, lasting(DISCOVERY_DEPTH))?;
+        let form = GidForm::of_distro(settings.distro.as_deref());
+        let own = Arc::new(OwnNode::new(settings.node_name.clone(), form, announcer));
+        own.add(&[], &[]);
+        let (snapshots, snapshot) = watch::channel(Arc::new(Snapshot::empty(Instant::now())));
+        let (matches, _) = watch::channel(Matches::default());
+        let observer = Observer::new(participant, snapshots, matches.clone());
+        tasks.tracker.spawn(observer.run(discovery, tasks.closing.clone()));
+        let clients = Clients::new(endpoints.clone(), own, matches);
+        Ok(Self { shared: Arc::new(Shared { snapshot, clients, endpoints, tasks }) })
+    }
+
+    /// What the graph shows. [`Snapshot::at`] is at most a few seconds ago while the graph is open.
+    pub fn snapshot(&self) -> Arc<Snapshot> {
+        self.shared.snapshot.borrow().clone()
+    }
+
+    /// Wakes when the graph shows something else, many changes at once as one. It ends when the graph is closed.
+    pub fn changes(&self) -> watch::Receiver<Arc<Snapshot>> {
+        self.shared.snapshot.clone()
+    }
+
+    /// Makes what [`Self::lifecycle_state`], [`Self::change_state`] and the parameter calls need for this node. A node that
+    /// starts later finds it there, and answers the sooner.
+    pub async fn prepare(&self, node: &GraphName) -> Result<(), GraphError> {
+        lifecycle::prepare(&self.shared.clients, node).await?;
+        parameters::prepare(&self.shared.clients, node).await
+    }
+
+    /// Waits until a server of this service would hear a request, and its answer would be heard; says which participants
+    /// have one. Without `kind` the service's type is taken from what the graph shows.
+    pub async fn service_answers(
+        &self,
+        service: &GraphName,
+        kind: Option<&str>,
+        within: Duration,
+    ) -> Result<BTreeSet<ParticipantId>, GraphError> {
+        let deadline = tokio::time::Instant::now() + within;
+        let kind = match kind {
+            Some(kind) => kind.to_owned(),
+            None => self.kind_of(service, deadline, within).await?,
+        };
+        let left = deadline.saturating_duration_since(tokio::time::Instant::now());
+        let answered = self.shared.clients.servers(service, &kind, left).await;
+        answered.map_err(|error| match error {
+            GraphError::NoServer { service, .. } => GraphError::NoServer { service, within },
+            other => other,
+        })
+    }
+
+    async fn kind_of(
+        &self,
+        service: &GraphName,
+        deadline: tokio::time::Instant,
+        within: Duration,
+    ) -> Result<String, GraphError> {
+        let kind = |snapshot: &Snapshot| -> Option<String> {
+            let node = snapshot.servers_of(service).next()?;
+            node.services.iter().find(|offered| offered.name == *service).map(|offered| offered.kind.clone())
+        };
+        let mut changes = self.changes();
+        let found = tokio::time::timeout_at(deadline, changes.wait_for(|snapshot| kind(snapshot).is_some()));
+        match found.await {
+            Ok(Ok(snapshot)) => kind(&snapshot).ok_or(GraphError::Closed),
+            Ok(Err(_closed)) => Err(GraphError::Closed),
+            Err(_) => Err(GraphError::NoServer { service: service.clone(), within }),
+        }
+    }
+
+    /// The state this lifecycle node is in.
+    pub async fn lifecycle_state(&self, node: &GraphName, within: Duration) -> Result<LifecycleState, GraphError> {
+        lifecycle::state(&self.shared.clients, node, within).await
+    }
+
+    /// Asks this lifecycle node for a transition, once; says whether it made it. After [`GraphError::NoAnswer`] it may
+    /// have: ask for its state.
+    pub async fn change_state(
+        &self,
+        node: &GraphName,
+        transition: Transition,
+        within: Duration,
+    ) -> Result<bool, GraphError> {
+        lifecycle::change(&self.shared.clients, node, transition, within).await
+    }
+
+    /// All parameters of this node. `within` is for each of the calls that takes.
+    pub async fn parameters(
+        &self,
+        node: &GraphName,
+        within: Duration,
+    ) -> Result<Vec<(String, ParameterValue)>, GraphError> {
+        let names = parameters::list(&self.shared.clients, node, within).await?;
+        let values = parameters::get(&self.shared.clients, node, &names, within).await?;
+        Ok(names.into_iter().zip(values).collect())
+    }
+
+    /// One parameter of this node; [`ParameterValue::NotSet`] where it has none of that name.
+    pub async fn parameter(
+        &self,
+        node: &GraphName,
+        name: &str,
+        within: Duration,
+    ) -> Result<ParameterValue, GraphError> {
+        let values = parameters::get(&self.shared.clients, node, &[name.to_owned()], within).await?;
+        Ok(values.into_iter().next().unwrap_or(ParameterValue::NotSet))
+    }
+
+    /// Sets these parameters, each for itself; says what became of each, in their order.
+    pub async fn set_parameters(
+        &self,
+        node: &GraphName,
+        parameters: Vec<(String, ParameterValue)>,
+        within: Duration,
+    ) -> Result<Vec<SetResult>, GraphError> {
+        parameters::set(&self.shared.clients, node, parameters, within).await
+    }
+
+    /// Counts the messages of this topic, whose type is `kind`, whatever its publishers' settings are.
+    pub fn rate(&self, topic: &GraphName, kind: &str) -> Result<RateMeter, GraphError> {
+        let dds_kind = names::type_to_dds(Role::Topic, kind).ok_or_else(|| GraphError::Kind(kind.to_owned()))?;
+        let topic = names::to_dds(Role::Topic, topic);
+        let reader = self.shared.endpoints.reader(&topic, &dds_kind, Delivery::BestEffort)?;
+        let (meter, counting) = RateMeter::new(reader, &self.shared.tasks.closing);
+        self.shared.tasks.tracker.spawn(counting);
+        Ok(meter)
+    }
+
+    /// Leaves the graph. Other handles see nothing any more.
+    pub async fn close(self) {
+        self.shared.tasks.closing.cancel();
+        self.shared.tasks.tracker.close();
+        self.shared.tasks.tracker.wait().await;
+        // If this was the last handle the rest goes here, where it may block.
+        let _ = tokio::task::spawn_blocking(move || drop(self)).await;
+    }
+}
+
+impl Drop for Tasks {
+    fn drop(&mut self) {
+        self.closing.cancel();
+        let participant = self.participant.take();
+        if let Ok(runtime) = Handle::try_current() {
+            runtime.spawn_blocking(move || drop(participant));
+        }
+    }
+}
+
+/// The name of a node's own service.
+fn service_of(node: &GraphName, service: &'static str) -> Result<GraphName, GraphError> {
+    format!("{node}/{service}").parse().map_err(|_| GraphError::Name { node: node.clone(), service })
+}

@@ -1,0 +1,296 @@
+//! Readers and writers of DDS topics, whose messages are CDR bytes: this is where the graph meets the DDS library. What
+//! the bytes mean is for others.
+
+use std::convert::Infallible;
+
+use futures_util::{Stream, StreamExt};
+use ros2_client::dds::rustdds::bytes::Bytes;
+use ros2_client::dds::rustdds::no_key::{
+    DataWriter, Decode, DefaultDecoder, DeserializedCacheChange, DeserializerAdapter, SerializerAdapter,
+    SimpleDataReader,
+};
+use ros2_client::dds::rustdds::policy::{Deadline, Durability, History, Lifespan, Ownership};
+use ros2_client::dds::rustdds::serialization::{deserialize_from_cdr_with_rep_id, to_writer_with_rep_id};
+use ros2_client::dds::rustdds::{
+    DomainParticipant, Duration, GUID, Publisher, QosPolicies, QosPolicyBuilder, RTPSEntity, RepresentationIdentifier,
+    Subscriber, TopicKind, WriteOptionsBuilder, rpc::SampleIdentity,
+};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use super::{EndpointId, GraphError};
+
+/// The most bytes of one message that are read; a longer one is dropped.
+pub const MAX_MESSAGE_BYTES: usize = 1024 * 1024;
+/// How long a writer may wait for room.
+const WRITE_WAIT: Duration = Duration::from_millis(100);
+
+/// How messages are kept and passed on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Delivery {
+    /// All arrive, those from before only if somebody kept them: services.
+    Reliable {
+        /// How many are kept.
+        depth: i32,
+    },
+    /// All arrive, the last ones from before as well: the graph, `/rosout`.
+    Lasting {
+        /// How many are kept.
+        depth: i32,
+    },
+    /// What arrives, arrives; understood by every publisher.
+    BestEffort,
+}
+
+/// A CDR message without its header.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Cdr {
+    encoding: RepresentationIdentifier,
+    /// The body.
+    pub body: Bytes,
+}
+
+/// A message with where it came from.
+#[derive(Debug)]
+pub struct Sample<M> {
+    /// The message.
+    pub message: M,
+    /// Its writer.
+    pub writer: EndpointId,
+    /// For an answer: the request it belongs to.
+    pub answers: Option<SampleIdentity>,
+}
+
+/// Reads `M` from one topic.
+pub struct Reader<M: Received> {
+    reader: SimpleDataReader<M, Adapter>,
+}
+
+/// Writes to one topic.
+pub struct Writer {
+    writer: DataWriter<Cdr, Adapter>,
+}
+
+/// Makes the readers and writers of one participant.
+pub struct Endpoints {
+    participant: DomainParticipant,
+    publisher: Publisher,
+    subscriber: Subscriber,
+}
+
+impl Delivery {
+    fn qos(self) -> QosPolicies {
+        let builder = QosPolicyBuilder::new()
+            .ownership(Ownership::Shared)
+            .deadline(Deadline(Duration::INFINITE))
+            .lifespan(Lifespan { duration: Duration::INFINITE });
+        let builder = match self {
+            Self::Reliable { depth } => {
+                builder.durability(Durability::Volatile).reliable(WRITE_WAIT).history(History::KeepLast { depth })
+            }
+            Self::Lasting { depth } => {
+                builder.durability(Durability::TransientLocal).reliable(WRITE_WAIT).history(History::KeepLast { depth })
+            }
+            Self::BestEffort => {
+                builder.durability(Durability::Volatile).best_effort().history(History::KeepLast { depth: 1 })
+            }
+        };
+        builder.build()
+    }
+}
+
+impl Cdr {
+    /// `value` in little-endian CDR, after `header`, which must end where eight-byte values may begin.
+    pub fn of(header: &[u8], value: &impl Serialize) -> Result<Self, GraphError> {
+        let mut body = header.to_vec();
+        let mut message = Vec::new();
+        to_writer_with_rep_id(&mut message, value, RepresentationIdentifier::CDR_LE)
+            .map_err(|source| GraphError::Encode(source.into()))?;
+        body.append(&mut message);
+        Ok(Self::little_endian(body))
+    }
+
+    /// A body that is little-endian already.
+    pub fn little_endian(body: Vec<u8>) -> Self {
+        Self { encoding: RepresentationIdentifier::CDR_LE, body: body.into() }
+    }
+
+    /// Whether the bytes are little-endian.
+    pub fn is_little_endian(&self) -> bool {
+        self.encoding == RepresentationIdentifier::CDR_LE
+    }
+
+    /// The value that is `skipped` bytes into the body; `None`: there is none.
+    pub fn value<T: DeserializeOwned>(&self, skipped: usize) -> Option<T> {
+        let bytes = self.body.get(skipped..)?;
+        deserialize_from_cdr_with_rep_id(bytes, self.encoding).ok().map(|(value, _read)| value)
+    }
+}
+
+impl Endpoints {
+    /// For this participant.
+    pub fn of(participant: &DomainParticipant) -> Result<Self, GraphError> {
+        let failed = |source| GraphError::endpoint("the participant's groups", source);
+        Ok(Self {
+            participant: participant.clone(),
+            publisher: participant.create_publisher(&QosPolicies::qos_none()).map_err(failed)?,
+            subscriber: participant.create_subscriber(&QosPolicies::qos_none()).map_err(failed)?,
+        })
+    }
+
+    /// A reader of the DDS topic `topic` with the DDS type `kind`.
+    pub fn reader<M: Received>(&self, topic: &str, kind: &str, delivery: Delivery) -> Result<Reader<M>, GraphError> {
+        let failed = |source| GraphError::endpoint(topic, source);
+        let qos = delivery.qos();
+        let dds = self.participant.create_topic(topic.into(), kind.into(), &qos, TopicKind::NoKey).map_err(failed)?;
+        let reader = self.subscriber.create_simple_datareader_no_key(&dds, Some(qos)).map_err(failed)?;
+        Ok(Reader { reader })
+    }
+
+    /// A writer to the DDS topic `topic` with the DDS type `kind`.
+    pub fn writer(&self, topic: &str, kind: &str, delivery: Delivery) -> Result<Writer, GraphError> {
+        let failed = |source| GraphError::endpoint(topic, source);
+        let qos = delivery.qos();
+        let dds = self.participant.create_topic(topic.into(), kind.into(), &qos, TopicKind::NoKey).map_err(failed)?;
+        let writer = self.publisher.create_datawriter_no_key(&dds, Some(qos)).map_err(failed)?;
+        Ok(Writer { writer })
+    }
+}
+
+impl<M: Received> Reader<M> {
+    /// Its id.
+    pub fn id(&self) -> EndpointId {
+        EndpointId::of(self.reader.guid())
+    }
+
+    /// What arrives. Messages that cannot be read are left out; it never ends. Dropping it between two messages loses none.
+    pub fn samples(&self) -> impl Stream<Item = Sample<M>> + Send + '_ {
+        self.reader.as_async_stream().filter_map(|read| std::future::ready(read.ok().map(Sample::of)))
+    }
+}
+
+impl<M> Sample<M> {
+    fn of(change: DeserializedCacheChange<M>) -> Self {
+        let (writer, answers) = (EndpointId::of(change.writer_guid()), change.related_sample_identity());
+        Self { message: change.into_value(), writer, answers }
+    }
+}
+
+impl Writer {
+    /// Its id.
+    pub fn id(&self) -> EndpointId {
+        EndpointId::of(self.writer.guid())
+    }
+
+    /// Its id as the DDS library has it.
+    pub fn guid(&self) -> GUID {
+        self.writer.guid()
+    }
+
+    /// Sends one message; `related` says what it belongs to, where that is asked for.
+    pub async fn write(&self, message: Cdr, related: Option<SampleIdentity>) -> Result<SampleIdentity, GraphError> {
+        let options = WriteOptionsBuilder::new().related_sample_identity_opt(related).build();
+        self.writer
+            .async_write_with_options(message, options)
+            .await
+            .map_err(|error| GraphError::Write { reason: format!("{error:?}") })
+    }
+
+    /// Sends one message without waiting; for writers that keep only the last.
+    pub fn put(&self, message: Cdr) {
+        if let Err(error) = self.writer.write(message, None) {
+            tracing::warn!(?error, "the graph was not told about this node");
+        }
+    }
+}
+
+/// What a reader makes of a message's bytes.
+pub trait Received: Send + Sized + 'static {
+    /// The encodings it takes; messages in others are left out.
+    const ENCODINGS: &'static [RepresentationIdentifier];
+
+    /// The message.
+    fn from_body(encoding: RepresentationIdentifier, body: &[u8]) -> Self;
+}
+
+impl Received for Cdr {
+    const ENCODINGS: &'static [RepresentationIdentifier] =
+        &[RepresentationIdentifier::CDR_LE, RepresentationIdentifier::CDR_BE];
+
+    fn from_body(encoding: RepresentationIdentifier, body: &[u8]) -> Self {
+        // An empty body is no message of any type that is read here.
+        let body = if body.len() <= MAX_MESSAGE_BYTES { Bytes::copy_from_slice(body) } else { Bytes::new() };
+        Self { encoding, body }
+    }
+}
+
+/// A message of which only the length is kept: it is counted, not read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Counted {
+    /// Bytes of its body.
+    pub bytes: usize,
+}
+
+impl Received for Counted {
+    const ENCODINGS: &'static [RepresentationIdentifier] = &[
+        RepresentationIdentifier::CDR_LE,
+        RepresentationIdentifier::CDR_BE,
+        RepresentationIdentifier::PL_CDR_LE,
+        RepresentationIdentifier::PL_CDR_BE,
+        RepresentationIdentifier::CDR2_LE,
+        RepresentationIdentifier::CDR2_BE,
+        RepresentationIdentifier::D_CDR_LE,
+        RepresentationIdentifier::D_CDR_BE,
+        RepresentationIdentifier::XCDR2_LE,
+        RepresentationIdentifier::XCDR2_BE,
+    ];
+
+    fn from_body(_encoding: RepresentationIdentifier, body: &[u8]) -> Self {
+        Self { bytes: body.len() }
+    }
+}
+
+/// Passes bytes through where the library expects a codec.
+pub struct Adapter;
+
+/// See [`Adapter`].
+#[derive(Clone)]
+pub struct PassThrough;
+
+impl<M: Received> DeserializerAdapter<M> for Adapter {
+    type Error = Infallible;
+    type Decoded = M;
+
+    fn supported_encodings() -> &'static [RepresentationIdentifier] {
+        M::ENCODINGS
+    }
+
+    fn transform_decoded(decoded: M) -> M {
+        decoded
+    }
+}
+
+impl<M: Received> DefaultDecoder<M> for Adapter {
+    type Decoder = PassThrough;
+    const DECODER: PassThrough = PassThrough;
+}
+
+impl<M: Received> Decode<'_, M> for PassThrough {
+    type Error = Infallible;
+
+    fn decode_bytes(self, body: &[u8], encoding: RepresentationIdentifier) -> Result<M, Infallible> {
+        Ok(M::from_body(encoding, body))
+    }
+}
+
+impl SerializerAdapter<Cdr> for Adapter {
+    type Error = Infallible;
+
+    fn output_encoding() -> RepresentationIdentifier {
+        RepresentationIdentifier::CDR_LE
+    }
+
+    fn to_bytes(value: &Cdr) -> Result<Bytes, Infallible> {
+        Ok(value.body.clone())
+    }
+}

@@ -1,0 +1,200 @@
+//! `rmw_dds_common/msg/ParticipantEntitiesInfo`, by which each participant says which nodes it holds and which readers
+//! and writers belong to them. Its form changed: a gid is 24 bytes up to Humble and 16 from Iron on, and nothing in the
+//! message says which; only one of the two adds up. Bytes come from strangers: every count and length has a limit, and
+//! what does not add up is refused whole.
+
+use task_proto::ros::GraphName;
+
+use super::{EndpointId, ParticipantId};
+
+/// The most nodes of one participant.
+pub const MAX_NODES: usize = 256;
+/// The most readers, and the most writers, of one node.
+pub const MAX_ENDPOINTS: usize = 2048;
+/// The most bytes a message may have.
+pub const MAX_BYTES: usize = 1024 * 1024;
+/// The longest namespace and the longest name, in bytes.
+const MAX_NAME_BYTES: usize = 256;
+
+/// The two lengths a gid can have.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum GidForm {
+    /// Up to Humble: the 16 bytes of a DDS GUID and 8 zeros.
+    Bytes24,
+    /// From Iron on.
+    Bytes16,
+}
+
+/// What a participant says about itself.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ParticipantEntities {
+    /// The participant it is about.
+    pub participant: ParticipantId,
+    /// Its nodes.
+    pub nodes: Vec<NodeEntities>,
+    /// Nodes with a name that ROS does not allow, which were left out.
+    pub misnamed: usize,
+}
+
+/// One node of a participant.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct NodeEntities {
+    /// Its full name.
+    pub name: GraphName,
+    /// Its readers.
+    pub readers: Vec<EndpointId>,
+    /// Its writers.
+    pub writers: Vec<EndpointId>,
+}
+
+/// A message that is none.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum EntitiesError {
+    /// Too long to be looked at.
+    #[error("{0} bytes, the limit is {MAX_BYTES}")]
+    TooLong(usize),
+    /// With neither length of gid does the message add up.
+    #[error("not a ParticipantEntitiesInfo with gids of 16 or 24 bytes, or one beyond the limits")]
+    Malformed,
+}
+
+impl GidForm {
+    /// The form that nodes of this distribution speak; an unknown one is taken for a new one.
+    pub fn of_distro(distro: Option<&str>) -> Self {
+        match distro {
+            Some("dashing" | "eloquent" | "foxy" | "galactic" | "humble") => Self::Bytes24,
+            _ => Self::Bytes16,
+        }
+    }
+
+    fn bytes(self) -> usize {
+        match self {
+            Self::Bytes24 => 24,
+            Self::Bytes16 => 16,
+        }
+    }
+}
+
+impl ParticipantEntities {
+    /// Reads the CDR body (without its 4-byte header), whichever form it has.
+    pub fn decode(body: &[u8], little_endian: bool) -> Result<(Self, GidForm), EntitiesError> {
+        if body.len() > MAX_BYTES {
+            return Err(EntitiesError::TooLong(body.len()));
+        }
+        [GidForm::Bytes16, GidForm::Bytes24]
+            .into_iter()
+            .find_map(|form| Reader { body, at: 0, little_endian, form }.message().map(|read| (read, form)))
+            .ok_or(EntitiesError::Malformed)
+    }
+
+    /// The little-endian CDR body in this form.
+    pub fn encode(&self, form: GidForm) -> Vec<u8> {
+        let mut writer = Writer { body: Vec::new(), form };
+        writer.gid(&self.participant.of_participant());
+        writer.count(self.nodes.len());
+        for node in &self.nodes {
+            let (namespace, name) = node.name.as_str().rsplit_once('/').unwrap_or(("", node.name.as_str()));
+            writer.text(if namespace.is_empty() { "/" } else { namespace });
+            writer.text(name);
+            for endpoints in [&node.readers, &node.writers] {
+                writer.count(endpoints.len());
+                endpoints.iter().for_each(|endpoint| writer.gid(endpoint));
+            }
+        }
+        writer.body
+    }
+}
+
+struct Reader<'a> {
+    body: &'a [u8],
+    at: usize,
+    little_endian: bool,
+    form: GidForm,
+}
+
+impl Reader<'_> {
+    /// The whole message; `None` also if bytes are left over, for that is how the other form shows.
+    fn message(mut self) -> Option<ParticipantEntities> {
+        let participant = self.gid()?.participant();
+        let mut misnamed = 0;
+        let mut nodes = Vec::new();
+        for _ in 0..self.count(MAX_NODES)? {
+            let namespace = self.text()?;
+            let name = self.text()?;
+            let (readers, writers) = (self.gids(participant)?, self.gids(participant)?);
+            match format!("{}/{name}", namespace.trim_end_matches('/')).parse() {
+                Ok(name) => nodes.push(NodeEntities { name, readers, writers }),
+                Err(_) => misnamed += 1,
+            }
+        }
+        // Up to three bytes of padding are allowed at the end.
+        let rest = self.body.get(self.at..)?;
+        (rest.len() < 4 && rest.iter().all(|byte| *byte == 0)).then_some(ParticipantEntities {
+            participant,
+            nodes,
+            misnamed,
+        })
+    }
+
+    fn take(&mut self, length: usize) -> Option<&[u8]> {
+        let bytes = self.body.get(self.at..self.at.checked_add(length)?)?;
+        self.at += length;
+        Some(bytes)
+    }
+
+    fn number(&mut self) -> Option<usize> {
+        self.at = self.at.next_multiple_of(4);
+        let little_endian = self.little_endian;
+        let bytes = self.take(4)?.try_into().ok()?;
+        let number = if little_endian { u32::from_le_bytes(bytes) } else { u32::from_be_bytes(bytes) };
+        usize::try_from(number).ok()
+    }
+
+    fn count(&mut self, most: usize) -> Option<usize> {
+        self.number().filter(|count| *count <= most)
+    }
+
+    /// A text: its length with the closing zero, then its bytes.
+    fn text(&mut self) -> Option<String> {
+        let length = self.count(MAX_NAME_BYTES + 1)?;
+        let (last, text) = self.take(length)?.split_last()?;
+        (*last == 0).then_some(())?;
+        String::from_utf8(text.to_vec()).ok()
+    }
+
+    fn gid(&mut self) -> Option<EndpointId> {
+        let length = self.form.bytes();
+        let (id, filling) = self.take(length)?.split_at(16);
+        filling.iter().all(|byte| *byte == 0).then_some(())?;
+        Some(EndpointId(id.try_into().ok()?))
+    }
+
+    /// Gids, all of this participant: nobody speaks for another, and a wrong form does not get past this.
+    fn gids(&mut self, of: ParticipantId) -> Option<Vec<EndpointId>> {
+        let count = self.count(MAX_ENDPOINTS)?;
+        (0..count).map(|_| self.gid().filter(|gid| gid.participant() == of)).collect()
+    }
+}
+
+struct Writer {
+    body: Vec<u8>,
+    form: GidForm,
+}
+
+impl Writer {
+    fn count(&mut self, count: usize) {
+        self.body.resize(self.body.len().next_multiple_of(4), 0);
+        self.body.extend(u32::try_from(count).unwrap_or(u32::MAX).to_le_bytes());
+    }
+
+    fn text(&mut self, text: &str) {
+        self.count(text.len() + 1);
+        self.body.extend(text.as_bytes());
+        self.body.push(0);
+    }
+
+    fn gid(&mut self, gid: &EndpointId) {
+        self.body.extend(gid.0);
+        self.body.resize(self.body.len() + self.form.bytes() - 16, 0);
+    }
+}

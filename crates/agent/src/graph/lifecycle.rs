@@ -1,0 +1,88 @@
+//! Managed nodes: their state and their transitions, by the services every lifecycle node has.
+
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+use task_proto::ros::{GraphName, LifecycleState, Transition};
+
+use super::services::{Clients, Repeat};
+use super::{GraphError, service_of};
+
+const GET_STATE: (&str, &str) = ("get_state", "lifecycle_msgs/srv/GetState");
+const CHANGE_STATE: (&str, &str) = ("change_state", "lifecycle_msgs/srv/ChangeState");
+
+/// A request without fields: DDS has no empty messages, so ROS sends one byte.
+#[derive(Serialize)]
+struct Nothing {
+    filler: u8,
+}
+
+#[derive(Deserialize)]
+struct State {
+    id: u8,
+    #[expect(dead_code, reason = "the id says the same")]
+    label: String,
+}
+
+#[derive(Serialize)]
+struct Change {
+    id: u8,
+    label: &'static str,
+}
+
+#[derive(Deserialize)]
+struct Changed {
+    success: bool,
+}
+
+/// Makes the clients for this node, before it is there.
+pub(super) async fn prepare(clients: &Clients, node: &GraphName) -> Result<(), GraphError> {
+    for (name, kind) in [GET_STATE, CHANGE_STATE] {
+        clients.prepare(&service_of(node, name)?, kind).await?;
+    }
+    Ok(())
+}
+
+/// The state the node is in.
+pub(super) async fn state(clients: &Clients, node: &GraphName, within: Duration) -> Result<LifecycleState, GraphError> {
+    let service = service_of(node, GET_STATE.0)?;
+    let state: State =
+        clients.call(&service, GET_STATE.1, &Nothing { filler: 0 }, within, Repeat::WhileThereIsTime).await?;
+    Ok(of_id(state.id))
+}
+
+/// Asks for the transition; says whether the node made it.
+pub(super) async fn change(
+    clients: &Clients,
+    node: &GraphName,
+    transition: Transition,
+    within: Duration,
+) -> Result<bool, GraphError> {
+    let service = service_of(node, CHANGE_STATE.0)?;
+    let changed: Changed =
+        clients.call(&service, CHANGE_STATE.1, &request_of(transition), within, Repeat::Never).await?;
+    Ok(changed.success)
+}
+
+/// The numbers are those of `lifecycle_msgs/msg/State`.
+fn of_id(id: u8) -> LifecycleState {
+    match id {
+        1 => LifecycleState::Unconfigured,
+        2 => LifecycleState::Inactive,
+        3 => LifecycleState::Active,
+        4 => LifecycleState::Finalized,
+        _ => LifecycleState::Changing,
+    }
+}
+
+/// The numbers are those of `lifecycle_msgs/msg/Transition`. Shutdown has another number in every state, but one label,
+/// which nodes look at first.
+fn request_of(transition: Transition) -> Change {
+    match transition {
+        Transition::Configure => Change { id: 1, label: "" },
+        Transition::Cleanup => Change { id: 2, label: "" },
+        Transition::Activate => Change { id: 3, label: "" },
+        Transition::Deactivate => Change { id: 4, label: "" },
+        Transition::Shutdown => Change { id: 0, label: "shutdown" },
+    }
+}

@@ -1,0 +1,114 @@
+//! How ROS writes its names in DDS: `/chatter` is the DDS topic `rt/chatter`, a service is the pair `rq/…Request` and
+//! `rr/…Reply`, `std_msgs/msg/String` is the DDS type `std_msgs::msg::dds_::String_`. Both ways, and nothing else.
+
+use task_proto::ros::GraphName;
+
+/// What a DDS topic is to ROS.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Role {
+    /// A topic.
+    Topic,
+    /// The way of a service's requests.
+    Request,
+    /// The way of a service's answers.
+    Reply,
+}
+
+/// The DDS topic that carries every participant's nodes. It has no prefix.
+pub const DISCOVERY_TOPIC: &str = "ros_discovery_info";
+/// Its type.
+pub const DISCOVERY_TYPE: &str = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_";
+
+/// What the DDS topic `dds` is; `None`: not ROS's, or with a name that ROS does not allow.
+pub fn from_dds(dds: &str) -> Option<(Role, GraphName)> {
+    let (prefix, rest) = dds.split_once('/')?;
+    let (role, name) = match prefix {
+        "rt" => (Role::Topic, rest),
+        "rq" => (Role::Request, rest.strip_suffix("Request")?),
+        "rr" => (Role::Reply, rest.strip_suffix("Reply")?),
+        _ => return None,
+    };
+    Some((role, format!("/{name}").parse().ok()?))
+}
+
+/// The DDS topic of `name` in this role.
+pub fn to_dds(role: Role, name: &GraphName) -> String {
+    match role {
+        Role::Topic => format!("rt{name}"),
+        Role::Request => format!("rq{name}Request"),
+        Role::Reply => format!("rr{name}Reply"),
+    }
+}
+
+/// The ROS type, `package/msg/Type`, that a DDS type stands for in this role.
+pub fn type_from_dds(role: Role, dds: &str) -> Option<String> {
+    let (path, name) = dds.split_once("::dds_::")?;
+    let (package, kind) = path.split_once("::")?;
+    let name = name.strip_suffix('_')?;
+    let name = match role {
+        Role::Topic => name,
+        Role::Request => name.strip_suffix("_Request")?,
+        Role::Reply => name.strip_suffix("_Response")?,
+    };
+    let word = |text: &str| !text.is_empty() && text.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'_');
+    (word(package) && word(kind) && word(name)).then(|| format!("{package}/{kind}/{name}"))
+}
+
+/// The DDS type of the ROS type `package/msg/Type` in this role.
+pub fn type_to_dds(role: Role, ros: &str) -> Option<String> {
+    let mut parts = ros.split('/');
+    let (package, kind, name) = (parts.next()?, parts.next()?, parts.next()?);
+    if parts.next().is_some() {
+        return None;
+    }
+    let suffix = match role {
+        Role::Topic => "",
+        Role::Request => "_Request",
+        Role::Reply => "_Response",
+    };
+    let dds = format!("{package}::{kind}::dds_::{name}{suffix}_");
+    // Only what reads back as the same is a type.
+    (type_from_dds(role, &dds).as_deref() == Some(ros)).then_some(dds)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_and_types_go_both_ways() {
+        for (role, dds, ros) in [
+            (Role::Topic, "rt/chatter", "/chatter"),
+            (Role::Request, "rq/robot/talker/get_stateRequest", "/robot/talker/get_state"),
+            (Role::Reply, "rr/robot/talker/get_stateReply", "/robot/talker/get_state"),
+        ] {
+            let (found, name) = from_dds(dds).expect(dds);
+            assert_eq!((found, name.as_str()), (role, ros));
+            assert_eq!(to_dds(role, &name), dds);
+        }
+        for (role, dds, ros) in [
+            (Role::Topic, "std_msgs::msg::dds_::String_", "std_msgs/msg/String"),
+            (Role::Request, "std_srvs::srv::dds_::Trigger_Request_", "std_srvs/srv/Trigger"),
+            (Role::Reply, "std_srvs::srv::dds_::Trigger_Response_", "std_srvs/srv/Trigger"),
+        ] {
+            assert_eq!(type_from_dds(role, dds).as_deref(), Some(ros));
+            assert_eq!(type_to_dds(role, ros).as_deref(), Some(dds));
+        }
+    }
+
+    #[test]
+    fn what_is_not_ros_is_left_alone() {
+        for dds in
+            ["ros_discovery_info", "DCPSParticipant", "rq/noEnd", "rt/", "rt/a b", "rt//x", "xx/chatter", "rt/\u{e9}"]
+        {
+            assert_eq!(from_dds(dds), None, "{dds:?}");
+        }
+        for dds in ["String", "std_msgs::msg::String_", "::msg::dds_::String_", "a::msg::dds_::B C_", "a::msg::dds_::B"]
+        {
+            assert_eq!(type_from_dds(Role::Topic, dds), None, "{dds:?}");
+        }
+        for ros in ["std_msgs/String", "std_msgs/msg/String/more", "std_msgs/msg/", "a/msg/B C"] {
+            assert_eq!(type_to_dds(Role::Topic, ros), None, "{ros:?}");
+        }
+    }
+}

@@ -1,0 +1,220 @@
+//! Calls to services. A request before both sides have found each other is lost without a word, so a call waits for that
+//! first; no call waits without a limit; and only what may be done twice is asked again.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::pin::pin;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicI64, Ordering};
+use std::time::Duration;
+
+use futures_util::StreamExt;
+use ros2_client::dds::rustdds::SequenceNumber;
+use ros2_client::dds::rustdds::rpc::SampleIdentity;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use task_proto::ros::GraphName;
+use tokio::sync::{Mutex, watch};
+use tokio::time::{Instant, timeout_at};
+
+use super::endpoint::{Cdr, Delivery, Endpoints, Reader, Writer};
+use super::names::{self, Role};
+use super::observer::Matches;
+use super::own::OwnNode;
+use super::{EndpointId, GraphError, ParticipantId};
+
+/// The most services that are kept ready to be called; beyond it the one that was not used for the longest time goes.
+pub const MAX_CLIENTS: usize = 256;
+/// How long one try of a call that may be repeated waits for its answer.
+const TRY: Duration = Duration::from_secs(2);
+/// Services: what ROS calls its default profile for them.
+const DELIVERY: Delivery = Delivery::Reliable { depth: 10 };
+/// The length of what Cyclone puts before requests and answers: half the client's id and a number.
+const CYCLONE_HEADER: usize = 16;
+
+/// Whether a call may reach the service twice.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Repeat {
+    /// It changes nothing, or sets what it says: it is asked again while there is time.
+    WhileThereIsTime,
+    /// Once.
+    Never,
+}
+
+/// The clients of all services that were called.
+pub struct Clients {
+    endpoints: Arc<Endpoints>,
+    own: Arc<OwnNode>,
+    matches: watch::Sender<Matches>,
+    kept: Mutex<Kept>,
+}
+
+#[derive(Default)]
+struct Kept {
+    clients: BTreeMap<(GraphName, String), (u64, Arc<Client>)>,
+    uses: u64,
+}
+
+struct Client {
+    requests: Writer,
+    replies: Mutex<Reader<Cdr>>,
+    /// Of the requests' writer and the answers' reader.
+    ids: (EndpointId, EndpointId),
+    /// Cyclone's numbers of requests.
+    number: AtomicI64,
+}
+
+impl Clients {
+    /// None yet.
+    pub fn new(endpoints: Arc<Endpoints>, own: Arc<OwnNode>, matches: watch::Sender<Matches>) -> Self {
+        Self { endpoints, own, matches, kept: Mutex::default() }
+    }
+
+    /// Makes the client of this service, so that a server that appears later finds it there.
+    pub async fn prepare(&self, service: &GraphName, kind: &str) -> Result<(), GraphError> {
+        self.client(service, kind).await.map(drop)
+    }
+
+    /// The participants with a server of this service that hears requests and whose answers are heard; waits until there
+    /// is one.
+    pub async fn servers(
+        &self,
+        service: &GraphName,
+        kind: &str,
+        within: Duration,
+    ) -> Result<BTreeSet<ParticipantId>, GraphError> {
+        let client = self.client(service, kind).await?;
+        self.matched(&client, service, Instant::now() + within, within).await
+    }
+
+    /// Calls the service and waits for its answer.
+    pub async fn call<Q: Serialize, A: DeserializeOwned>(
+        &self,
+        service: &GraphName,
+        kind: &str,
+        request: &Q,
+        within: Duration,
+        repeat: Repeat,
+    ) -> Result<A, GraphError> {
+        let deadline = Instant::now() + within;
+        let client = self.client(service, kind).await?;
+        let no_answer = || GraphError::NoAnswer { service: service.clone(), within };
+        // One call at a time: whoever reads the answers reads everybody's.
+        let replies = timeout_at(deadline, client.replies.lock()).await.map_err(|_| no_answer())?;
+        loop {
+            let servers = self.matched(&client, service, deadline, within).await?;
+            let until = match repeat {
+                Repeat::WhileThereIsTime => deadline.min(Instant::now() + TRY),
+                Repeat::Never => deadline,
+            };
+            let framed = servers.iter().all(|server| server.is_cyclone());
+            match timeout_at(until, client.ask(&replies, request, framed)).await {
+                Ok(answer) => {
+                    let skipped = if framed { CYCLONE_HEADER } else { 0 };
+                    let malformed = || GraphError::Malformed { service: service.clone() };
+                    return answer?.value(skipped).ok_or_else(malformed);
+                }
+                Err(_) if until < deadline => {}
+                Err(_) => return Err(no_answer()),
+            }
+        }
+    }
+
+    async fn matched(
+        &self,
+        client: &Client,
+        service: &GraphName,
+        deadline: Instant,
+        within: Duration,
+    ) -> Result<BTreeSet<ParticipantId>, GraphError> {
+        let (writer, reader) = client.ids;
+        let mut matches = self.matches.subscribe();
+        let found = timeout_at(deadline, matches.wait_for(|matches| !matches.with_both(writer, reader).is_empty()));
+        match found.await {
+            Ok(Ok(matches)) => Ok(matches.with_both(writer, reader)),
+            Ok(Err(_closed)) => Err(GraphError::Closed),
+            Err(_) => Err(GraphError::NoServer { service: service.clone(), within }),
+        }
+    }
+
+    async fn client(&self, service: &GraphName, kind: &str) -> Result<Arc<Client>, GraphError> {
+        let mut kept = self.kept.lock().await;
+        kept.uses += 1;
+        let now = kept.uses;
+        let key = (service.clone(), kind.to_owned());
+        if let Some((used, client)) = kept.clients.get_mut(&key) {
+            *used = now;
+            return Ok(client.clone());
+        }
+        if kept.clients.len() >= MAX_CLIENTS {
+            self.drop_one(&mut kept);
+        }
+        let client = Arc::new(Client::new(&self.endpoints, service, kind)?);
+        let (writer, reader) = client.ids;
+        self.own.add(&[reader], &[writer]);
+        kept.clients.insert(key, (now, client.clone()));
+        Ok(client)
+    }
+
+    fn drop_one(&self, kept: &mut Kept) {
+        let idle = kept.clients.iter().filter(|(_, (_, client))| Arc::strong_count(client) == 1);
+        let Some(key) = idle.min_by_key(|(_, (used, _))| *used).map(|(key, _)| key.clone()) else { return };
+        if let Some((_, client)) = kept.clients.remove(&key) {
+            let (writer, reader) = client.ids;
+            self.own.remove(&[reader], &[writer]);
+            drop(client);
+            self.matches.send_if_modified(|matches| {
+                matches.forget(writer);
+                matches.forget(reader);
+                false
+            });
+        }
+    }
+}
+
+impl Client {
+    fn new(endpoints: &Endpoints, service: &GraphName, kind: &str) -> Result<Self, GraphError> {
+        let dds = |role| {
+            let dds_kind = names::type_to_dds(role, kind).ok_or_else(|| GraphError::Kind(kind.to_owned()))?;
+            Ok::<_, GraphError>((names::to_dds(role, service), dds_kind))
+        };
+        let (request_topic, request_kind) = dds(Role::Request)?;
+        let (reply_topic, reply_kind) = dds(Role::Reply)?;
+        // The reader first: a server that finds the writer can answer.
+        let replies = endpoints.reader(&reply_topic, &reply_kind, DELIVERY)?;
+        let requests = endpoints.writer(&request_topic, &request_kind, DELIVERY)?;
+        let ids = (requests.id(), replies.id());
+        Ok(Self { requests, replies: Mutex::new(replies), ids, number: AtomicI64::new(0) })
+    }
+
+    /// Sends the request and waits for its answer, passing over answers to others.
+    async fn ask(&self, replies: &Reader<Cdr>, request: &impl Serialize, framed: bool) -> Result<Cdr, GraphError> {
+        let mut answers = pin!(replies.samples());
+        if framed {
+            let header = self.cyclone_header();
+            let number = SampleIdentity {
+                writer_guid: self.requests.guid(),
+                sequence_number: SequenceNumber::from(self.number.load(Ordering::Relaxed)),
+            };
+            self.requests.write(Cdr::of(&header, request)?, Some(number)).await?;
+            while let Some(answer) = answers.next().await {
+                if answer.message.body.starts_with(&header) {
+                    return Ok(answer.message);
+                }
+            }
+        } else {
+            let asked = self.requests.write(Cdr::of(&[], request)?, None).await?;
+            while let Some(answer) = answers.next().await {
+                if answer.answers == Some(asked) {
+                    return Ok(answer.message);
+                }
+            }
+        }
+        Err(GraphError::Closed)
+    }
+
+    /// What a server on Cyclone sends back as it got it.
+    fn cyclone_header(&self) -> Vec<u8> {
+        let number = self.number.fetch_add(1, Ordering::Relaxed) + 1;
+        [&self.requests.id().0[8..], &number.to_le_bytes()].concat()
+    }
+}

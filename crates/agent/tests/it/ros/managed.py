@@ -1,0 +1,34 @@
+"""A lifecycle node that refuses to be configured while its parameter "broken" is true. It leaves when its input ends."""
+import sys
+import threading
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.lifecycle import Node, TransitionCallbackReturn
+
+
+class Managed(Node):
+    def __init__(self):
+        super().__init__("mapper")
+        self.declare_parameter("broken", False)
+
+    def on_configure(self, state):
+        if self.get_parameter("broken").value:
+            return TransitionCallbackReturn.FAILURE
+        return super().on_configure(state)
+
+
+def leave():
+    sys.stdin.read()
+    rclpy.try_shutdown()
+
+
+rclpy.init(args=sys.argv)
+node = Managed()
+threading.Thread(target=leave, daemon=True).start()
+print("up", flush=True)
+try:
+    rclpy.spin(node)
+except (ExternalShutdownException, KeyboardInterrupt):
+    pass
+rclpy.try_shutdown()

@@ -62,7 +62,7 @@ pub enum Command {
     /// Stop a task; it stays installed
     Stop(task::TaskOrder),
     /// Stop a task and remove it from robots
-    Remove(task::TaskOrder),
+    Remove(task::RemoveOrder),
     /// Look at the nodes on a robot's ROS graph
     Node {
         /// What to do.
@@ -83,7 +83,6 @@ pub enum Command {
     },
     /// Ask a lifecycle node for a transition
     Lifecycle(ros::LifecycleOrder),
-    Remove(task::RemoveOrder),
 }
 
 /// Where the server is and who asks. Each option may stand before the command or after it.
@@ -192,12 +191,11 @@ async fn dispatch(connection: &Connection, command: Command) -> Result<Outcome, 
         Command::Deploy { action } => deploy::run(&connection.open()?, action).await,
         Command::Start(order) => task::run(&connection.open()?, task::Verb::Start, order).await,
         Command::Stop(order) => task::run(&connection.open()?, task::Verb::Stop, order).await,
-        Command::Remove(order) => task::run(&connection.open()?, task::Verb::Remove, order).await,
+        Command::Remove(order) => task::remove(&connection.open()?, order).await,
         Command::Node { action } => ros::node(&connection.open()?, action).await,
         Command::Topic { action } => ros::topic(&connection.open()?, action).await,
         Command::Param { action } => ros::param(&connection.open()?, action).await,
         Command::Lifecycle(order) => ros::lifecycle(&connection.open()?, order).await,
-        Command::Remove(order) => task::remove(&connection.open()?, order).await,
     }
 }
 

@@ -17,18 +17,19 @@ use task_proto::{Digest, InstanceId, RobotId, RobotName, TaskName};
 use tokio::sync::{mpsc, watch};
 use tokio::task::{AbortHandle, JoinSet};
 use tokio::time::Instant;
-use tokio_util::sync::CancellationToken;
+use tokio_util::sync::{CancellationToken, DropGuard};
 
 use crate::admission;
 use crate::effects::{Effects, Now, chain};
 use crate::ledger::{Ledger, TaskRecord};
 use crate::link::{Heard, Shared};
-use crate::observed::{Prepared, ProcessState, RobotFacts};
+use crate::observed::{Health, Prepared, ProcessState, RobotFacts};
 use crate::plan::{self, Lane, Next, Situation, Step, StepFailure};
 
 mod hearing;
 mod reporting;
 mod steps;
+mod watching;
 
 /// How often the hold flag is looked at, were there nothing else to do, and progress is reported.
 const TICK: Duration = Duration::from_secs(1);
@@ -36,6 +37,11 @@ const TICK: Duration = Duration::from_secs(1);
 const LEDGER_RETRY: Duration = Duration::from_secs(5);
 /// More turns than this for one task mean that the plan goes in circles.
 const MAX_TURNS: u32 = 64;
+/// What watchers have seen and the driver has not taken yet; beyond it they wait.
+const MAX_SIGHTS: usize = 16;
+
+/// What is known of a disk that nobody has looked at.
+static NOTHING_PREPARED: Prepared = Prepared { manifest: None, content: false, built: false, versions: Vec::new() };
 
 /// Who the driver speaks for.
 #[derive(Debug, Clone)]
@@ -63,12 +69,36 @@ struct View {
     prepared: Option<Prepared>,
     /// What became of the active run's process; `None` likewise.
     process: Option<ProcessState>,
-    /// The run directory that a watcher looks at.
-    watched: Option<String>,
+    /// Who looks at that process.
+    watched: Option<Watched>,
+    /// What ROS says of it.
+    health: Health,
     /// How far the pull under way has come.
     pull: Option<watch::Receiver<Progress>>,
     /// The same, as it is reported.
     progress: Option<Progress>,
+}
+
+/// The watchers of one process. Dropping it ends the one that asks ROS.
+struct Watched {
+    /// The run directory's name.
+    dir: String,
+    _until_dropped: DropGuard,
+}
+
+/// What a watcher has seen of the process of a run directory.
+struct Seen {
+    task: TaskName,
+    dir: String,
+    what: Sight,
+}
+
+/// What can be seen of a process.
+enum Sight {
+    /// It has ended, or is not watched any more.
+    Over,
+    /// What ROS says of it now.
+    Health(Health),
 }
 
 /// A step under way.
@@ -94,7 +124,9 @@ pub struct Driver<E> {
     views: BTreeMap<TaskName, View>,
     under_way: HashMap<(TaskName, Lane), UnderWay>,
     steps: JoinSet<(TaskName, Lane, Outcome)>,
-    watchers: JoinSet<TaskName>,
+    /// Where watchers put what they see.
+    sights: mpsc::Sender<Seen>,
+    seen: mpsc::Receiver<Seen>,
     robot: RobotFacts,
     held: bool,
     /// Conditions by code; those that follow from other fields are not in it.
@@ -140,6 +172,7 @@ impl<E: Effects> Driver<E> {
         }
         // Which ROS there is is looked at when it is needed.
         let robot = RobotFacts { installations: None, ..effects.robot_facts() };
+        let (sights, seen) = mpsc::channel(MAX_SIGHTS);
         let held = effects.is_held();
         Self {
             effects,
@@ -151,7 +184,8 @@ impl<E: Effects> Driver<E> {
             views: BTreeMap::new(),
             under_way: HashMap::new(),
             steps: JoinSet::new(),
-            watchers: JoinSet::new(),
+            sights,
+            seen,
             robot,
             held,
             conditions,
@@ -170,14 +204,9 @@ impl<E: Effects> Driver<E> {
             tokio::select! {
                 // Cancel-safe: a step that has ended stays in the set until it is taken.
                 Some(ended) = self.steps.join_next_with_id() => self.step_ended(ended),
+                // Cancel-safe: a message stays in its channel until it is received.
+                Some(seen) = self.seen.recv() => self.see(seen),
                 // Cancel-safe: likewise.
-                Some(ended) = self.watchers.join_next() => {
-                    if let Ok(task) = ended {
-                        let view = self.views.entry(task).or_default();
-                        (view.process, view.watched) = (None, None);
-                    }
-                }
-                // Cancel-safe: a message stays in the channel until it is received.
                 Some(message) = heard.recv() => self.hear(message),
                 // Cancel-safe: an interval keeps its own time.
                 _ = tick.tick() => self.tick(),
@@ -293,33 +322,43 @@ impl<E: Effects> Driver<E> {
     }
 
     fn ask(&self, task: &TaskName, lane: Lane, desired: Option<&DesiredTask>, begin: &[(TaskName, Step)]) -> Next {
+        let planned = begin.iter().filter(|(other, _)| other == task).map(|(_, step)| step);
+        let under_way = self.under_way.iter().filter(|((other, _), _)| other == task);
+        let steps: Vec<&Step> = planned.chain(under_way.map(|(_, under_way)| &under_way.step)).collect();
         let rest = Next::Rest { until_ms: None };
-        let (Some(record), Some(view)) = (self.ledger.tasks.get(task), self.views.get(task)) else { return rest };
-        let (Some(prepared), Some(process)) = (&view.prepared, &view.process) else { return rest };
-        let now = self.effects.now();
-        let steps = || {
-            let planned = begin.iter().filter(|(other, _)| other == task).map(|(_, step)| step);
-            let lanes = [Lane::Run, Lane::Prepare].map(|lane| self.under_way.get(&(task.clone(), lane)));
-            planned.chain(lanes.into_iter().flatten().map(|under_way| &under_way.step)).collect::<Vec<_>>()
+        let Some(view) = self.views.get(task).filter(|view| view.prepared.is_some() && view.process.is_some()) else {
+            return rest;
         };
-        let situation = Situation {
+        self.situation(task, view, desired, &steps).map_or(rest, |situation| match lane {
+            Lane::Run => plan::supervise(&situation),
+            Lane::Prepare => plan::prepare(&situation),
+        })
+    }
+
+    /// All that the plan is to know of `task`, while `steps` are under way.
+    fn situation<'a>(
+        &'a self,
+        task: &TaskName,
+        view: &'a View,
+        desired: Option<&'a DesiredTask>,
+        steps: &[&Step],
+    ) -> Option<Situation<'a>> {
+        let now = self.effects.now();
+        Some(Situation {
             desired,
-            record,
-            prepared,
-            process,
-            preparing: steps().iter().any(|step| step.lane() == Lane::Prepare),
-            deleting: steps().iter().any(|step| step.deletes()),
+            record: self.ledger.tasks.get(task)?,
+            prepared: view.prepared.as_ref().unwrap_or(&NOTHING_PREPARED),
+            process: view.process.as_ref().unwrap_or(&ProcessState::None),
+            health: &view.health,
+            preparing: steps.iter().any(|step| step.lane() == Lane::Prepare),
+            deleting: steps.iter().any(|step| step.deletes()),
             robot: &self.robot,
             may_begin: self.may_begin(now),
             held: self.held,
             boot_id: &self.speaker.boot_id,
             now_ms: now.boot_ms,
             jitter: rand::random(),
-        };
-        match lane {
-            Lane::Run => plan::supervise(&situation),
-            Lane::Prepare => plan::prepare(&situation),
-        }
+        })
     }
 
     /// Looks at whatever is not known to be as it was.
@@ -372,28 +411,10 @@ impl<E: Effects> Driver<E> {
         }
         let process = |record: &TaskRecord| Some(record.active.as_ref()?.process.as_ref()?.dir.clone());
         if before.and_then(process) != process(&record) {
-            view.process = None;
+            (view.process, view.watched, view.health) = (None, None, Health::Unknown);
         }
         self.ledger.tasks.insert(task.clone(), record);
         self.dirty = true;
-    }
-
-    /// Sees to it that the end of each live process is noticed.
-    fn watch_processes(&mut self) {
-        for (task, record) in &self.ledger.tasks {
-            let Some(view) = self.views.get_mut(task) else { continue };
-            let Some(process) = record.active.as_ref().and_then(|active| active.process.as_ref()) else { continue };
-            let lives = matches!(view.process, Some(ProcessState::Alive { .. }));
-            if !lives || view.watched.as_ref() == Some(&process.dir) {
-                continue;
-            }
-            view.watched = Some(process.dir.clone());
-            let (effects, task, process) = (self.effects.clone(), task.clone(), process.clone());
-            self.watchers.spawn(async move {
-                effects.process_ended(&task, &process).await;
-                task
-            });
-        }
     }
 
     fn tick(&mut self) {

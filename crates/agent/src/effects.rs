@@ -10,7 +10,7 @@ use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 use crate::ledger::{ActiveRun, Ledger, LedgerError, ProcessRecord};
-use crate::observed::{Prepared, ProcessState, RobotFacts};
+use crate::observed::{Health, Prepared, ProcessState, RobotFacts};
 use crate::plan::StepFailure;
 
 mod robot;
@@ -64,6 +64,11 @@ pub trait Effects: Send + Sync + 'static {
     /// Resolves when a process that lived has ended. Dropping it does nothing to the process.
     fn process_ended(&self, task: &TaskName, process: &ProcessRecord) -> impl Future<Output = ()> + Send;
 
+    /// Begins to compare what ROS says of this run, whose process lives, with what its package promises, bringing its
+    /// lifecycle nodes to active and setting its parameters unless `process.ready` says that this was done. It goes on
+    /// until the receiver is dropped. A package that promises nothing holds since its process was started.
+    fn watch(&self, task: &TaskName, run: &ActiveRun) -> watch::Receiver<Health>;
+
     /// Deletes the gathered bytes of all contents but these.
     fn keep_parts(&self, wanted: &[Digest]);
 
@@ -92,13 +97,9 @@ pub trait Effects: Send + Sync + 'static {
     /// Makes the run's version the current one and starts the process that its record names; gives the process id.
     fn start(&self, task: &TaskName, run: &ActiveRun) -> impl Future<Output = Result<u32, StepFailure>> + Send;
 
-    /// Stops a process and all it started.
-    fn stop(
-        &self,
-        task: &TaskName,
-        process: &ProcessRecord,
-        stop_timeout_s: u32,
-    ) -> impl Future<Output = Result<(), StepFailure>> + Send;
+    /// Stops the run's process and all it started, in good order: its lifecycle nodes first. Afterwards none of it is
+    /// left on the graph.
+    fn stop(&self, task: &TaskName, run: &ActiveRun) -> impl Future<Output = Result<(), StepFailure>> + Send;
 
     /// Deletes the versions that are not in `kept`, and what ended runs left.
     fn prune(

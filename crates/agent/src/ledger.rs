@@ -125,6 +125,18 @@ pub struct ProcessRecord {
     pub pid: Option<u32>,
     /// Whether it counted as running.
     pub ready: bool,
+    /// Set once it is to be stopped for a reason of its own.
+    #[serde(default)]
+    pub condemned: Option<Condemned>,
+}
+
+/// Why a process is stopped that the order would have go on.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Condemned {
+    /// What it failed in.
+    pub failure: Failure,
+    /// Whether the restart policy may start another.
+    pub again: bool,
 }
 
 /// What of a task manifest matters while the task runs.
@@ -140,10 +152,13 @@ pub struct RunRules {
     pub idempotent: bool,
     /// Seconds between the signals of a stop.
     pub stop_timeout_s: u32,
-    /// Seconds a process must live to be ready.
+    /// Seconds that all must hold before it is ready.
     pub hold_s: u32,
-    /// Seconds in which a run must have been ready once.
+    /// Seconds in which a process must get ready, and for how long it may be degraded.
     pub ready_timeout_s: u32,
+    /// Seconds a job may run.
+    #[serde(default)]
+    pub deadline_s: Option<u32>,
 }
 
 /// A run that is over.
@@ -376,6 +391,7 @@ impl From<&TaskManifest> for RunRules {
             stop_timeout_s: manifest.run.stop_timeout_s,
             hold_s: manifest.ready.hold_s,
             ready_timeout_s: manifest.ready.timeout_s,
+            deadline_s: manifest.run.deadline_s,
         }
     }
 }

@@ -1,11 +1,12 @@
-//! What is true on the robot, whatever the ledger says: processes and what lies on the disk. Plain values, filled by the
-//! effects and read by the plan.
+//! What is true on the robot, whatever the ledger says: processes, what ROS sees of them, and what lies on the disk.
+//! Plain values, filled by the effects and read by the plan. Times are milliseconds since boot.
 
 use std::collections::BTreeSet;
 
 use task_proto::Digest;
 use task_proto::id::Labels;
 use task_proto::manifest::TaskManifest;
+use task_proto::report::{Failure, FailureCode};
 
 use crate::installation::{self, Installation};
 use crate::launch;
@@ -51,6 +52,37 @@ pub struct Exit {
     pub last_lines: String,
 }
 
+/// What ROS says of a run whose process lives, against what its package promises in `[ready]`.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub enum Health {
+    /// Nobody has looked yet.
+    #[default]
+    Unknown,
+    /// All that was promised holds.
+    Holds {
+        /// Since when, without a break.
+        since_ms: u64,
+    },
+    /// Something is missing, and may yet come.
+    Missing(Missing),
+    /// What no waiting mends: `node_name_taken`, `parameter_rejected`, `lifecycle_failed`. Only before it was ready.
+    Refused(Failure),
+}
+
+/// Something that was promised and is not there.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Missing {
+    /// Since when anything has been missing, without a break.
+    pub since_ms: u64,
+    /// What it means once the task was ready: `node_vanished`, `node_inactive`, `topic_silent`, `service_lost`,
+    /// `graph_unavailable`.
+    pub code: FailureCode,
+    /// What is missing, a sentence without its end: "`/mapper` did not appear".
+    pub what: String,
+    /// What is there instead: "on the graph: `/lidar`, `/odom`". May be empty.
+    pub seen: String,
+}
+
 /// What a package may require of the robot.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct RobotFacts {
@@ -94,6 +126,23 @@ impl RobotFacts {
             Err(error) => vec![error.to_string()],
         });
         lacks
+    }
+}
+
+impl Missing {
+    /// Why a task that was ready is not as it should be.
+    pub fn failure(&self) -> Failure {
+        Failure::new(self.code.clone(), self.sentence(""))
+    }
+
+    /// Why a task was not ready within its time.
+    pub fn not_within(&self, timeout_s: u32) -> Failure {
+        Failure::new(FailureCode::NOT_READY, self.sentence(&format!(" within {timeout_s} s")))
+    }
+
+    fn sentence(&self, when: &str) -> String {
+        let (what, seen) = (&self.what, &self.seen);
+        if seen.is_empty() { format!("{what}{when}") } else { format!("{what}{when}; {seen}") }
     }
 }
 
@@ -144,6 +193,23 @@ mod tests {
             packages: Some(["std_msgs".to_owned()].into()),
             ..Installation::default()
         }
+    }
+
+    #[test]
+    fn what_is_missing_is_said_with_what_is_there() {
+        let mut missing = Missing {
+            since_ms: 0,
+            code: FailureCode::NODE_VANISHED,
+            what: "`/mapper` did not appear".to_owned(),
+            seen: "on the graph: `/lidar`, `/odom`".to_owned(),
+        };
+        let failure = missing.not_within(30);
+        assert_eq!(
+            failure.to_string(),
+            "not_ready: `/mapper` did not appear within 30 s; on the graph: `/lidar`, `/odom`"
+        );
+        missing.seen.clear();
+        assert_eq!(missing.failure().to_string(), "node_vanished: `/mapper` did not appear");
     }
 
     #[test]

@@ -27,8 +27,9 @@ use task_proto::report::{Failure, FailureCode, Phase};
 use task_proto::{Digest, TaskName};
 
 use crate::ledger::{ActiveRun, ProcessRecord, RunRules, TaskRecord};
-use crate::observed::{Prepared, ProcessState, RobotFacts};
+use crate::observed::{Health, Prepared, ProcessState, RobotFacts};
 
+mod alive;
 #[cfg(test)]
 mod tests;
 mod transition;
@@ -46,6 +47,8 @@ pub struct Situation<'a> {
     pub prepared: &'a Prepared,
     /// What became of the active run's process.
     pub process: &'a ProcessState,
+    /// What ROS says of it while it lives.
+    pub health: &'a Health,
     /// Whether a step of [`Lane::Prepare`] is under way.
     pub preparing: bool,
     /// Whether a step that deletes versions is under way.
@@ -91,13 +94,8 @@ pub enum Step {
     Build(PackageRef),
     /// Make this run the active one and start a process of it.
     Start(Box<ActiveRun>),
-    /// Stop the active run's process.
-    Stop {
-        /// Which.
-        process: ProcessRecord,
-        /// Seconds between the signals.
-        stop_timeout_s: u32,
-    },
+    /// Stop this run's process; it is the active one.
+    Stop(Box<ActiveRun>),
     /// Delete the versions that are not in `kept`.
     Prune {
         /// The versions that stay.
@@ -121,7 +119,7 @@ impl Step {
     pub fn lane(&self) -> Lane {
         match self {
             Self::PullManifest(_) | Self::LookForRos(_) | Self::PullContent(_) | Self::Build(_) => Lane::Prepare,
-            Self::Start(_) | Self::Stop { .. } | Self::Prune { .. } | Self::Remove => Lane::Run,
+            Self::Start(_) | Self::Stop(_) | Self::Prune { .. } | Self::Remove => Lane::Run,
         }
     }
 
@@ -131,7 +129,7 @@ impl Step {
         let seconds = match self {
             Self::PullContent(_) | Self::Build(_) => return None,
             Self::PullManifest(_) | Self::LookForRos(_) | Self::Start(_) => STEP_DEADLINE_S,
-            Self::Stop { stop_timeout_s, .. } => STEP_DEADLINE_S + 2 * u64::from(*stop_timeout_s),
+            Self::Stop(run) => STEP_DEADLINE_S + 2 * u64::from(run.rules.stop_timeout_s),
             Self::Prune { .. } | Self::Remove => DELETE_DEADLINE_S,
         };
         Some(Duration::from_secs(seconds))
@@ -152,7 +150,7 @@ impl Step {
             | Self::Build(package) => {
                 desired.is_some_and(|task| task.wanted == Wanted::Running && task.package == *package)
             }
-            Self::Start(_) | Self::Stop { .. } | Self::Prune { .. } | Self::Remove => true,
+            Self::Start(_) | Self::Stop(_) | Self::Prune { .. } | Self::Remove => true,
         }
     }
 }
@@ -250,26 +248,7 @@ fn takes_over(s: &Situation<'_>) -> bool {
 fn with_process(s: &Situation<'_>, active: &ActiveRun, process: &ProcessRecord) -> Next {
     let replaced = !active.is_for(&s.record.order) && takes_over(s);
     let wanted = s.desired.is_some_and(|task| task.wanted == Wanted::Running);
-    if !wanted || replaced {
-        if s.now_ms < active.retry_at_ms {
-            return Next::Rest { until_ms: Some(active.retry_at_ms) };
-        }
-        return Next::Act(Step::Stop { process: process.clone(), stop_timeout_s: active.rules.stop_timeout_s });
-    }
-    // Readiness is, for now, having lived long enough; what the ROS graph says comes in here.
-    let ready_at_ms = process.started_ms + u64::from(active.rules.hold_s) * 1000;
-    if !process.ready {
-        return if s.now_ms >= ready_at_ms {
-            record(transition::ready(s))
-        } else {
-            Next::Rest { until_ms: Some(ready_at_ms) }
-        };
-    }
-    if active.restarts_in_a_row > 0 {
-        let calm_at_ms = process.started_ms + CALM_MS;
-        return if s.now_ms >= calm_at_ms { record(transition::calm(s.record)) } else { tidy(s, Some(calm_at_ms)) };
-    }
-    tidy(s, None)
+    if !wanted || replaced { alive::stop(s, active) } else { alive::next(s, active, process) }
 }
 
 fn without_process(s: &Situation<'_>, active: Option<&ActiveRun>) -> Next {
@@ -325,7 +304,7 @@ pub fn describe(task: &TaskName, step: &Step) -> String {
         Step::PullContent(package) => format!("pull {task} {}", package.version),
         Step::Build(package) => format!("build {task} {}", package.version),
         Step::Start(run) => format!("start {task} {} (run {})", run.package.version, run.run),
-        Step::Stop { .. } => format!("stop {task}"),
+        Step::Stop(_) => format!("stop {task}"),
         Step::Prune { .. } => format!("delete old versions of {task}"),
         Step::Remove => format!("remove {task}"),
     }

@@ -2,14 +2,14 @@
 
 use std::sync::Arc;
 
-use task_proto::report::{ActiveVersion, Condition, Phase, Report, TaskReport};
+use task_proto::report::{ActiveVersion, Condition, Failure, Phase, Report, TaskReport};
 use task_proto::{Generation, TaskName};
 
 use super::{Driver, View};
 use crate::admission;
 use crate::effects::Effects;
-use crate::ledger::TaskRecord;
-use crate::observed::ProcessState;
+use crate::ledger::{ActiveRun, TaskRecord};
+use crate::observed::{Health, ProcessState};
 
 impl<E: Effects> Driver<E> {
     /// Publishes a snapshot, if it says anything that the last one did not.
@@ -80,6 +80,14 @@ fn says_the_same(last: &Report, next: &Report) -> bool {
     without_times(last) == without_times(next)
 }
 
+/// Why the run that lives is not as it should be, once it was.
+fn degraded(active: &ActiveRun, health: &Health) -> Option<Failure> {
+    match health {
+        Health::Missing(missing) if active.process.as_ref()?.ready => Some(missing.failure()),
+        _ => None,
+    }
+}
+
 fn task_report(task: &TaskName, record: &TaskRecord, view: Option<&View>, now_ms: u64) -> TaskReport {
     let (phase, failure) = record.standing();
     let progress = view.and_then(|view| view.progress).filter(|_| phase == Phase::Fetching);
@@ -100,7 +108,7 @@ fn task_report(task: &TaskName, record: &TaskRecord, view: Option<&View>, now_ms
         attempts: record.preparation.attempts,
         restarts: for_order.map_or(0, |active| active.restarts),
         failure: failure.cloned(),
-        degraded: None,
+        degraded: view.and_then(|view| degraded(active?, &view.health)),
         active: active.and_then(|active| {
             let process = active.process.as_ref()?;
             let pid = match view.and_then(|view| view.process.as_ref()) {

@@ -12,8 +12,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::{Driver, Outcome, UnderWay};
 use crate::effects::Effects;
-use crate::observed::{Prepared, ProcessState};
-use crate::plan::{self, Lane, Situation, Step, StepFailure};
+use crate::plan::{self, Lane, Step, StepFailure};
 
 /// How long an interrupted step may take to end by itself.
 const INTERRUPT_GRACE: Duration = Duration::from_secs(5);
@@ -41,9 +40,7 @@ impl<E: Effects> Driver<E> {
                     Step::PullContent(package) => effects.pull_content(package, &progress, &stop).await.map(done),
                     Step::Build(package) => effects.build(package, &stop).await.map(done),
                     Step::Start(run) => effects.start(&name, run).await.map(Some),
-                    Step::Stop { process, stop_timeout_s } => {
-                        effects.stop(&name, process, *stop_timeout_s).await.map(done)
-                    }
+                    Step::Stop(run) => effects.stop(&name, run).await.map(done),
                     Step::Prune { kept } => effects.prune(&name, kept, running.as_ref()).await.map(done),
                     Step::Remove => effects.remove(&name).await.map(done),
                 }
@@ -117,23 +114,8 @@ impl<E: Effects> Driver<E> {
         if matches!(step, Step::LookForRos(_)) {
             self.robot.installations = Some(self.effects.robot_facts().installations.unwrap_or_default());
         }
-        let (Some(record), Some(view)) = (self.ledger.tasks.get(task), self.views.get(task)) else { return };
-        let now = self.effects.now();
-        let nothing = Prepared::default();
-        let situation = Situation {
-            desired: None,
-            record,
-            prepared: view.prepared.as_ref().unwrap_or(&nothing),
-            process: view.process.as_ref().unwrap_or(&ProcessState::None),
-            preparing: false,
-            deleting: false,
-            robot: &self.robot,
-            may_begin: self.may_begin(now),
-            held: self.held,
-            boot_id: &self.speaker.boot_id,
-            now_ms: now.boot_ms,
-            jitter: rand::random(),
-        };
+        let Some(view) = self.views.get(task) else { return };
+        let Some(situation) = self.situation(task, view, None, &[]) else { return };
         let record = plan::finished(&situation, step, outcome);
         if let (Step::Prune { kept }, Some(prepared)) =
             (step, &mut self.views.entry(task.clone()).or_default().prepared)
@@ -143,7 +125,7 @@ impl<E: Effects> Driver<E> {
         } else if step.lane() == Lane::Prepare {
             self.views.entry(task.clone()).or_default().prepared = None;
         }
-        if matches!(step, Step::Start(_) | Step::Stop { .. }) {
+        if matches!(step, Step::Start(_) | Step::Stop(_)) {
             self.views.entry(task.clone()).or_default().process = None;
         }
         self.put(task, record);

@@ -13,6 +13,7 @@ use task_proto::{DeploymentId, Digest, Generation};
 use super::*;
 use crate::installation::Installation;
 use crate::ledger::{ActiveRun, LedgerError, ProcessRecord};
+use crate::observed::Missing;
 
 /// How long a test waits for what should come at once.
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -39,11 +40,17 @@ struct State {
     exec_depends: Vec<String>,
     ros_packages: BTreeSet<String>,
     seen_packages: BTreeSet<String>,
+    /// What ROS says of every process that lives.
+    health: watch::Sender<Health>,
 }
 
 impl Fake {
     fn state<T>(&self, look: impl FnOnce(&mut State) -> T) -> T {
         look(&mut self.state.lock().expect("no test panicked"))
+    }
+
+    fn sees(&self, health: Health) {
+        self.state(|state| state.health.send_replace(health));
     }
 }
 
@@ -100,6 +107,10 @@ impl Effects for Fake {
         std::future::pending().await
     }
 
+    fn watch(&self, _task: &TaskName, _run: &ActiveRun) -> watch::Receiver<Health> {
+        self.state(|state| state.health.subscribe())
+    }
+
     fn keep_parts(&self, wanted: &[Digest]) {
         self.state(|state| state.kept_parts.push(wanted.to_vec()));
     }
@@ -141,7 +152,8 @@ impl Effects for Fake {
         Ok(7)
     }
 
-    async fn stop(&self, _task: &TaskName, process: &ProcessRecord, _stop_timeout_s: u32) -> Result<(), StepFailure> {
+    async fn stop(&self, _task: &TaskName, run: &ActiveRun) -> Result<(), StepFailure> {
+        let process = run.process.as_ref().expect("a process to stop");
         self.state(|state| state.alive.remove(&process.dir));
         Ok(())
     }
@@ -204,7 +216,9 @@ struct Bench {
 impl Bench {
     async fn new() -> Self {
         let (key, robot) = (SigningKey::random(), RobotId::random());
-        Self::with(Arc::default(), Ledger::new(0), key, robot).await
+        let fake = Arc::new(Fake::default());
+        fake.sees(Health::Holds { since_ms: 0 });
+        Self::with(fake, Ledger::new(0), key, robot).await
     }
 
     async fn with(fake: Arc<Fake>, ledger: Ledger, key: SigningKey, robot: RobotId) -> Self {
@@ -317,6 +331,39 @@ async fn a_cancel_interrupts_a_pull_and_leaves_the_old_version_running() {
     bench.end().await;
     let kept = fake.state(|state| state.kept_parts.clone());
     assert_eq!(kept.last(), Some(&vec![old.package.content.digest]), "what was gathered of 2.0 is deleted");
+}
+
+fn missing(since_ms: u64) -> Health {
+    Health::Missing(Missing {
+        since_ms,
+        code: FailureCode::NODE_VANISHED,
+        what: "`/mapper` is gone".to_owned(),
+        seen: "on the graph: `/lidar`".to_owned(),
+    })
+}
+
+#[tokio::test]
+async fn what_ros_says_makes_a_task_ready_degraded_and_whole_again() {
+    let bench = Bench::new().await;
+    bench.fake.sees(Health::Unknown);
+    let order = order("1.0");
+    bench.order(1, vec![order.clone()]).await;
+    bench.phase(Phase::Starting).await;
+    bench.fake.sees(Health::Holds { since_ms: bench.fake.now().boot_ms });
+    bench.phase(Phase::Running).await;
+    bench.fake.sees(missing(bench.fake.now().boot_ms));
+    let report = bench.report(|report| report.tasks[0].degraded.is_some()).await;
+    assert_eq!(report.tasks[0].phase, Phase::Running);
+    let degraded = report.tasks[0].degraded.as_ref().expect("waited for").to_string();
+    assert_eq!(degraded, "node_vanished: `/mapper` is gone; on the graph: `/lidar`");
+    bench.fake.sees(Health::Holds { since_ms: bench.fake.now().boot_ms });
+    bench.report(|report| report.tasks[0].degraded.is_none()).await;
+    assert_eq!(bench.fake.state(|state| state.started.len()), 1);
+    bench.fake.sees(Health::Refused(Failure::new(FailureCode::LIFECYCLE_FAILED, "it will not")));
+    bench.order(2, vec![DesiredTask { run: 2, ..order }]).await;
+    let report = bench.phase(Phase::Failed).await;
+    assert_eq!(report.tasks[0].failure.as_ref().expect("why").code, FailureCode::LIFECYCLE_FAILED);
+    assert!(bench.fake.state(|state| state.alive.is_empty()), "it is stopped before it has failed");
 }
 
 #[tokio::test]

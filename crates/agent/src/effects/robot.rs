@@ -22,7 +22,7 @@ use crate::fetch::{self, FetchError, Fetcher};
 use crate::installation::Installation;
 use crate::layout::{DataDir, VersionDir};
 use crate::ledger::{ActiveRun, Ledger, LedgerError, ProcessRecord};
-use crate::observed::{Exit, Prepared, ProcessState, RobotFacts};
+use crate::observed::{Exit, Health, Prepared, ProcessState, RobotFacts};
 use crate::plan::StepFailure;
 use crate::run_dir::{LogSpec, RunSpec};
 use crate::supervisor::{Observed, Supervisor, SupervisorError};
@@ -216,6 +216,14 @@ impl Effects for Robot {
         }
     }
 
+    // A process that lives is all that is promised so far.
+    fn watch(&self, _task: &TaskName, run: &ActiveRun) -> watch::Receiver<Health> {
+        let since_ms = run.process.as_ref().map_or(0, |process| process.started_ms);
+        let (health, seen) = watch::channel(Health::Holds { since_ms });
+        tokio::spawn(async move { health.closed().await });
+        seen
+    }
+
     fn keep_parts(&self, wanted: &[Digest]) {
         if let Err(error) = self.data.clean_parts(wanted) {
             tracing::warn!(%error, "bytes of packages that are no longer ordered can't be removed");
@@ -289,8 +297,9 @@ impl Effects for Robot {
         Ok(pid)
     }
 
-    async fn stop(&self, task: &TaskName, process: &ProcessRecord, stop_timeout_s: u32) -> Result<(), StepFailure> {
-        let grace = Duration::from_secs(u64::from(stop_timeout_s));
+    async fn stop(&self, task: &TaskName, run: &ActiveRun) -> Result<(), StepFailure> {
+        let Some(process) = &run.process else { return Ok(()) };
+        let grace = Duration::from_secs(u64::from(run.rules.stop_timeout_s));
         let stopped = self.supervisor.stop(&self.run_dir(task, process), grace).await;
         stopped.map(drop).map_err(|error: SupervisorError| later(FailureCode::IO_ERROR, &error, 0))
     }

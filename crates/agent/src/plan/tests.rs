@@ -35,6 +35,8 @@ struct World {
     may_begin: bool,
     manifest: Run,
     ros_seen: bool,
+    /// What ROS says of the process that lives.
+    health: Health,
 }
 
 /// What can happen.
@@ -126,6 +128,7 @@ impl World {
             may_begin: true,
             ros_seen: false,
             manifest,
+            health: Health::Holds { since_ms: 0 },
         }
     }
 
@@ -232,6 +235,7 @@ impl World {
             record,
             prepared: &prepared,
             process: &process,
+            health: &self.health,
             preparing: self.steps.iter().any(|(step, _)| step.lane() == Lane::Prepare),
             deleting: self.steps.iter().any(|(step, _)| step.deletes()),
             robot: &RobotFacts { installations: self.ros_seen.then(|| vec![ros()]), ..RobotFacts::default() },
@@ -270,7 +274,8 @@ impl World {
                     self.job_starts.push(job);
                 }
             }
-            Step::Stop { process, .. } => {
+            Step::Stop(run) => {
+                let process = run.process.as_ref().expect("what lives");
                 self.alive.retain(|dir| *dir != process.dir);
                 self.ended.push((process.dir.clone(), Some(ExitStatus::Signal(2))));
             }
@@ -443,7 +448,7 @@ fn hold_starts_nothing_and_stops_nothing() {
     }
     assert_eq!((phase(&world), &world.alive), (Phase::Deferred, &old));
     world.happen(Happening::Hold(false));
-    assert!(matches!(world.steps[..], [(Step::Stop { .. }, false)]));
+    assert!(matches!(world.steps[..], [(Step::Stop(_), false)]));
 }
 
 #[test]
@@ -486,16 +491,10 @@ fn on_boot_hold_leaves_a_service_down_after_a_reboot() {
 #[test]
 fn every_step_of_the_run_lane_has_a_deadline() {
     let order = order(1, 1, 1, Wanted::Running);
-    let process =
-        ProcessRecord { dir: "run".to_owned(), boot_id: "boot".to_owned(), started_ms: 0, pid: None, ready: false };
-    let run = ActiveRun::of(&order, RunRules::from(&manifest(&Run::default())), 0);
     let stop_timeout_s = 3600;
-    let steps = [
-        Step::Start(Box::new(run)),
-        Step::Stop { process, stop_timeout_s },
-        Step::Prune { kept: Vec::new() },
-        Step::Remove,
-    ];
+    let run = ActiveRun::of(&order, RunRules::from(&manifest(&Run { stop_timeout_s, ..Run::default() })), 0);
+    let steps =
+        [Step::Start(Box::new(run.clone())), Step::Stop(Box::new(run)), Step::Prune { kept: Vec::new() }, Step::Remove];
     assert!(steps.iter().all(|step| step.lane() == Lane::Run && step.deadline().is_some()));
     let stop = steps[1].deadline().expect("checked");
     assert!(stop > Duration::from_secs(2 * u64::from(stop_timeout_s)), "both signals have their time: {stop:?}");

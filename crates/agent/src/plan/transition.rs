@@ -5,7 +5,7 @@ use task_proto::manifest::{OnBoot, Restart, TaskKind};
 use task_proto::report::{Failure, FailureCode, Phase};
 
 use super::{MAX_RESTARTS_IN_A_ROW, Situation, Step, run_dir_name};
-use crate::ledger::{ActiveRun, End, Preparation, ProcessRecord, RunRules, TaskRecord};
+use crate::ledger::{ActiveRun, Condemned, End, Preparation, ProcessRecord, RunRules, TaskRecord};
 use crate::observed::Exit;
 
 /// A step that did not succeed.
@@ -46,7 +46,7 @@ pub fn begun(record: &TaskRecord, step: &Step, boot_id: &str, start: u64, now_ms
     let phase = match step {
         Step::PullManifest(_) | Step::LookForRos(_) | Step::PullContent(_) => Some(Phase::Fetching),
         Step::Build(_) => Some(Phase::Building),
-        Step::Start(_) | Step::Stop { .. } | Step::Prune { .. } | Step::Remove => None,
+        Step::Start(_) | Step::Stop(_) | Step::Prune { .. } | Step::Remove => None,
     };
     if let Some(phase) = phase {
         let again = record.preparation.phase == phase && record.preparation.failure.is_some();
@@ -66,6 +66,7 @@ pub fn begun(record: &TaskRecord, step: &Step, boot_id: &str, start: u64, now_ms
             started_ms: now_ms,
             pid: None,
             ready: false,
+            condemned: None,
         });
         record.active = Some(run);
     }
@@ -98,15 +99,17 @@ pub fn finished(s: &Situation<'_>, step: &Step, outcome: Result<Option<u32>, Ste
                 give_up_or_retry(active, s, error.failure, error.retry_after_ms.is_some());
             }
         }
-        (Step::Stop { .. }, Ok(_)) => {
+        (Step::Stop(_), Ok(_)) => {
             if let Some(active) = &mut record.active {
-                active.process = None;
-                if active.rules.kind == TaskKind::Job && active.end.is_none() {
+                let condemned = active.process.take().and_then(|process| process.condemned);
+                if let Some(condemned) = condemned {
+                    give_up_or_retry(active, s, condemned.failure, condemned.again);
+                } else if active.rules.kind == TaskKind::Job && active.end.is_none() {
                     active.end = Some(interrupted("the job was stopped before it had ended"));
                 }
             }
         }
-        (Step::Stop { .. }, Err(_)) => {
+        (Step::Stop(_), Err(_)) => {
             if let Some(active) = &mut record.active {
                 active.retry_at_ms = s.now_ms + backoff_ms(1, MAX_STEP_BACKOFF_MS, s.jitter).max(BACKOFF_BASE_MS);
             }
@@ -151,7 +154,7 @@ pub(super) fn prepared_to(s: &Situation<'_>, phase: Phase, failure: Option<Failu
     record
 }
 
-/// The record once the process has lived long enough.
+/// The record once all that makes the process ready has held long enough.
 pub(super) fn ready(s: &Situation<'_>) -> TaskRecord {
     let mut record = s.record.clone();
     if let Some(active) = &mut record.active {
@@ -161,6 +164,15 @@ pub(super) fn ready(s: &Situation<'_>) -> TaskRecord {
         }
     }
     record.settle_phase(s.now_ms);
+    record
+}
+
+/// The record once it is decided that the process must end.
+pub(super) fn condemned(s: &Situation<'_>, condemned: Condemned) -> TaskRecord {
+    let mut record = s.record.clone();
+    if let Some(process) = record.active.as_mut().and_then(|active| active.process.as_mut()) {
+        process.condemned = Some(condemned);
+    }
     record
 }
 
@@ -189,7 +201,9 @@ pub(super) fn ended(s: &Situation<'_>, exit: &Exit) -> TaskRecord {
     let Some(active) = &mut record.active else { return record };
     let Some(process) = active.process.take() else { return record };
     let job_done = active.rules.kind == TaskKind::Job && exit.is_success();
-    if process.boot_id != s.boot_id && !job_done {
+    if let Some(condemned) = process.condemned {
+        give_up_or_retry(active, s, condemned.failure, condemned.again);
+    } else if process.boot_id != s.boot_id && !job_done {
         // Whatever status it left, it ended because the robot went down.
         after_reboot(active, s.now_ms);
     } else if active.rules.kind == TaskKind::Job {

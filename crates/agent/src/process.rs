@@ -255,10 +255,11 @@ pub fn spawn_task(
     directory: &Path,
     environment: &BTreeMap<String, String>,
     output: PipeWriter,
+    errors: PipeWriter,
 ) -> io::Result<u32> {
     let mut command = command(Path::new("/bin/bash"), environment);
     command.arg(script).current_dir(directory).process_group(0);
-    command.stdin(Stdio::null()).stdout(output.try_clone()?).stderr(output);
+    command.stdin(Stdio::null()).stdout(output).stderr(errors);
     let parent = nix::unistd::getpid();
     let prepare = move || {
         reset_for_exec()?;

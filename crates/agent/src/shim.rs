@@ -2,7 +2,7 @@
 //! every orphan below it and writes down how it all ended. It lives exactly as long as its task, needs nothing of the
 //! agent after the start and never decides anything: no restart, no stop.
 //!
-//! It has no async runtime: a thread copies the output, the main thread waits for children.
+//! It has no async runtime: two threads copy the output, the main thread waits for children.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -13,7 +13,7 @@ use nix::sys::signal::Signal;
 use serde::{Deserialize, Serialize};
 
 use crate::containment::Containment;
-use crate::logs::RotatedLog;
+use crate::logs::capture;
 use crate::process::ExitStatus;
 use crate::process::{self, ChildEvent, ProcessIdentity};
 use crate::run_dir::{Ended, RunDir, RunDirError, Started};
@@ -89,13 +89,15 @@ fn begin(dir: &RunDir) -> Result<Task, ShimError> {
     let spec = dir.spec()?.ok_or_else(|| ShimError::NoSpec(dir.path().display().to_string()))?;
     let own = identity(std::process::id())?;
     let (output, writer) = io::pipe()?;
-    let pid = process::spawn_task(&spec.script, &spec.directory, &spec.environment, writer).map_err(|source| {
+    let (errors, error_writer) = io::pipe()?;
+    let spawned = process::spawn_task(&spec.script, &spec.directory, &spec.environment, writer, error_writer);
+    let pid = spawned.map_err(|source| {
         let (script, directory) = (spec.script.display().to_string(), spec.directory.display().to_string());
         ShimError::Start { script, directory, source }
     })?;
     let (done, drained) = mpsc::channel();
     std::thread::spawn(move || {
-        RotatedLog::new(spec.log).copy_from(output);
+        capture::copy(spec.log, output, errors);
         // The main thread no longer listens when it has given up on the rest.
         let _ = done.send(());
     });

@@ -13,6 +13,7 @@ pub mod report;
 pub mod request;
 pub mod ros;
 pub mod selector;
+pub mod time;
 pub mod token;
 pub mod topic;
 

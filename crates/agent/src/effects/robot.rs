@@ -3,7 +3,6 @@
 
 use std::collections::BTreeMap;
 use std::error::Error;
-use std::io::{Read as _, Seek as _, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::sync::{PoisonError, RwLock};
 use std::time::Duration;
@@ -27,7 +26,7 @@ use crate::plan::StepFailure;
 use crate::run_dir::{LogSpec, RunSpec};
 use crate::supervisor::{Observed, Supervisor, SupervisorError};
 use crate::underlay::{self, Places};
-use crate::{clock, disk, durable, environment, installation, launch, script, survey};
+use crate::{clock, disk, durable, environment, installation, launch, logs, script, survey};
 
 /// Written into a version's directory once it is built.
 const BUILT_MARKER: &str = "built";
@@ -35,8 +34,8 @@ const BUILT_MARKER: &str = "built";
 const RUN_RECORD: &str = "run.json";
 /// Where looking into ROS installations has its files.
 const SURVEY_DIR: &str = "survey";
-/// How much of a log's end goes into a failure's text.
-const TAIL_BYTES: u64 = 2048;
+/// How much of a log's end goes, without its times, into a failure's text.
+const TAIL_BYTES: u64 = 3072;
 
 /// This robot.
 pub struct Robot {
@@ -106,19 +105,6 @@ impl Robot {
         let version = launch::of(manifest).ros;
         let found = underlay::setup_files(&self.installations(), version, &manifest.requires.ros_distro);
         found.map_err(|error| finally(FailureCode::REQUIREMENTS_UNMET, &error))
-    }
-
-    /// The end of the task's log.
-    fn last_lines(&self, task: &TaskName) -> String {
-        let tail = || {
-            let mut file = std::fs::File::open(self.log(task).path)?;
-            let size = file.metadata()?.len();
-            file.seek(SeekFrom::Start(size.saturating_sub(TAIL_BYTES)))?;
-            let mut bytes = Vec::new();
-            file.take(TAIL_BYTES).read_to_end(&mut bytes)?;
-            std::io::Result::Ok(String::from_utf8_lossy(&bytes).into_owned())
-        };
-        tail().unwrap_or_default()
     }
 }
 
@@ -197,7 +183,9 @@ impl Effects for Robot {
     }
 
     async fn process(&self, task: &TaskName, process: &ProcessRecord) -> ProcessState {
-        let exit = |status| ProcessState::Ended(Exit { status, last_lines: self.last_lines(task) });
+        let exit = |status| {
+            ProcessState::Ended(Exit { status, last_lines: logs::last_lines(&self.log(task).path, TAIL_BYTES) })
+        };
         match self.supervisor.observe(&self.run_dir(task, process)).await {
             Ok(Observed::NeverStarted) => ProcessState::NeverStarted,
             Ok(Observed::Running { pid, .. }) => ProcessState::Alive { pid },

@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use task_agent::environment;
 use task_agent::launch::Interrupt;
+use task_agent::logs::record::Record;
 use task_agent::process::ProcessEntry;
 use task_agent::run_dir::{LogSpec, RunSpec};
 use task_agent::supervisor::Supervisor;
@@ -67,9 +68,11 @@ impl TestRun {
         self.path("run")
     }
 
-    /// The task's output so far.
+    /// The task's output so far, without times.
     pub fn log(&self) -> String {
-        std::fs::read_to_string(&self.spec.log.path).unwrap_or_default()
+        let log = std::fs::read(&self.spec.log.path).unwrap_or_default();
+        let lines = log.split_inclusive(|byte| *byte == b'\n');
+        lines.map(|line| String::from_utf8_lossy(Record::parse(line).text).into_owned()).collect()
     }
 
     /// Waits until the task has written `text`.

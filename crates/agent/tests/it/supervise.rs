@@ -232,6 +232,22 @@ async fn a_flood_of_output_neither_blocks_the_task_nor_fills_the_disk() {
 }
 
 #[tokio::test]
+async fn output_and_errors_are_told_apart_and_a_prompt_is_not_held_back() {
+    let run = TestRun::of("mkfifo answer; echo one; echo two >&2; printf 'name? '; cat answer");
+    within("the start", run.supervisor.start(&run.run_dir(), &run.spec)).await.expect("started");
+    run.wrote("name? ").await;
+    std::fs::write(run.path("answer"), "Ada\n").expect("answered");
+    within("the end", run.supervisor.wait(&run.run_dir())).await.expect("observed");
+    let log = std::fs::read_to_string(&run.spec.log.path).expect("log");
+    let lines = log.lines().map(|line| line.split_once(' ').expect("a time").1);
+    let of = |letters: &str| lines.clone().filter(|line| line.starts_with(|c| letters.contains(c))).collect::<Vec<_>>();
+    assert_eq!(of("Oo"), ["O one", "O name? ", "o Ada"]);
+    assert_eq!((of("Ee"), of("T")), (vec!["E two"], vec!["T started"]));
+    let end = task_agent::logs::last_lines(&run.spec.log.path, 4096);
+    assert!(end.contains("name?\nAda") && !end.contains("started"), "{end}");
+}
+
+#[tokio::test]
 async fn a_log_that_cannot_be_written_does_not_stop_the_task() {
     let mut run = TestRun::of("yes | head -c 1000000; exit 6");
     run.spec.log.path = PathBuf::from("/nonexistent/task.log");

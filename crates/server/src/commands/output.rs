@@ -111,19 +111,8 @@ pub(crate) fn stderr_is_terminal() -> bool {
 
 /// Milliseconds since the Unix epoch as `2026-01-31 08:05:09Z`.
 pub(crate) fn time(ms: u64) -> String {
-    let seconds = ms / 1000;
-    let (days, second) = (seconds / 86_400, seconds % 86_400);
-    // Civil date from days, with years that begin in March so that leap days come last (Hinnant's algorithm).
-    let shifted = days + 719_468;
-    let era = shifted / 146_097;
-    let day_of_era = shifted % 146_097;
-    let year_of_era = (day_of_era - day_of_era / 1460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;
-    let day_of_year = day_of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
-    let month_from_march = (5 * day_of_year + 2) / 153;
-    let day = day_of_year - (153 * month_from_march + 2) / 5 + 1;
-    let month = if month_from_march < 10 { month_from_march + 3 } else { month_from_march - 9 };
-    let year = era * 400 + year_of_era + u64::from(month <= 2);
-    format!("{year:04}-{month:02}-{day:02} {:02}:{:02}:{:02}Z", second / 3600, second / 60 % 60, second % 60)
+    let text = task_proto::time::timestamp(ms);
+    format!("{} {}Z", &text[..10], &text[11..19])
 }
 
 /// So many robots, as people say it.

@@ -1,0 +1,165 @@
+//! A line as it lies on the disk, easy to read with `tail`:
+//!
+//! ```text
+//! 2026-11-21T10:00:00.123Z O hello
+//! 2026-11-21T10:00:00.124Z E Traceback (most recent call last):
+//! ```
+//!
+//! The letter says where the line is from: `O` standard output, `E` standard error, `R` `/rosout`, `D` `/diagnostics`, `B`
+//! the build, `T` the agent. A small letter goes on with the line before: it was too long, or its end took its time. Lines
+//! of earlier versions have no time and no letter. It never changes a text.
+
+use task_proto::log::{LogLevel, LogSource};
+use task_proto::time::{parse_timestamp, timestamp};
+
+use super::console;
+
+/// The longest text of a stored line; a longer one goes on in the next.
+pub const MAX_TEXT_BYTES: usize = 4000;
+/// Bytes of a time.
+const STAMP_BYTES: usize = 24;
+/// Bytes before the text: the time, the letter and a space behind each.
+pub const PREFIX_BYTES: usize = STAMP_BYTES + 3;
+/// Stands before each run's output.
+const START: &[u8] = b"started";
+/// Likewise, as earlier versions wrote it.
+const OLD_START: &[u8] = b"[taskd: started]";
+
+/// One stored line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Record<'a> {
+    /// When it was written, by the robot's clock.
+    pub at_ms: Option<u64>,
+    /// Where it is from.
+    pub source: Option<LogSource>,
+    /// Whether it goes on with the line before.
+    pub continues: bool,
+    /// What was said, as it came.
+    pub text: &'a [u8],
+}
+
+impl<'a> Record<'a> {
+    /// Reads a line without its end; what has no time and letter is all text.
+    pub fn parse(line: &'a [u8]) -> Self {
+        Self::stamped(line).unwrap_or(Self { at_ms: None, source: None, continues: false, text: line })
+    }
+
+    fn stamped(line: &'a [u8]) -> Option<Self> {
+        let (prefix, text) = line.split_at_checked(PREFIX_BYTES)?;
+        let prefix = std::str::from_utf8(prefix).ok()?;
+        let (stamp, letter) = prefix.split_at_checked(STAMP_BYTES)?;
+        let letter = letter.strip_prefix(' ')?.strip_suffix(' ')?;
+        let source = source_of(letter.bytes().next()?.to_ascii_uppercase())?;
+        let continues = letter.bytes().all(|byte| byte.is_ascii_lowercase());
+        Some(Self { at_ms: Some(parse_timestamp(stamp)?), source: Some(source), continues, text })
+    }
+
+    /// Whether a run begins here.
+    pub fn is_start(&self) -> bool {
+        match self.source {
+            Some(source) => source == LogSource::Agent && self.text == START,
+            None => self.text == OLD_START,
+        }
+    }
+
+    /// How serious it is: what it says itself, else what its source stands for. `unmarked` is the source of a line that
+    /// names none.
+    pub fn level(&self, unmarked: LogSource) -> LogLevel {
+        let by_source = match self.source.unwrap_or(unmarked) {
+            LogSource::Stderr => LogLevel::Warn,
+            _ => LogLevel::Info,
+        };
+        // Most lines have no bracket near their beginning, and this is asked of each.
+        let may_say = self.text.iter().take(64).any(|byte| *byte == b'[');
+        let said = may_say.then(|| console::parse(&console::printable(self.text)).map(|said| said.level)).flatten();
+        said.unwrap_or(by_source)
+    }
+}
+
+/// Adds one line to `log`.
+pub fn write(log: &mut Vec<u8>, stamp: &str, source: LogSource, continues: bool, text: &[u8]) {
+    let letter = letter_of(source);
+    log.extend_from_slice(stamp.as_bytes());
+    log.extend_from_slice(&[b' ', if continues { letter.to_ascii_lowercase() } else { letter }, b' ']);
+    log.extend_from_slice(text);
+    log.push(b'\n');
+}
+
+/// Adds the line that a run begins with.
+pub fn write_start(log: &mut Vec<u8>, now_ms: u64) {
+    write(log, &timestamp(now_ms), LogSource::Agent, false, START);
+}
+
+fn letter_of(source: LogSource) -> u8 {
+    match source {
+        LogSource::Stdout => b'O',
+        LogSource::Stderr => b'E',
+        LogSource::Rosout => b'R',
+        LogSource::Diagnostics => b'D',
+        LogSource::Build => b'B',
+        LogSource::Agent => b'T',
+    }
+}
+
+fn source_of(letter: u8) -> Option<LogSource> {
+    Some(match letter {
+        b'O' => LogSource::Stdout,
+        b'E' => LogSource::Stderr,
+        b'R' => LogSource::Rosout,
+        b'D' => LogSource::Diagnostics,
+        b'B' => LogSource::Build,
+        b'T' => LogSource::Agent,
+        _ => return None,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const STAMP: &str = "2026-11-21T10:00:00.123Z";
+
+    #[test]
+    fn a_stored_line_reads_back_whatever_its_bytes() {
+        for (source, continues) in [(LogSource::Stdout, false), (LogSource::Diagnostics, true)] {
+            let mut log = Vec::new();
+            write(&mut log, STAMP, source, continues, b"\xff O \x1b[0m");
+            let record = Record::parse(log.strip_suffix(b"\n").expect("a line"));
+            assert_eq!(record.at_ms, parse_timestamp(STAMP));
+            assert_eq!(
+                (record.source, record.continues, record.text),
+                (Some(source), continues, &b"\xff O \x1b[0m"[..])
+            );
+        }
+        let mut log = Vec::new();
+        write_start(&mut log, 5);
+        assert_eq!(log, b"1970-01-01T00:00:00.005Z T started\n");
+        assert!(Record::parse(log.trim_ascii_end()).is_start());
+    }
+
+    #[test]
+    fn lines_of_earlier_versions_and_damaged_ones_are_text() {
+        for line in [
+            "",
+            "hello",
+            "2026-11-21T10:00:00.123Z",
+            "2026-11-21T10:00:00.123Z X text",
+            "2026-11-21T10:00:00.123ZOOtext é",
+        ] {
+            let record = Record::parse(line.as_bytes());
+            assert_eq!((record.at_ms, record.source, record.text), (None, None, line.as_bytes()));
+        }
+        assert!(Record::parse(b"[taskd: started]").is_start());
+        assert!(!Record::parse(b"started").is_start());
+    }
+
+    #[test]
+    fn the_level_is_what_the_line_says_or_its_source() {
+        let level = |line: &str| Record::parse(line.as_bytes()).level(LogSource::Stdout);
+        assert_eq!(level("plain"), LogLevel::Info);
+        assert_eq!(level(&format!("{STAMP} O plain")), LogLevel::Info);
+        assert_eq!(level(&format!("{STAMP} E [plain]")), LogLevel::Warn);
+        assert_eq!(level(&format!("{STAMP} E [INFO] [1.2] [node]: text")), LogLevel::Info);
+        assert_eq!(level(&format!("{STAMP} O \x1b[31m[FATAL] [1.2]: text")), LogLevel::Fatal);
+    }
+}

@@ -7,6 +7,7 @@ use crate::desired::{Delivery, PackageRef, Wanted};
 use crate::envelope::PublicKey;
 use crate::id::Labels;
 use crate::manifest::{TaskKind, TaskManifest};
+use crate::output::OutputSet;
 use crate::report::{ActiveVersion, Condition, Failure, HostFacts, Phase, Progress};
 use crate::selector::Selector;
 use crate::topic::TopicPrefix;
@@ -278,6 +279,28 @@ pub struct PackageView {
     pub pushed_at_ms: u64,
     /// Its manifest.
     pub manifest: TaskManifest,
+}
+
+/// `GET /outputs` (operator), optionally `?robot=` (id or name) and `?task=`. The files are read from
+/// `/v2/outputs/<robot id>/<task>/blobs/<digest>`.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+pub struct OutputList {
+    /// The newest first, at most 1,000.
+    pub outputs: Vec<OutputView>,
+}
+
+/// What one run brought back.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct OutputView {
+    /// The robot's name.
+    pub robot_name: RobotName,
+    /// The artifact's manifest.
+    pub manifest: Digest,
+    /// When it came.
+    pub pushed_at_ms: u64,
+    /// Which run, and its files.
+    #[serde(flatten)]
+    pub output: OutputSet,
 }
 
 /// `POST /deployments` (operator), with an `Idempotency-Key` header.

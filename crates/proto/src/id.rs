@@ -138,6 +138,16 @@ text_id!(
     }
 );
 text_id!(
+    /// A file that came back from a task, by its path below the task's directory. It can't leave the directory it is
+    /// written into.
+    OutputPath, "path of an output",
+    "at most 1024 bytes of printable names, none of them '.' or '..', joined by single '/'", |t| {
+        t.len() <= 1024
+            && !t.chars().any(char::is_control)
+            && t.split('/').all(|name| !matches!(name, "" | "." | "..") && !name.contains('\\'))
+    }
+);
+text_id!(
     /// A name for a manifest inside its repository.
     Tag, "tag", "at most 128 letters, digits, '.', '_' and '-', not starting with '.' or '-'", |t| {
         t.len() <= 128

@@ -9,6 +9,7 @@ pub mod id;
 pub mod log;
 pub mod manifest;
 pub mod oci;
+pub mod output;
 pub mod report;
 pub mod request;
 pub mod ros;

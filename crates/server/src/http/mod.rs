@@ -13,6 +13,7 @@ pub mod extract;
 mod health;
 pub mod listener;
 pub mod oci;
+mod outputs;
 mod packages;
 mod robots;
 pub mod session;
@@ -167,6 +168,7 @@ pub fn routes() -> Vec<Route> {
             .body_bytes(REPORT_BODY_BYTES),
         Route::new(post.clone(), "/api/v1/robots/{robot}/ask", Operator, ask::ask),
         Route::new(get.clone(), "/api/v1/packages", Operator, packages::list),
+        Route::new(get.clone(), "/api/v1/outputs", Operator, outputs::list),
         Route::new(get.clone(), "/api/v1/deployments", Operator, deployments::list),
         Route::new(post.clone(), "/api/v1/deployments", Operator, deployments::create).body_bytes(ORDER_BODY_BYTES),
         Route::new(get.clone(), "/api/v1/deployments/{deployment}", Operator, deployments::show),

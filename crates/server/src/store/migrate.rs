@@ -11,6 +11,7 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[
     (1, "fleet", include_str!("../migrations/0001_fleet.sql")),
     (2, "packages", include_str!("../migrations/0002_packages.sql")),
     (3, "token_rotation", include_str!("../migrations/0003_token_rotation.sql")),
+    (4, "outputs", include_str!("../migrations/0004_outputs.sql")),
 ];
 
 /// Applies what has not been applied yet.

@@ -8,6 +8,7 @@ mod assignments;
 mod deployments;
 mod migrate;
 mod orders;
+mod outputs;
 mod packages;
 mod reports;
 mod robots;

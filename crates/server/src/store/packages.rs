@@ -9,6 +9,7 @@ use task_proto::api::PackageView;
 use task_proto::desired::{BlobRef, PackageRef};
 use task_proto::manifest::TaskManifest;
 use task_proto::oci::Descriptor;
+use task_proto::output::OutputSet;
 use task_proto::{Digest, RepositoryName, Tag, TaskName};
 
 use super::{Store, StoreError, Write, rows};
@@ -50,6 +51,8 @@ pub struct NewManifest {
     pub tags: Vec<Tag>,
     /// What it says if it is a task package.
     pub package: Option<(PackageRef, TaskManifest)>,
+    /// What it says if it is the output of a run.
+    pub output: Option<OutputSet>,
 }
 
 /// How storing a manifest ended.
@@ -85,6 +88,11 @@ impl Store {
         }
         if let Some((package, task_manifest)) = &new.package {
             write.insert_package(package, task_manifest, now_ms).await?;
+        }
+        if let Some(output) = &new.output {
+            for surplus in write.insert_output(repository, &new.manifest.digest, output, now_ms).await? {
+                write.delete_manifest(repository, &surplus).await?;
+            }
         }
         write.commit().await?;
         Ok(PutManifest::Stored)
@@ -128,26 +136,9 @@ impl Store {
         digest: &Digest,
     ) -> Result<Option<Vec<Digest>>, StoreError> {
         let mut write = self.begin().await?;
-        let parts: Vec<String> =
-            sqlx::query_scalar("DELETE FROM manifest_parts WHERE repository = $1 AND manifest = $2 RETURNING digest")
-                .bind(repository.as_str())
-                .bind(digest.to_string())
-                .fetch_all(write.connection())
-                .await?;
-        let mut deleted = 0;
-        for sql in [
-            "DELETE FROM packages WHERE name = $1 AND manifest = $2",
-            "DELETE FROM tags WHERE repository = $1 AND manifest = $2",
-            "DELETE FROM manifests WHERE repository = $1 AND digest = $2",
-        ] {
-            let query = sqlx::query(sql).bind(repository.as_str()).bind(digest.to_string());
-            deleted = query.execute(write.connection()).await?.rows_affected();
-        }
+        let parts = write.delete_manifest(repository, digest).await?;
         write.commit().await?;
-        if deleted == 0 {
-            return Ok(None);
-        }
-        parts.iter().map(|part| rows::id("manifest_parts.digest", part)).collect::<Result<_, _>>().map(Some)
+        Ok(parts)
     }
 
     /// Removes a tag; false if it was not there.
@@ -287,6 +278,33 @@ impl Store {
 }
 
 impl Write {
+    async fn delete_manifest(
+        &mut self,
+        repository: &RepositoryName,
+        digest: &Digest,
+    ) -> Result<Option<Vec<Digest>>, StoreError> {
+        let parts: Vec<String> =
+            sqlx::query_scalar("DELETE FROM manifest_parts WHERE repository = $1 AND manifest = $2 RETURNING digest")
+                .bind(repository.as_str())
+                .bind(digest.to_string())
+                .fetch_all(self.connection())
+                .await?;
+        let mut deleted = 0;
+        for sql in [
+            "DELETE FROM packages WHERE name = $1 AND manifest = $2",
+            "DELETE FROM outputs WHERE repository = $1 AND manifest = $2",
+            "DELETE FROM tags WHERE repository = $1 AND manifest = $2",
+            "DELETE FROM manifests WHERE repository = $1 AND digest = $2",
+        ] {
+            let query = sqlx::query(sql).bind(repository.as_str()).bind(digest.to_string());
+            deleted = query.execute(self.connection()).await?.rows_affected();
+        }
+        if deleted == 0 {
+            return Ok(None);
+        }
+        parts.iter().map(|part| rows::id("manifest_parts.digest", part)).collect::<Result<_, _>>().map(Some)
+    }
+
     async fn repository_holds(&mut self, repository: &RepositoryName, part: &Digest) -> Result<bool, StoreError> {
         let found = sqlx::query(
             "SELECT digest FROM repository_blobs WHERE repository = $1 AND digest = $2

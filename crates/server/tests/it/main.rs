@@ -13,6 +13,7 @@ mod mqtt;
 mod mqtt_harness;
 mod mqtt_hostile;
 mod oci;
+mod outputs;
 mod packages;
 mod page;
 mod registry;

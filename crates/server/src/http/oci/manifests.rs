@@ -11,11 +11,13 @@ use http::{HeaderValue, StatusCode};
 use task_proto::desired::{BlobRef, PackageRef};
 use task_proto::manifest::TaskManifest;
 use task_proto::oci::{ImageManifest, PACKAGE_TYPE};
+use task_proto::output::{MAX_FILES, OutputSet};
 use task_proto::{Digest, RepositoryName, Tag};
 
 use super::blobs::serve;
 use super::parsed::Parsed;
 use super::{Answer, OciError, Registry, empty};
+use crate::blobs::Blob;
 use crate::store::{NewManifest, PutManifest, Reference, StoredManifest};
 
 /// The largest manifest; the specification asks for at least this.
@@ -45,13 +47,15 @@ pub(super) async fn get(
     serve(&blob, request, content_type, HeaderValue::from_static(cache))
 }
 
-/// `PUT`: stores the exact bytes, if all they refer to is in the repository.
+/// `PUT`: stores the exact bytes, if all they refer to is in the repository. Of a caller who may push `only` one type of
+/// artifact, no other is taken.
 pub(super) async fn put(
     registry: &Registry,
     repository: &RepositoryName,
     reference: Reference,
     parts: &Parts,
     body: Body,
+    only: Option<&str>,
 ) -> Answer {
     let bytes = read_body(body).await?;
     let digest = Digest::of(&bytes);
@@ -63,12 +67,19 @@ pub(super) async fn put(
     }
     let content_type = parts.headers.get(CONTENT_TYPE).and_then(|value| value.to_str().ok());
     let parsed = Parsed::new(content_type, &bytes)?;
+    if only.is_some_and(|only| parsed.artifact_type.as_deref() != Some(only)) {
+        return Err(OciError::denied("a robot may only push outputs"));
+    }
 
     // From here until the manifest is stored, nothing it is made of may be collected.
     let _hold = registry.blobs.hold_collection().await;
     let manifest = BlobRef { digest, size: bytes.len() as u64 };
     let package = match &parsed.package {
         Some(image) => Some(check_package(registry, repository, manifest, image).await?),
+        None => None,
+    };
+    let output = match &parsed.output {
+        Some(image) => Some(check_output(registry, repository, image).await?),
         None => None,
     };
     let now_ms = registry.clock.now_ms();
@@ -83,6 +94,7 @@ pub(super) async fn put(
         parts: parsed.parts,
         tags,
         package,
+        output,
     };
     match registry.store.put_manifest(repository, &new, now_ms).await? {
         PutManifest::PartsMissing(missing) => Err(OciError::parts_unknown(&missing)),
@@ -134,6 +146,50 @@ fn tags_to_set(parts: &Parts, reference: &Reference) -> Result<Vec<Tag>, OciErro
     tags.map(|(_, tag)| tag.parse().map_err(|error| OciError::tag_invalid(&error))).collect()
 }
 
+/// Reads what an output's config blob says of it, which must be true.
+async fn check_output(
+    registry: &Registry,
+    repository: &RepositoryName,
+    image: &ImageManifest,
+) -> Result<OutputSet, OciError> {
+    let config = image.config.blob();
+    let output: OutputSet = serde_json::from_slice(&read_config(registry, repository, config).await?)
+        .map_err(|error| OciError::manifest_invalid(format!("the config does not describe an output: {error}")))?;
+    if output.repository().as_ref() != Some(repository) {
+        let message = format!("the output of {} on {} belongs into its own repository", output.task, output.robot_id);
+        return Err(OciError::manifest_invalid(message));
+    }
+    if output.files.len() > MAX_FILES || output.manifest(config) != *image {
+        let message =
+            format!("the manifest is not that of the output in its config, or it has more than {MAX_FILES} files");
+        return Err(OciError::manifest_invalid(message));
+    }
+    for file in &output.files {
+        check_blob(registry, repository, file.blob).await?;
+    }
+    Ok(output)
+}
+
+/// Whether a blob is in the repository and as large as it is said to be.
+async fn check_blob(registry: &Registry, repository: &RepositoryName, part: BlobRef) -> Result<Blob, OciError> {
+    let is_here = registry.store.has_blob(Some(repository), &part.digest).await?;
+    let blob = if is_here { registry.blobs.get(part.digest).await? } else { None };
+    let blob = blob.ok_or_else(|| OciError::parts_unknown(&[part.digest]))?;
+    if blob.size() != part.size {
+        let message = format!("the blob {} has {} bytes, its descriptor says {}", part.digest, blob.size(), part.size);
+        return Err(OciError::manifest_invalid(message));
+    }
+    Ok(blob)
+}
+
+async fn read_config(registry: &Registry, repository: &RepositoryName, config: BlobRef) -> Result<Bytes, OciError> {
+    let blob = check_blob(registry, repository, config).await?;
+    if config.size > MAX_CONFIG_BYTES {
+        return Err(OciError::manifest_invalid(format!("the config has more than {MAX_CONFIG_BYTES} bytes")));
+    }
+    Ok(blob.read().await?)
+}
+
 /// Reads the task manifest out of a package's config blob and holds it to its rules.
 async fn check_package(
     registry: &Registry,
@@ -146,20 +202,8 @@ async fn check_package(
             format!("a manifest of artifactType {PACKAGE_TYPE} needs its config and one layer of its own types");
         return Err(OciError::manifest_invalid(message));
     };
-    for part in [config, content] {
-        let is_here = registry.store.has_blob(Some(repository), &part.digest).await?;
-        let blob = if is_here { registry.blobs.get(part.digest).await? } else { None };
-        let size = blob.ok_or_else(|| OciError::parts_unknown(&[part.digest]))?.size();
-        if size != part.size {
-            let message = format!("the blob {} has {size} bytes, its descriptor says {}", part.digest, part.size);
-            return Err(OciError::manifest_invalid(message));
-        }
-    }
-    if config.size > MAX_CONFIG_BYTES {
-        return Err(OciError::manifest_invalid(format!("the config has more than {MAX_CONFIG_BYTES} bytes")));
-    }
-    let blob = registry.blobs.get(config.digest).await?.ok_or_else(|| OciError::parts_unknown(&[config.digest]))?;
-    let task: TaskManifest = serde_json::from_slice(&blob.read().await?)
+    check_blob(registry, repository, content).await?;
+    let task: TaskManifest = serde_json::from_slice(&read_config(registry, repository, config).await?)
         .map_err(|error| OciError::manifest_invalid(format!("the config is not a task manifest: {error}")))?;
     let mut problems: Vec<String> = task.problems().iter().map(ToString::to_string).collect();
     if task.name.as_str() != repository.as_str() {

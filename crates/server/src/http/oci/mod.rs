@@ -1,5 +1,5 @@
 //! The registry: the OCI distribution API v1.1, pull and push, under `/v2/`. Operators may do everything, a robot reads the
-//! blobs of the packages it should have. What a repository holds is the store's, the bytes are the blob store's.
+//! blobs of the packages it should have and pushes outputs into its own repositories. What a repository holds is the store's, the bytes are the blob store's.
 
 mod blobs;
 mod error;
@@ -12,7 +12,8 @@ use axum::extract::{Path, Request, State};
 use axum::response::{IntoResponse, Response};
 use http::{HeaderMap, HeaderValue, Method, StatusCode, Uri};
 use serde::de::DeserializeOwned;
-use task_proto::{Digest, RepositoryName};
+use task_proto::output::{self, OUTPUT_TYPE};
+use task_proto::{Digest, RepositoryName, RobotId};
 
 pub use error::OciError;
 
@@ -89,12 +90,15 @@ pub async fn dispatch(State(registry): State<Registry>, Path(path): Path<String>
     };
     let repository: RepositoryName = name.parse().map_err(|error| OciError::name_invalid(&error))?;
     let method = parts.method.clone();
-    if let Some(robot) = caller.as_ref().and_then(Caller::robot) {
+    let robot = caller.as_ref().and_then(Caller::robot);
+    if let Some(robot) = robot
+        && !may_push(robot, &repository, &method, &endpoint)
+    {
         return match (&method, endpoint) {
             (&Method::GET | &Method::HEAD, Endpoint::Blob(digest)) => {
                 blobs::get_for_robot(&registry, robot, parse_digest(digest)?, &parts).await
             }
-            _ => Err(OciError::denied("a robot may only read blobs")),
+            _ => Err(OciError::denied("a robot may only read its packages' blobs and push its own outputs")),
         };
     }
     match endpoint {
@@ -107,7 +111,10 @@ pub async fn dispatch(State(registry): State<Registry>, Path(path): Path<String>
                 _ => Err(OciError::method("GET, HEAD, DELETE")),
             }
         }
-        Endpoint::Uploads if method == Method::POST => uploads::begin(&registry, &repository, &parts, body).await,
+        Endpoint::Uploads if method == Method::POST => {
+            let may_mount = robot.is_none();
+            uploads::begin(&registry, &repository, &parts, body, may_mount).await
+        }
         Endpoint::Uploads => Err(OciError::method("POST")),
         Endpoint::Upload(id) => {
             let id = id.parse().map_err(|_| OciError::upload_unknown())?;
@@ -124,7 +131,10 @@ pub async fn dispatch(State(registry): State<Registry>, Path(path): Path<String>
             let reference = parse_reference(reference);
             match method {
                 Method::GET | Method::HEAD => manifests::get(&registry, &repository, reference, &parts).await,
-                Method::PUT => manifests::put(&registry, &repository, reference?, &parts, body).await,
+                Method::PUT => {
+                    let only = robot.map(|_| OUTPUT_TYPE);
+                    manifests::put(&registry, &repository, reference?, &parts, body, only).await
+                }
                 Method::DELETE => manifests::delete(&registry, &repository, reference?).await,
                 _ => Err(OciError::method("GET, HEAD, PUT, DELETE")),
             }
@@ -133,6 +143,18 @@ pub async fn dispatch(State(registry): State<Registry>, Path(path): Path<String>
         Endpoint::Tags => lists::tags(&registry, &repository, &parts).await,
         Endpoint::Referrers(subject) => lists::referrers(&registry, &repository, subject, &parts).await,
     }
+}
+
+/// Whether this is part of pushing one of the robot's own outputs. It deletes nothing and reads nothing back.
+fn may_push(robot: &RobotId, repository: &RepositoryName, method: &Method, endpoint: &Endpoint<'_>) -> bool {
+    let is_own = output::owner(repository).is_some_and(|(owner, _)| owner == *robot);
+    is_own
+        && match endpoint {
+            Endpoint::Blob(_) => *method == Method::HEAD,
+            Endpoint::Uploads | Endpoint::Upload(_) => true,
+            Endpoint::Manifest(_) => matches!(*method, Method::PUT | Method::HEAD),
+            Endpoint::Tags | Endpoint::Referrers(_) => false,
+        }
 }
 
 fn parse_digest(text: &str) -> Result<Digest, OciError> {

@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use serde::Deserialize;
 use task_proto::Digest;
 use task_proto::oci::{INDEX_TYPE, ImageManifest, MANIFEST_TYPE, PACKAGE_TYPE};
+use task_proto::output::OUTPUT_TYPE;
 
 use super::OciError;
 
@@ -29,6 +30,8 @@ pub(super) struct Parsed {
     pub(super) parts: Vec<Digest>,
     /// The manifest in full, if it is meant to be a task package.
     pub(super) package: Option<ImageManifest>,
+    /// The same, if it is meant to be the output of a run.
+    pub(super) output: Option<ImageManifest>,
 }
 
 #[derive(Deserialize)]
@@ -66,8 +69,11 @@ impl Parsed {
         let document: Document = serde_json::from_slice(bytes).map_err(invalid)?;
         let media_type = media_type(content_type, document.media_type.as_deref())?;
         document.check_kind(&media_type)?;
-        let is_package = document.artifact_type.as_deref() == Some(PACKAGE_TYPE);
-        let package = is_package.then(|| serde_json::from_slice(bytes).map_err(invalid)).transpose()?;
+        let whole_if = |kind: &str| {
+            let is_meant = document.artifact_type.as_deref() == Some(kind);
+            is_meant.then(|| serde_json::from_slice(bytes).map_err(invalid)).transpose()
+        };
+        let (package, output) = (whole_if(PACKAGE_TYPE)?, whole_if(OUTPUT_TYPE)?);
         let config_type = document.config.as_ref().map(|config| config.media_type.clone());
         let parsed = Self {
             media_type,
@@ -76,6 +82,7 @@ impl Parsed {
             annotations: document.annotations.unwrap_or_default(),
             subject: document.subject.map(|subject| subject.digest),
             package,
+            output,
         };
         parsed.check_texts()?;
         Ok(parsed)

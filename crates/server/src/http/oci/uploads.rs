@@ -27,14 +27,21 @@ struct FinishQuery {
 }
 
 /// `POST /v2/<name>/blobs/uploads/`: begins an upload, or does all of it if `digest` or `mount` is given.
-pub(super) async fn begin(registry: &Registry, repository: &RepositoryName, parts: &Parts, body: Body) -> Answer {
+/// A mount that may not be, because it would show what another repository holds, begins an upload instead.
+pub(super) async fn begin(
+    registry: &Registry,
+    repository: &RepositoryName,
+    parts: &Parts,
+    body: Body,
+    may_mount: bool,
+) -> Answer {
     let query: BeginQuery = query(&parts.uri)?;
     if query.digest_algorithm.is_some_and(|algorithm| algorithm != "sha256") {
         return Err(OciError::digest_invalid("only sha256 is supported"));
     }
     if let Some(digest) = &query.mount {
         let digest = parse_digest(digest)?;
-        if mount(registry, repository, digest, query.from.as_deref()).await? {
+        if may_mount && mount(registry, repository, digest, query.from.as_deref()).await? {
             return created(repository, &digest);
         }
     } else if let Some(digest) = &query.digest {

@@ -1,0 +1,87 @@
+//! Outputs of runs: which files came back from which robot. The bytes lie in the blob store, under the robot's repository.
+
+use sqlx::Row as _;
+use task_proto::api::OutputView;
+use task_proto::output::OutputSet;
+use task_proto::{Digest, RepositoryName, RobotId, TaskName};
+
+use super::{Store, StoreError, Write, rows};
+
+/// The newest runs kept of one task on one robot.
+const KEPT: usize = 10;
+/// The most outputs listed.
+const MAX_LISTED: i64 = 1000;
+
+impl Store {
+    /// The newest outputs first, of one robot or of all, of one task or of all; at most 1,000.
+    pub async fn outputs(
+        &self,
+        robot: Option<&RobotId>,
+        task: Option<&TaskName>,
+    ) -> Result<Vec<OutputView>, StoreError> {
+        let found = sqlx::query(
+            "SELECT o.manifest, o.output, o.pushed_at_ms, r.name FROM outputs o JOIN robots r ON r.id = o.robot_id
+             WHERE ($1 = '' OR o.robot_id = $1) AND ($2 = '' OR o.task = $2)
+             ORDER BY o.pushed_at_ms DESC, o.manifest LIMIT $3",
+        )
+        .bind(robot.map_or("", RobotId::as_str))
+        .bind(task.map_or("", TaskName::as_str))
+        .bind(MAX_LISTED)
+        .fetch_all(&self.reads)
+        .await?;
+        let view = |row: &sqlx::any::AnyRow| {
+            Ok(OutputView {
+                robot_name: rows::id("robots.name", row.try_get("name")?)?,
+                manifest: rows::id("outputs.manifest", row.try_get("manifest")?)?,
+                pushed_at_ms: rows::number(row.try_get("pushed_at_ms")?),
+                output: rows::from_json("outputs.output", row.try_get("output")?)?,
+            })
+        };
+        found.iter().map(view).collect()
+    }
+}
+
+impl Write {
+    /// Notes an output, which takes the place of an earlier one of the same run. Gives the manifests of its repository
+    /// that are too many now.
+    pub(super) async fn insert_output(
+        &mut self,
+        repository: &RepositoryName,
+        manifest: &Digest,
+        output: &OutputSet,
+        now_ms: u64,
+    ) -> Result<Vec<Digest>, StoreError> {
+        let tag = format!("{}-{}", output.deployment, output.run);
+        sqlx::query(
+            "INSERT INTO outputs (repository, manifest, robot_id, task, tag, output, pushed_at_ms)
+             VALUES ($1, $2, $3, $4, $5, $6, $7)
+             ON CONFLICT (repository, manifest) DO UPDATE SET pushed_at_ms = excluded.pushed_at_ms",
+        )
+        .bind(repository.as_str())
+        .bind(manifest.to_string())
+        .bind(output.robot_id.as_str())
+        .bind(output.task.as_str())
+        .bind(&tag)
+        .bind(rows::json(output))
+        .bind(rows::stored(now_ms))
+        .execute(self.connection())
+        .await?;
+        let others = sqlx::query(
+            "SELECT manifest, tag FROM outputs WHERE repository = $1 AND manifest <> $2
+             ORDER BY pushed_at_ms DESC, manifest",
+        )
+        .bind(repository.as_str())
+        .bind(manifest.to_string())
+        .fetch_all(self.connection())
+        .await?;
+        let (mut surplus, mut kept) = (Vec::new(), 1);
+        for row in &others {
+            if row.try_get::<&str, _>("tag")? == tag || kept >= KEPT {
+                surplus.push(rows::id("outputs.manifest", row.try_get("manifest")?)?);
+            } else {
+                kept += 1;
+            }
+        }
+        Ok(surplus)
+    }
+}

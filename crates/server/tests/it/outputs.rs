@@ -1,0 +1,126 @@
+//! Files that come back from robots: pushed by the robot into its own repository, listed and read by operators.
+
+use reqwest::{Method, StatusCode};
+use task_proto::Digest;
+use task_proto::api::OutputList;
+use task_proto::desired::BlobRef;
+use task_proto::oci::MANIFEST_TYPE;
+use task_proto::output::{OutputFile, OutputSet};
+
+use crate::harness::{TestRobot, TestServer, refusal};
+
+/// A push in the robot's name, blob by blob.
+struct Push<'a> {
+    server: &'a TestServer,
+    robot: &'a TestRobot,
+    repository: String,
+}
+
+impl<'a> Push<'a> {
+    fn new(server: &'a TestServer, robot: &'a TestRobot, repository: String) -> Self {
+        Self { server, robot, repository }
+    }
+
+    fn ask(&self, method: Method, rest: &str) -> reqwest::RequestBuilder {
+        self.server.bare(method, &format!("/v2/{}/{rest}", self.repository)).bearer_auth(&self.robot.token)
+    }
+
+    async fn blob(&self, bytes: &[u8]) -> BlobRef {
+        let digest = Digest::of(bytes);
+        let request = self.ask(Method::POST, &format!("blobs/uploads/?digest={digest}")).body(bytes.to_vec());
+        assert_eq!(request.send().await.expect("an answer").status(), StatusCode::CREATED);
+        BlobRef { digest, size: bytes.len() as u64 }
+    }
+
+    async fn output(&self, output: &OutputSet) -> StatusCode {
+        let config = self.blob(&serde_json::to_vec(output).expect("json")).await;
+        let manifest = serde_json::to_vec(&output.manifest(config)).expect("json");
+        let tag = output.tag().expect("a tag");
+        let put = self.ask(Method::PUT, &format!("manifests/{tag}")).header("content-type", MANIFEST_TYPE);
+        put.body(manifest).send().await.expect("an answer").status()
+    }
+}
+
+fn output(robot: &TestRobot, run: u64, files: Vec<OutputFile>) -> OutputSet {
+    OutputSet {
+        robot_id: robot.id.clone(),
+        task: "mapping".parse().expect("valid"),
+        version: "1.0.0".parse().expect("valid"),
+        deployment: "d00000000000000b2".parse().expect("valid"),
+        run,
+        files,
+    }
+}
+
+fn file(path: &str, blob: BlobRef) -> OutputFile {
+    OutputFile { path: path.parse().expect("valid"), blob }
+}
+
+#[tokio::test]
+async fn a_robot_brings_files_back_and_operators_read_them() {
+    let server = TestServer::start().await;
+    let robot = server.enroll("atlas").await;
+    let push = Push::new(&server, &robot, format!("outputs/{}/mapping", robot.id));
+    let map = push.blob(b"P5 1 1 255 x").await;
+    for run in 1..=12 {
+        let set = output(&robot, run, vec![file("maps/corridor.pgm", map)]);
+        server.clock.advance_ms(1000);
+        assert_eq!(push.output(&set).await, StatusCode::CREATED, "run {run}");
+        assert_eq!(push.output(&set).await, StatusCode::CREATED, "run {run}, whose answer was lost");
+    }
+    let corrected = output(&robot, 12, vec![file("maps/other.pgm", map)]);
+    assert_eq!(push.output(&corrected).await, StatusCode::CREATED);
+
+    let list: OutputList = server.get("/api/v1/outputs?robot=atlas&task=mapping").await;
+    assert_eq!(list.outputs.len(), 10, "the newest runs are kept, each once: {list:?}");
+    assert!(list.outputs.iter().any(|view| view.output == corrected && view.robot_name.as_str() == "atlas"));
+    assert!(list.outputs.iter().all(|view| view.output.run > 2), "the oldest went: {list:?}");
+    let other: OutputList = server.get("/api/v1/outputs?task=other").await;
+    assert!(other.outputs.is_empty());
+
+    let bytes = server.request(Method::GET, &format!("/v2/outputs/{}/mapping/blobs/{}", robot.id, map.digest));
+    assert_eq!(bytes.send().await.expect("an answer").bytes().await.expect("a body"), &b"P5 1 1 255 x"[..]);
+}
+
+#[tokio::test]
+async fn a_robot_pushes_nothing_else_and_nowhere_else() {
+    let server = TestServer::start().await;
+    let (robot, other) = (server.enroll("atlas").await, server.enroll("husky").await);
+    let secret = server.push("secret", "1.0.0").await;
+    let own = Push::new(&server, &robot, format!("outputs/{}/mapping", robot.id));
+    let foreign = [format!("outputs/{}/mapping", other.id), "secret".to_owned(), "outputs".to_owned()];
+    for repository in foreign {
+        let push = Push::new(&server, &robot, repository);
+        for (method, rest) in [
+            (Method::POST, "blobs/uploads/"),
+            (Method::PUT, "manifests/latest"),
+            (Method::HEAD, &*format!("blobs/{}", secret.content.digest)),
+        ] {
+            let status = push.ask(method.clone(), rest).send().await.expect("an answer").status();
+            assert_eq!(status, StatusCode::FORBIDDEN, "{method} {rest} in {}", push.repository);
+        }
+    }
+    // What another repository holds is neither shown nor mounted.
+    let mount = own.ask(Method::POST, &format!("blobs/uploads/?mount={}&from=secret", secret.content.digest));
+    assert_eq!(mount.send().await.expect("an answer").status(), StatusCode::ACCEPTED, "an upload was begun instead");
+    let head = own.ask(Method::HEAD, &format!("blobs/{}", secret.content.digest));
+    assert_eq!(head.send().await.expect("an answer").status(), StatusCode::NOT_FOUND);
+
+    let map = own.blob(b"x").await;
+    let package = task_proto::oci::ImageManifest::package(map, map);
+    let put = own.ask(Method::PUT, "manifests/latest").header("content-type", MANIFEST_TYPE).json(&package);
+    assert_eq!(put.send().await.expect("an answer").status(), StatusCode::FORBIDDEN, "no package");
+    let lie = OutputSet { robot_id: other.id.clone(), ..output(&robot, 1, vec![file("a", map)]) };
+    assert_eq!(own.output(&lie).await, StatusCode::BAD_REQUEST, "another robot's");
+    let larger = BlobRef { size: 2, ..map };
+    assert_eq!(own.output(&output(&robot, 1, vec![file("a", larger)])).await, StatusCode::BAD_REQUEST, "a wrong size");
+    let missing = BlobRef { digest: Digest::of(b"never pushed"), size: 1 };
+    assert_ne!(own.output(&output(&robot, 1, vec![file("a", missing)])).await, StatusCode::CREATED, "a missing file");
+    let delete = own.ask(Method::DELETE, &format!("blobs/{}", map.digest));
+    assert_eq!(delete.send().await.expect("an answer").status(), StatusCode::FORBIDDEN);
+
+    let list: OutputList = server.get("/api/v1/outputs").await;
+    assert!(list.outputs.is_empty(), "{list:?}");
+    let unknown = refusal(server.request(Method::GET, "/api/v1/outputs?robot=nobody")).await;
+    assert_eq!(unknown, (404, "not_found".to_owned()));
+}

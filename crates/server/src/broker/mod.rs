@@ -2,6 +2,7 @@
 //! It asks a [`Gatekeeper`] who may come in and hands messages to an [`Inbox`]; it never stores anything and knows no
 //! payloads. An external broker would be another start function that returns the same [`Broker`].
 
+mod fan_out;
 mod front;
 mod router;
 mod watchdog;
@@ -13,11 +14,12 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use futures_util::future::BoxFuture;
-use task_proto::RobotId;
 use task_proto::api::{MqttTraffic, Traffic};
 use task_proto::topic::{RobotTopic, TopicPrefix};
+use task_proto::{Digest, RobotId};
 use tokio::sync::watch;
 
+pub use fan_out::{FanOut, FanOutError, MAX_PART_BYTES};
 use front::Front;
 use router::Router;
 
@@ -126,6 +128,8 @@ pub struct Limits {
     pub max_silent_per_address: usize,
     /// Operators among them.
     pub max_operators: usize,
+    /// Robots that hear some package's parts at the same time.
+    pub max_part_listeners: usize,
     /// The largest packet of an admitted client, in bytes after the fixed header.
     pub max_packet_bytes: usize,
     /// Filters in one SUBSCRIBE or UNSUBSCRIBE, and subscriptions of one client.
@@ -152,6 +156,7 @@ impl Default for Limits {
             max_connections: 20_000,
             max_silent_per_address: 2048,
             max_operators: 256,
+            max_part_listeners: 512,
             max_packet_bytes: 256 * 1024,
             max_filters: 64,
             connect_timeout: Duration::from_secs(10),
@@ -226,7 +231,7 @@ impl Broker {
         inbox: Arc<dyn Inbox>,
     ) -> Result<Self, BrokerError> {
         let limits = config.limits.clone();
-        let router = Router::start(&config.prefix, limits.max_operators).await;
+        let router = Router::start(&config.prefix, limits.max_operators, limits.max_part_listeners).await;
         let router = router.map_err(|error| BrokerError::Router { reason: error.to_string() })?;
         let front = Front::start(config, gatekeeper, inbox, router.clone()).await?;
         let health = watchdog::start(&front, router, &limits);
@@ -243,6 +248,12 @@ impl Broker {
     /// session has not taken when it ends are lost.
     pub fn ask(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotAsked> {
         self.front.ask(robot, payload)
+    }
+
+    /// Lets `robots` subscribe to `p/<digest>`, to hear the parts that are published from then on, until the [`FanOut`]
+    /// is dropped. Few packages at a time.
+    pub fn fan_out(&self, digest: Digest, robots: Vec<RobotId>) -> Result<FanOut, FanOutError> {
+        FanOut::begin(self.front.clone(), digest, robots)
     }
 
     /// Ends the robot's session, if it has one: its token was revoked or it was removed.

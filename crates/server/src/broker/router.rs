@@ -1,7 +1,8 @@
 //! Owns rumqttd's router thread: what is published here reaches every listener. It never sees a client's bytes, topics
 //! or filters unchecked, because its thread dies of some of them; and since the router keeps a log for each filter and a
-//! record for each link name for ever, it gets two filters and a fixed set of names. Listeners pick out what they want.
+//! record for each link name for ever, it gets three filters and a fixed set of names. Listeners pick out what they want.
 
+use std::collections::HashMap;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -10,15 +11,18 @@ use bytes::Bytes;
 use rumqttd::local::{LinkBuilder, LinkError, LinkRx, LinkTx};
 use rumqttd::protocol::{Disconnect, DisconnectReasonCode, Packet, Publish, QoS};
 use rumqttd::{Notification, RouterConfig};
+use task_proto::Digest;
 use task_proto::topic::TopicPrefix;
 use tokio::sync::{Notify, oneshot};
 use tokio_util::sync::CancellationToken;
 
 /// What the watchdog's canary travels on. No prefix can contain a space, so it meets nobody else.
 pub(super) const CANARY_TOPIC: &str = "router canary";
+/// What packages' parts travel on, before the digest and the part's number. Likewise.
+const PARTS: &str = "package parts/";
 /// What the publishing link may have waiting; the router being this far behind, messages to listeners are dropped.
 const MAX_BACKLOG: usize = 1000;
-/// The router's log for each of the two filters: so much may a listener fall behind before it misses messages.
+/// The router's log for each of the three filters: so much may a listener fall behind before it misses messages.
 const SEGMENT_BYTES: usize = 2 * 1024 * 1024;
 const SEGMENTS: usize = 4;
 /// Messages the router hands a listener at a time.
@@ -31,8 +35,9 @@ const LINK_TIMEOUT: Duration = Duration::from_secs(5);
 /// The router, also across restarts of its thread.
 pub(super) struct Router {
     everything: String,
-    slots: Mutex<Vec<usize>>,
-    max_listeners: usize,
+    /// The names that are free.
+    slots: Mutex<HashMap<Listening, Vec<usize>>>,
+    max_links: usize,
     listeners: AtomicUsize,
     dropped: AtomicU64,
     current: Mutex<Arc<Running>>,
@@ -51,10 +56,12 @@ struct Running {
 type Connect = Arc<dyn Fn(&str) -> Option<(LinkTx, LinkRx)> + Send + Sync>;
 
 /// What a listener asks for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) enum Listening {
     /// Everything below the prefix.
     Everything,
+    /// The parts of every package.
+    Parts,
     /// Canaries.
     Canary,
 }
@@ -80,13 +87,20 @@ pub(super) enum RouterError {
 
 impl Router {
     /// Starts the router's thread.
-    pub(super) async fn start(prefix: &TopicPrefix, max_listeners: usize) -> Result<Arc<Self>, RouterError> {
+    pub(super) async fn start(
+        prefix: &TopicPrefix,
+        max_listeners: usize,
+        max_part_listeners: usize,
+    ) -> Result<Arc<Self>, RouterError> {
         let everything = format!("{prefix}/#");
-        let running = Running::start(&everything, max_listeners).await?;
+        let max_links = max_listeners + max_part_listeners + OTHER_LINKS;
+        let running = Running::start(&everything, max_links).await?;
+        let slots = [(Listening::Everything, max_listeners), (Listening::Parts, max_part_listeners)];
+        let slots = slots.map(|(listening, count)| (listening, (0..count).rev().collect()));
         Ok(Arc::new(Self {
             everything,
-            slots: Mutex::new((0..max_listeners).rev().collect()),
-            max_listeners,
+            slots: Mutex::new(slots.into()),
+            max_links,
             listeners: AtomicUsize::new(0),
             dropped: AtomicU64::new(0),
             current: Mutex::new(Arc::new(running)),
@@ -96,7 +110,7 @@ impl Router {
 
     /// Starts over with a new thread. Listeners of the old one find that it is gone.
     pub(super) async fn restart(&self) -> Result<(), RouterError> {
-        let running = Arc::new(Running::start(&self.everything, self.max_listeners).await?);
+        let running = Arc::new(Running::start(&self.everything, self.max_links).await?);
         let before = std::mem::replace(&mut *lock(&self.current), running);
         before.replaced.cancel();
         Ok(())
@@ -108,13 +122,22 @@ impl Router {
         if topic != CANARY_TOPIC && self.listeners.load(Ordering::Relaxed) == 0 {
             return;
         }
+        if !self.hand_over(topic, qos, payload) {
+            self.dropped.fetch_add(1, Ordering::Relaxed);
+            tracing::debug!(topic, "the router is behind, a message for listeners is dropped");
+        }
+    }
+
+    /// Publishes a package's part; false if the router can't take it now.
+    pub(super) fn publish_part(&self, digest: Digest, number: u64, part: Bytes) -> bool {
+        self.hand_over(&format!("{PARTS}{digest}/{number}"), QoS::AtLeastOnce, part)
+    }
+
+    fn hand_over(&self, topic: &str, qos: QoS, payload: Bytes) -> bool {
         let running = lock(&self.current).clone();
         let mut publisher = lock(&running.publisher);
         let is_behind = publisher.buffer().len() >= MAX_BACKLOG;
-        if is_behind {
-            self.dropped.fetch_add(1, Ordering::Relaxed);
-            tracing::debug!(topic, "the router is behind, a message for listeners is dropped");
-        } else {
+        if !is_behind {
             // Inside the router all is QoS 0, so the real one travels as one more level of the topic.
             let message = Publish::new(Bytes::from(format!("{topic}/{}", qos as u8)), payload, false);
             publisher.buffer().push_back(Packet::Publish(message, None));
@@ -127,6 +150,7 @@ impl Router {
             // The note itself must not make the backlog longer.
             publisher.buffer().pop_back();
         }
+        !is_behind
     }
 
     /// Messages dropped so far.
@@ -139,8 +163,12 @@ impl Router {
         let running = lock(&self.current).clone();
         let (filter, name, place) = match listening {
             Listening::Everything => {
-                let place = Place::take(self.clone())?;
+                let place = Place::take(self.clone(), listening)?;
                 (self.everything.clone(), format!("listener-{}", place.slot), Some(place))
+            }
+            Listening::Parts => {
+                let place = Place::take(self.clone(), listening)?;
+                (format!("{PARTS}#"), format!("parts-{}", place.slot), Some(place))
             }
             Listening::Canary => (format!("{CANARY_TOPIC}/#"), "canary".to_owned(), None),
         };
@@ -167,13 +195,13 @@ impl Router {
 const NOTHING: &str = "";
 
 impl Running {
-    async fn start(everything: &str, max_listeners: usize) -> Result<Self, RouterError> {
+    async fn start(everything: &str, max_links: usize) -> Result<Self, RouterError> {
         let config = RouterConfig {
-            max_connections: max_listeners + OTHER_LINKS,
+            max_connections: max_links,
             max_outgoing_packet_count: MAX_BATCH,
             max_segment_size: SEGMENT_BYTES,
             max_segment_count: SEGMENTS,
-            initialized_filters: Some(vec![everything.to_owned(), format!("{CANARY_TOPIC}/#")]),
+            initialized_filters: Some(vec![everything.to_owned(), format!("{PARTS}#"), format!("{CANARY_TOPIC}/#")]),
             ..RouterConfig::default()
         };
         let sender = rumqttd::Router::new(0, config).spawn();
@@ -226,21 +254,26 @@ impl Drop for Link {
 /// One of the names that listeners' links have, free again when this is dropped.
 struct Place {
     router: Arc<Router>,
+    listening: Listening,
     slot: usize,
 }
 
 impl Place {
-    fn take(router: Arc<Router>) -> Result<Self, RouterError> {
-        let slot = lock(&router.slots).pop().ok_or(RouterError::Full)?;
-        router.listeners.fetch_add(1, Ordering::Relaxed);
-        Ok(Self { router, slot })
+    fn take(router: Arc<Router>, listening: Listening) -> Result<Self, RouterError> {
+        let slot = lock(&router.slots).get_mut(&listening).and_then(Vec::pop).ok_or(RouterError::Full)?;
+        if listening == Listening::Everything {
+            router.listeners.fetch_add(1, Ordering::Relaxed);
+        }
+        Ok(Self { router, listening, slot })
     }
 }
 
 impl Drop for Place {
     fn drop(&mut self) {
-        self.router.listeners.fetch_sub(1, Ordering::Relaxed);
-        lock(&self.router.slots).push(self.slot);
+        if self.listening == Listening::Everything {
+            self.router.listeners.fetch_sub(1, Ordering::Relaxed);
+        }
+        lock(&self.router.slots).entry(self.listening).or_default().push(self.slot);
     }
 }
 
@@ -290,6 +323,12 @@ impl Listener {
             () = self.replaced.cancelled() => Err(RouterError::Gone),
         }
     }
+}
+
+/// The package and the number of the part that came on this topic; `None` if it is none.
+pub(super) fn part_of(topic: &str) -> Option<(Digest, u64)> {
+    let (digest, number) = topic.strip_prefix(PARTS)?.split_once('/')?;
+    Some((digest.parse().ok()?, number.parse().ok()?))
 }
 
 /// Undoes what [`Router::publish`] did to the topic.

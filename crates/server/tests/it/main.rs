@@ -12,6 +12,7 @@ mod harness;
 mod mqtt;
 mod mqtt_harness;
 mod mqtt_hostile;
+mod mqtt_parts;
 mod oci;
 mod outputs;
 mod packages;

@@ -1,7 +1,7 @@
 //! Who may say and hear what: pure functions of the visitor and the topic. It never looks anything up.
 
-use task_proto::RobotId;
 use task_proto::topic::{RobotTopic, Topic, TopicPrefix};
+use task_proto::{Digest, RobotId};
 
 use crate::broker::router::CANARY_TOPIC;
 
@@ -35,6 +35,8 @@ pub(super) enum Hearing {
     Desired,
     /// The server's questions to this robot, likewise.
     Request,
+    /// A package's parts, to whom they are granted: the session knows.
+    Package(Digest),
     /// What matches the filter among what goes through the router.
     Router,
 }
@@ -67,8 +69,8 @@ pub(super) fn may_subscribe(visitor: &Visitor, prefix: &TopicPrefix, filter: &st
         Visitor::Robot { robot, .. } => match prefix.parse(filter)? {
             Topic::Robot(owner, RobotTopic::Desired) if owner == *robot => Some(Hearing::Desired),
             Topic::Robot(owner, RobotTopic::Request) if owner == *robot => Some(Hearing::Request),
-            // Direct-push opens this to the packages that are assigned to the robot.
-            Topic::Package(_) | Topic::Robot(..) => None,
+            Topic::Package(digest) => Some(Hearing::Package(digest)),
+            Topic::Robot(..) => None,
         },
     }
 }
@@ -123,7 +125,8 @@ mod tests {
         let hearing = |filter: &str| may_subscribe(&robot(), &prefix, filter);
         assert_eq!(hearing("taskd/v1/r/r00000000000000a1/desired"), Some(Hearing::Desired));
         assert_eq!(hearing("taskd/v1/r/r00000000000000a1/request"), Some(Hearing::Request));
-        let package = format!("taskd/v1/p/{}", task_proto::Digest::of(b"x"));
+        let package = Digest::of(b"x");
+        assert_eq!(hearing(&format!("taskd/v1/p/{package}")), Some(Hearing::Package(package)));
         for denied in [
             "#",
             "+/+/+/+/+",
@@ -134,7 +137,8 @@ mod tests {
             "taskd/v1/r/r00000000000000a1/report",
             "taskd/v1/r/r00000000000000a2/desired",
             "$share/g/taskd/v1/r/r00000000000000a1/desired",
-            package.as_str(),
+            "taskd/v1/p/+",
+            "taskd/v1/p/#",
         ] {
             assert_eq!(hearing(denied), None, "{denied}");
         }

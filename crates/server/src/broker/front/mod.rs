@@ -9,6 +9,7 @@ mod doorbell;
 mod entrance;
 mod listener;
 mod outgoing;
+mod parts;
 mod session;
 mod takeover;
 mod traffic;
@@ -29,6 +30,8 @@ use super::{BrokerConfig, BrokerError, Gatekeeper, Inbox, Limits, NotAsked, NotC
 use crate::anteroom::Anteroom;
 use crate::backlog::listen;
 pub(super) use entrance::{CANARY_ID, CanaryPass};
+use parts::Grants;
+pub(super) use parts::{Grant, NotGranted};
 use takeover::Seats;
 use traffic::Totals;
 
@@ -48,6 +51,7 @@ struct Context {
     router: Arc<Router>,
     seats: Arc<Seats>,
     totals: Totals,
+    grants: Grants,
     canary_pass: Arc<CanaryPass>,
     /// Who has not sent CONNECT yet.
     anteroom: Arc<Anteroom>,
@@ -74,6 +78,7 @@ impl Front {
             router,
             seats: Arc::default(),
             totals: Totals::default(),
+            grants: Grants::default(),
             canary_pass: Arc::default(),
             anteroom,
             stop: CancellationToken::new(),
@@ -91,6 +96,19 @@ impl Front {
     pub(super) fn ask(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotAsked> {
         let doorbell = self.context.seats.doorbell(robot).ok_or(NotAsked::NotConnected)?;
         if doorbell.ask(payload) { Ok(()) } else { Err(NotAsked::Busy) }
+    }
+
+    pub(super) fn grants(&self) -> &Grants {
+        &self.context.grants
+    }
+
+    /// Hands a part to the router; false if that is behind.
+    pub(super) fn publish_part(&self, grant: &Grant, number: u64, part: Bytes) -> bool {
+        let is_taken = self.context.router.publish_part(grant.digest(), number, part);
+        if is_taken {
+            grant.sent(number);
+        }
+        is_taken
     }
 
     pub(super) fn disconnect(&self, robot: &RobotId) {

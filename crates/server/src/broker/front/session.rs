@@ -10,22 +10,27 @@ use bytes::{Bytes, BytesMut};
 use futures_util::future::BoxFuture;
 use rumqttd::protocol::{
     ConnectReturnCode, Packet, PingResp, PubAck, PubAckReason, PubComp, PubCompReason, PubRec, PubRecReason, PubRel,
-    PubRelReason, QoS, SubAck, SubscribeReasonCode, UnsubAck,
+    PubRelReason, QoS,
 };
-use task_proto::RobotId;
 use task_proto::topic::{RobotTopic, Topic};
+use task_proto::{Digest, RobotId};
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt, ReadHalf, WriteHalf};
 use tokio::time::{Instant, sleep_until, timeout};
 
 use super::Context;
-use super::access::{Hearing, Route, Visitor, matches, may_publish, may_subscribe};
+use super::access::{Hearing, Route, Visitor, may_publish};
 use super::codec::{DecodeError, Publish, Received, Will, decode, encode, encode_publish};
 use super::entrance::{Guest, Rejection, connack, reject, welcome};
 use super::outgoing::Outgoing;
+use super::parts::Member;
 use super::takeover::Seat;
 use super::traffic::{Count, Meter, Metered};
 use crate::broker::router::{Heard, Listener, Listening, RouterError};
 use crate::broker::{Inbox, NotStored, RobotMessage};
+
+mod subscriptions;
+
+use subscriptions::{Opening, opened};
 
 /// Answers a client may leave unread before nothing more is read from it.
 const MAX_UNREAD_BYTES: usize = 64 * 1024;
@@ -149,6 +154,8 @@ where
         output,
         listener,
         hearing: HashMap::new(),
+        members: HashMap::new(),
+        opening: None,
         outgoing: Outgoing::default(),
         unreleased: HashSet::new(),
         storing: None,
@@ -210,6 +217,9 @@ struct Session<'a, S> {
     output: BytesMut,
     listener: Option<Listener>,
     hearing: HashMap<String, (Hearing, QoS)>,
+    /// The packages whose parts it hears.
+    members: HashMap<Digest, Member>,
+    opening: Option<Opening>,
     outgoing: Outgoing,
     unreleased: HashSet<u16>,
     storing: Option<Storing<'a>>,
@@ -234,6 +244,7 @@ enum Woken {
     Rung(Bytes),
     Asked(Bytes),
     Heard(Result<Heard, RouterError>),
+    Opened(Result<Listener, RouterError>),
     Late(End),
 }
 
@@ -273,6 +284,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         }
         let woken = tokio::select! {
             stored = stored(&mut self.storing) => Woken::Stored(stored),
+            link = opened(&mut self.opening) => Woken::Opened(link),
             wrote = self.writer.write_buf(&mut self.output), if !self.output.is_empty() => Woken::Wrote(wrote),
             read = self.reader.read_buf(&mut self.input), if may_read => Woken::Read(read),
             payload = self.seat.doorbell().answer(), if may_send && hears_desired => Woken::Rung(payload),
@@ -295,7 +307,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         let unread_until = self.progress_at + self.context.limits.write_timeout;
         let silent_until = self.heard_at + self.keep_alive;
         // While we don't read, the client can't be blamed for its silence.
-        if self.may_read() && silent_until < unread_until || self.caught_up() && self.storing.is_none() {
+        if self.may_read() && silent_until < unread_until || self.caught_up() && !self.is_busy() {
             (silent_until, End::Silent)
         } else {
             (unread_until, End::Deaf)
@@ -308,7 +320,12 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
     }
 
     fn may_read(&self) -> bool {
-        self.storing.is_none() && self.output.len() < MAX_UNREAD_BYTES
+        !self.is_busy() && self.output.len() < MAX_UNREAD_BYTES
+    }
+
+    /// Whether what was read last is still being acted on.
+    fn is_busy(&self) -> bool {
+        self.storing.is_some() || self.opening.is_some()
     }
 
     fn act_on(&mut self, woken: Woken) -> Result<(), End> {
@@ -322,6 +339,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
             Woken::Stored(stored) => self.acknowledge_stored(stored)?,
             Woken::Rung(payload) => self.send_own(RobotTopic::Desired, Hearing::Desired, payload),
             Woken::Asked(payload) => self.send_own(RobotTopic::Request, Hearing::Request, payload),
+            Woken::Opened(link) => self.link_opened(link),
             Woken::Heard(heard) => self.pass_on(heard.map_err(|_| End::RouterLost)?),
             Woken::Late(end) => return Err(end),
         }
@@ -361,12 +379,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
                 self.progress_at = self.heard_at;
             }
             Received::Subscribe { packet_id, filters } => self.subscribe(packet_id, filters)?,
-            Received::Unsubscribe { packet_id, filters } => {
-                for filter in &filters {
-                    self.hearing.remove(filter);
-                }
-                self.send(Packet::UnsubAck(UnsubAck { pkid: packet_id, reasons: Vec::new() }, None));
-            }
+            Received::Unsubscribe { packet_id, filters } => self.unsubscribe(packet_id, &filters),
             Received::PingReq => self.send(Packet::PingResp(PingResp)),
             Received::Disconnect => return Err(End::Goodbye),
         }
@@ -429,26 +442,6 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         }
     }
 
-    fn subscribe(&mut self, pkid: u16, filters: Vec<(String, QoS)>) -> Result<(), End> {
-        if filters.len() > self.context.limits.max_filters {
-            return Err(End::Violation("subscribes to too many filters at a time"));
-        }
-        let mut return_codes = Vec::with_capacity(filters.len());
-        for (filter, qos) in filters {
-            let hearing = may_subscribe(&self.visitor, &self.context.prefix, &filter);
-            let has_room = self.hearing.len() < self.context.limits.max_filters || self.hearing.contains_key(&filter);
-            return_codes.push(match hearing {
-                Some(hearing) if has_room => {
-                    self.hearing.insert(filter, (hearing, qos));
-                    SubscribeReasonCode::Success(qos)
-                }
-                _ => SubscribeReasonCode::Failure,
-            });
-        }
-        self.send(Packet::SubAck(SubAck { pkid, return_codes }, None));
-        Ok(())
-    }
-
     fn qos_of(&self, wanted: Hearing) -> Option<QoS> {
         self.hearing.values().find(|(hearing, _)| *hearing == wanted).map(|(_, qos)| *qos)
     }
@@ -458,15 +451,6 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         if let (Visitor::Robot { robot, .. }, Some(granted)) = (&self.visitor, self.qos_of(hearing)) {
             let topic = self.context.prefix.format(&Topic::Robot(robot.clone(), last));
             self.send_message(topic, payload, lower(granted, QoS::AtLeastOnce));
-        }
-    }
-
-    /// Sends what came out of the router if a subscription matches, once, as the best of them has it.
-    fn pass_on(&mut self, heard: Heard) {
-        let matching = self.hearing.iter().filter(|(filter, _)| matches(filter, &heard.topic));
-        let best = matching.map(|(_, (_, qos))| *qos).max_by_key(|qos| *qos as u8);
-        if let Some(granted) = best {
-            self.send_message(heard.topic, heard.payload, lower(granted, heard.qos));
         }
     }
 

@@ -8,7 +8,9 @@
 //! It costs no C library. What it cannot do: see participants that speak neither UDP nor RTPS (Zenoh), or DDS Security.
 
 pub mod entities;
+pub mod feeds;
 pub mod names;
+pub mod owners;
 pub mod parameters;
 pub mod rate;
 pub mod snapshot;
@@ -28,15 +30,18 @@ use std::time::{Duration, Instant};
 use ros2_client::dds::rustdds::{DomainParticipant, DomainParticipantBuilder};
 use task_proto::ros::{GraphName, LifecycleState, Transition};
 use tokio::runtime::Handle;
-use tokio::sync::watch;
+use tokio::sync::{broadcast, watch};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use self::endpoint::{Cdr, Delivery, Endpoints};
 use self::entities::GidForm;
+use self::feeds::Feeds;
+pub use self::feeds::{DiagnosticLevel, DiagnosticStatus, RosoutLine};
 use self::names::Role;
 use self::observer::{Matches, Observer};
 use self::own::OwnNode;
+pub use self::owners::Owners;
 pub use self::parameters::{ParameterValue, SetResult};
 pub use self::rate::{Rate, RateMeter};
 use self::services::Clients;
@@ -158,6 +163,7 @@ struct Shared {
     snapshot: watch::Receiver<Arc<Snapshot>>,
     clients: Clients,
     endpoints: Arc<Endpoints>,
+    feeds: Feeds,
     tasks: Tasks,
 }
 
@@ -206,9 +212,14 @@ impl Graph {
         let (snapshots, snapshot) = watch::channel(Arc::new(Snapshot::empty(Instant::now())));
         let (matches, _) = watch::channel(Matches::default());
         let observer = Observer::new(participant, snapshots, matches.clone());
-        tasks.tracker.spawn(observer.run(discovery, tasks.closing.clone()));
+        let closing = tasks.closing.clone();
+        tasks.tracker.spawn(async move {
+            // Without it nothing would ever change or match again.
+            let _closed = closing.clone().drop_guard();
+            observer.run(discovery, closing).await;
+        });
         let clients = Clients::new(endpoints.clone(), own, matches);
-        Ok(Self { shared: Arc::new(Shared { snapshot, clients, endpoints, tasks }) })
+        Ok(Self { shared: Arc::new(Shared { snapshot, clients, endpoints, feeds: Feeds::default(), tasks }) })
     }
 
     /// What the graph shows. [`Snapshot::at`] is at most a few seconds ago while the graph is open.
@@ -219,6 +230,13 @@ impl Graph {
     /// Wakes when the graph shows something else, many changes at once as one. It ends when the graph is closed.
     pub fn changes(&self) -> watch::Receiver<Arc<Snapshot>> {
         self.shared.snapshot.clone()
+    }
+
+    /// Which of the participants in this snapshot live in these processes: only what a task started is its own.
+    pub async fn owners(snapshot: Arc<Snapshot>, pids: Vec<u32>) -> Owners {
+        let unknown = Owners { unknown: snapshot.participants.keys().copied().collect(), ..Owners::default() };
+        let asked = tokio::task::spawn_blocking(move || Owners::of(&snapshot.participants, &pids)).await;
+        asked.unwrap_or(unknown)
     }
 
     /// Makes what [`Self::lifecycle_state`], [`Self::change_state`] and the parameter calls need for this node. A node that
@@ -242,7 +260,7 @@ impl Graph {
             None => self.kind_of(service, deadline, within).await?,
         };
         let left = deadline.saturating_duration_since(tokio::time::Instant::now());
-        let answered = self.shared.clients.servers(service, &kind, left).await;
+        let answered = self.while_open(self.shared.clients.servers(service, &kind, left)).await;
         answered.map_err(|error| match error {
             GraphError::NoServer { service, .. } => GraphError::NoServer { service, within },
             other => other,
@@ -270,7 +288,7 @@ impl Graph {
 
     /// The state this lifecycle node is in.
     pub async fn lifecycle_state(&self, node: &GraphName, within: Duration) -> Result<LifecycleState, GraphError> {
-        lifecycle::state(&self.shared.clients, node, within).await
+        self.while_open(lifecycle::state(&self.shared.clients, node, within)).await
     }
 
     /// Asks this lifecycle node for a transition, once; says whether it made it. After [`GraphError::NoAnswer`] it may
@@ -281,7 +299,7 @@ impl Graph {
         transition: Transition,
         within: Duration,
     ) -> Result<bool, GraphError> {
-        lifecycle::change(&self.shared.clients, node, transition, within).await
+        self.while_open(lifecycle::change(&self.shared.clients, node, transition, within)).await
     }
 
     /// All parameters of this node. `within` is for each of the calls that takes.
@@ -290,8 +308,8 @@ impl Graph {
         node: &GraphName,
         within: Duration,
     ) -> Result<Vec<(String, ParameterValue)>, GraphError> {
-        let names = parameters::list(&self.shared.clients, node, within).await?;
-        let values = parameters::get(&self.shared.clients, node, &names, within).await?;
+        let names = self.while_open(parameters::list(&self.shared.clients, node, within)).await?;
+        let values = self.while_open(parameters::get(&self.shared.clients, node, &names, within)).await?;
         Ok(names.into_iter().zip(values).collect())
     }
 
@@ -302,7 +320,7 @@ impl Graph {
         name: &str,
         within: Duration,
     ) -> Result<ParameterValue, GraphError> {
-        let values = parameters::get(&self.shared.clients, node, &[name.to_owned()], within).await?;
+        let values = self.while_open(parameters::get(&self.shared.clients, node, &[name.to_owned()], within)).await?;
         Ok(values.into_iter().next().unwrap_or(ParameterValue::NotSet))
     }
 
@@ -313,7 +331,24 @@ impl Graph {
         parameters: Vec<(String, ParameterValue)>,
         within: Duration,
     ) -> Result<Vec<SetResult>, GraphError> {
-        parameters::set(&self.shared.clients, node, parameters, within).await
+        self.while_open(parameters::set(&self.shared.clients, node, parameters, within)).await
+    }
+
+    /// What nodes log, from now on; the first who asks also gets the last lines from before, for nodes keep them. A
+    /// listener that is too slow is told how many lines it missed.
+    pub fn rosout(&self) -> Result<broadcast::Receiver<Arc<RosoutLine>>, GraphError> {
+        let Shared { feeds, endpoints, snapshot, tasks, .. } = &*self.shared;
+        let (receiver, running) = feeds.rosout(endpoints, snapshot.clone(), &tasks.closing)?;
+        running.map(|running| tasks.tracker.spawn(running));
+        Ok(receiver)
+    }
+
+    /// What nodes say about the robot's parts, from now on.
+    pub fn diagnostics(&self) -> Result<broadcast::Receiver<Arc<DiagnosticStatus>>, GraphError> {
+        let Shared { feeds, endpoints, tasks, .. } = &*self.shared;
+        let (receiver, running) = feeds.diagnostics(endpoints, &tasks.closing)?;
+        running.map(|running| tasks.tracker.spawn(running));
+        Ok(receiver)
     }
 
     /// Counts the messages of this topic, whose type is `kind`, whatever its publishers' settings are.
@@ -324,6 +359,11 @@ impl Graph {
         let (meter, counting) = RateMeter::new(reader, &self.shared.tasks.closing);
         self.shared.tasks.tracker.spawn(counting);
         Ok(meter)
+    }
+
+    /// What `call` gives, or an error as soon as the graph is closed.
+    async fn while_open<T>(&self, call: impl Future<Output = Result<T, GraphError>>) -> Result<T, GraphError> {
+        self.shared.tasks.closing.run_until_cancelled(call).await.unwrap_or(Err(GraphError::Closed))
     }
 
     /// Leaves the graph. Other handles see nothing any more.

@@ -57,6 +57,8 @@ pub struct Sample<M> {
     pub message: M,
     /// Its writer.
     pub writer: EndpointId,
+    /// Its place among the writer's messages.
+    pub number: i64,
     /// For an answer: the request it belongs to.
     pub answers: Option<SampleIdentity>,
 }
@@ -172,7 +174,8 @@ impl<M: Received> Reader<M> {
 impl<M> Sample<M> {
     fn of(change: DeserializedCacheChange<M>) -> Self {
         let (writer, answers) = (EndpointId::of(change.writer_guid()), change.related_sample_identity());
-        Self { message: change.into_value(), writer, answers }
+        let number = i64::from(change.sequence_number);
+        Self { message: change.into_value(), writer, number, answers }
     }
 }
 

@@ -1,10 +1,11 @@
 //! The graph against real rclpy nodes. Each test has a domain of its own, and nothing leaves this host.
 
-use task_agent::graph::{Graph, GraphError, Node, ParameterValue, Snapshot};
+use task_agent::graph::{DiagnosticLevel, Graph, GraphError, GraphSettings, Node, ParameterValue, Snapshot};
+use task_proto::log::LogLevel;
 use task_proto::ros::{Endpoint, LifecycleState, Transition};
 
-use crate::harness::within;
-use crate::ros::{CALL, RosNode, name, open};
+use crate::harness::{eventually, within};
+use crate::ros::{CALL, RosNode, name, open, open_as};
 
 /// Waits until the graph shows it.
 async fn shows(graph: &Graph, what: &str, condition: impl Fn(&Snapshot) -> bool) -> std::sync::Arc<Snapshot> {
@@ -128,4 +129,120 @@ async fn parameters_are_read_and_set_and_refused_with_the_nodes_reason() {
     assert_eq!(graph.parameter(&talker, "rate", CALL).await.unwrap(), ParameterValue::Double(3.0));
     assert_eq!(graph.parameter(&talker, "nothing", CALL).await.unwrap(), ParameterValue::NotSet);
     node.leave().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn two_nodes_of_one_name_are_told_apart_by_their_processes() {
+    let graph = open(86).await;
+    let (first, second) = (RosNode::start("talker.py", 86, &[]).await, RosNode::start("talker.py", 86, &[]).await);
+    let talker = name("/talker");
+    let both = shows(&graph, "two talkers", |snapshot| snapshot.named(&talker).count() == 2).await;
+    let mut found = Vec::new();
+    for node in [&first, &second] {
+        let owners = Graph::owners(both.clone(), vec![node.pid()]).await;
+        assert_eq!((owners.theirs.len(), owners.others.len(), owners.unknown.len()), (1, 1, 0), "{owners:?}");
+        found.extend(owners.theirs);
+    }
+    assert_ne!(found[0], found[1]);
+    let all = Graph::owners(both, vec![first.pid(), second.pid(), std::process::id()]).await;
+    assert_eq!((all.theirs.len(), all.others.len()), (2, 0), "{all:?}");
+    first.leave().await;
+    let one = shows(&graph, "one talker", |snapshot| snapshot.named(&talker).count() == 1).await;
+    assert_eq!(only(&one, "/talker").participant, found[1]);
+    second.leave().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn rates_are_counted_of_reliable_and_of_best_effort_publishers() {
+    let graph = open(87).await;
+    let chatter = graph.rate(&name("/chatter"), "std_msgs/msg/String").unwrap();
+    let scan = graph.rate(&name("/scan"), "std_msgs/msg/String").unwrap();
+    let node = RosNode::start("talker.py", 87, &[]).await;
+    eventually("both topics at their rates", || {
+        let (fast, slow) = (chatter.rate(), scan.rate());
+        (fast.hz > 10.0 && fast.hz < 30.0 && slow.hz > 5.0 && slow.hz < 15.0).then_some(())
+    })
+    .await;
+    node.leave().await;
+    eventually("both topics silent", || (chatter.rate().hz == 0.0 && scan.rate().hz == 0.0).then_some(())).await;
+    assert!(chatter.rate().since_last > Some(task_agent::graph::rate::WINDOW));
+    assert!(matches!(graph.rate(&name("/scan"), "String"), Err(GraphError::Kind(_))));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn log_lines_are_heard_also_by_a_late_joiner() {
+    let mut node = RosNode::start("talker.py", 88, &["--ros-args", "-r", "__ns:=/robot"]).await;
+    node.order("log said before the agent came").await;
+    let graph = open(88).await;
+    let mut lines = graph.rosout().unwrap();
+    let mut next = async || within("a line", lines.recv()).await.unwrap();
+    while next().await.text != "said before the agent came" {}
+    node.order("warn said afterwards").await;
+    let line = next().await;
+    assert_eq!((line.text.as_str(), line.level), ("said afterwards", LogLevel::Warn));
+    assert_eq!((line.node.clone(), line.logger.as_str(), line.lost), (Some(name("/robot/talker")), "robot.talker", 0));
+    assert!(line.file.ends_with("talker.py") && line.line > 0 && line.at_ms > 1_700_000_000_000, "{line:?}");
+    let snapshot = shows(&graph, "the talker", |snapshot| has(snapshot, "/robot/talker")).await;
+    assert_eq!(line.participant, only(&snapshot, "/robot/talker").participant);
+    node.leave().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn diagnostics_are_heard() {
+    let graph = open(89).await;
+    let mut statuses = graph.diagnostics().unwrap();
+    let mut node = RosNode::start("talker.py", 89, &[]).await;
+    shows(&graph, "the talker", |snapshot| snapshot.publishers_of(&name("/diagnostics")).next().is_some()).await;
+    // A status that is sent before both sides have met is lost, so it is sent until one arrives.
+    let status = loop {
+        node.order("diagnose battery is low").await;
+        match tokio::time::timeout(std::time::Duration::from_millis(200), statuses.recv()).await {
+            Ok(status) => break status.unwrap(),
+            Err(_) => continue,
+        }
+    };
+    assert_eq!((status.name.as_str(), status.message.as_str()), ("battery", "battery is low"));
+    assert_eq!((status.level, status.hardware_id.as_str()), (DiagnosticLevel::Warn, "b1"));
+    assert_eq!(status.values, [("volts".to_owned(), "11.1".to_owned())]);
+    node.leave().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn domains_do_not_mix_and_two_agents_on_one_host_do_not_confuse_each_other() {
+    let (here, beside, elsewhere) =
+        (open_as(90, "/taskd_one").await, open_as(90, "/taskd_two").await, open_as(232, "/taskd_one").await);
+    let node = RosNode::start("talker.py", 90, &[]).await;
+    let other = RosNode::start("talker.py", 232, &["--ros-args", "-r", "__node:=stranger"]).await;
+    let seen = |own: &'static str, also: &'static str| {
+        move |snapshot: &Snapshot| has(snapshot, "/talker") && has(snapshot, also) && !has(snapshot, own)
+    };
+    shows(&here, "the talker and the other agent", seen("/taskd_one", "/taskd_two")).await;
+    shows(&beside, "the talker and the other agent", seen("/taskd_two", "/taskd_one")).await;
+    let alone = shows(&elsewhere, "the stranger", |snapshot| has(snapshot, "/stranger")).await;
+    assert_eq!(alone.nodes.len(), 1);
+    let both = [&here, &beside].map(|graph| async { graph.parameter(&name("/talker"), "rate", CALL).await.unwrap() });
+    for value in futures_util::future::join_all(both).await {
+        assert_eq!(value, ParameterValue::Double(1.5));
+    }
+    beside.close().await;
+    shows(&here, "the other agent gone", |snapshot| !has(snapshot, "/taskd_two") && has(snapshot, "/talker")).await;
+    other.leave().await;
+    node.leave().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_domain_that_does_not_exist_is_refused_by_its_key() {
+    let settings = GraphSettings { domain_id: 233, localhost_only: true, node_name: name("/taskd_test"), distro: None };
+    let refused = Graph::open(&settings).await.err().expect("a refusal");
+    assert_eq!(refused.to_string(), "ros_domain_id: 233 is not from 0 to 232");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_closed_graph_says_so() {
+    let graph = open(91).await;
+    let (other, mut changes) = (graph.clone(), graph.changes());
+    within("the graph to close", graph.close()).await;
+    assert!(within("the end of changes", changes.changed()).await.is_err());
+    let refused = other.lifecycle_state(&name("/mapper"), CALL).await;
+    assert!(matches!(refused, Err(GraphError::Closed)), "{refused:?}");
 }

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use task_agent::graph::{Graph, GraphSettings};
 use task_proto::ros::GraphName;
-use tokio::io::{AsyncBufReadExt, BufReader};
+use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader};
 use tokio::process::{Child, ChildStdin, ChildStdout, Command};
 
 use crate::harness::within;
@@ -63,6 +63,18 @@ impl RosNode {
         let mut node = Self { child, input, output };
         node.says("up").await;
         node
+    }
+
+    /// Its process.
+    pub fn pid(&self) -> u32 {
+        self.child.id().expect("it runs")
+    }
+
+    /// Has it do this, and waits until it has.
+    pub async fn order(&mut self, line: &str) {
+        let input = self.input.as_mut().expect("input");
+        input.write_all(format!("{line}\n").as_bytes()).await.expect("input");
+        self.says("done").await;
     }
 
     async fn says(&mut self, wanted: &str) {

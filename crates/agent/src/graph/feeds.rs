@@ -1,0 +1,312 @@
+//! What nodes say to everybody: log lines on `/rosout` and statuses on `/diagnostics`. Each is read once, when somebody
+//! first wants it, and passed on to all who listen; whoever is too slow is told how many messages it missed.
+
+use std::collections::BTreeMap;
+use std::pin::pin;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use futures_util::StreamExt;
+use ros2_client::Log;
+use ros2_client::builtin_interfaces::Time;
+use serde::Deserialize;
+use task_proto::log::LogLevel;
+use task_proto::ros::GraphName;
+use tokio::sync::{broadcast, watch};
+use tokio_util::sync::CancellationToken;
+
+use super::endpoint::{Cdr, Delivery, Endpoints, Reader, Sample};
+use super::names::{self, Role};
+use super::{EndpointId, GraphError, ParticipantId, Snapshot};
+
+/// How many messages wait for a slow listener.
+pub const CAPACITY: usize = 1024;
+/// The longest text of a message, in bytes; a longer one is cut.
+pub const MAX_TEXT_BYTES: usize = 8 * 1024;
+/// The most statuses of one message on `/diagnostics`, and the most values of one status.
+pub const MAX_STATUSES: usize = 256;
+/// How many writers' numbers are remembered.
+const MAX_WRITERS: usize = 4096;
+
+/// A log line of a node.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RosoutLine {
+    /// When, by the node's clock: milliseconds since the Unix epoch.
+    pub at_ms: u64,
+    /// How serious.
+    pub level: LogLevel,
+    /// The node, where the logger is one's.
+    pub node: Option<GraphName>,
+    /// The logger, which bears the node's name with dots, and maybe more.
+    pub logger: String,
+    /// What it says.
+    pub text: String,
+    /// Where in the program.
+    pub file: String,
+    /// Its line there.
+    pub line: u32,
+    /// Who said it.
+    pub participant: ParticipantId,
+    /// Messages of the same writer that were lost right before.
+    pub lost: u64,
+}
+
+/// How a part of the robot is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum DiagnosticLevel {
+    /// Well.
+    Ok,
+    /// Not quite well.
+    Warn,
+    /// Not well.
+    Error,
+    /// Nothing was heard of it.
+    Stale,
+}
+
+/// A status on `/diagnostics`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct DiagnosticStatus {
+    /// When, by the node's clock: milliseconds since the Unix epoch.
+    pub at_ms: u64,
+    /// How it is.
+    pub level: DiagnosticLevel,
+    /// What it is about.
+    pub name: String,
+    /// In words.
+    pub message: String,
+    /// The part.
+    pub hardware_id: String,
+    /// Values with their names.
+    pub values: Vec<(String, String)>,
+    /// Who said it.
+    pub participant: ParticipantId,
+}
+
+/// `diagnostic_msgs/msg/DiagnosticArray`.
+#[derive(Deserialize)]
+struct DiagnosticArray {
+    stamp: Time,
+    #[expect(dead_code, reason = "part of the message's form")]
+    frame_id: String,
+    status: Vec<Status>,
+}
+
+#[derive(Deserialize)]
+struct Status {
+    level: u8,
+    name: String,
+    message: String,
+    hardware_id: String,
+    values: Vec<(String, String)>,
+}
+
+/// The feeds that somebody listens to.
+#[derive(Default)]
+pub struct Feeds {
+    rosout: Mutex<Option<broadcast::Sender<Arc<RosoutLine>>>>,
+    diagnostics: Mutex<Option<broadcast::Sender<Arc<DiagnosticStatus>>>>,
+}
+
+/// A task to spawn.
+type Running = std::pin::Pin<Box<dyn Future<Output = ()> + Send>>;
+
+impl Feeds {
+    /// A listener to `/rosout`, and what reads it, where nobody did. The first listener gets the last lines from before.
+    pub fn rosout(
+        &self,
+        endpoints: &Endpoints,
+        snapshot: watch::Receiver<Arc<Snapshot>>,
+        closing: &CancellationToken,
+    ) -> Result<(broadcast::Receiver<Arc<RosoutLine>>, Option<Running>), GraphError> {
+        let read = || {
+            let delivery = Delivery::Lasting { depth: 500 };
+            let reader = reader(endpoints, "/rosout", "rcl_interfaces/msg/Log", delivery)?;
+            let mut lost = Lost::default();
+            let lines = move |sample: Sample<Cdr>| {
+                let log: Log = sample.message.value(0)?;
+                let lost = lost.before(sample.writer, sample.number);
+                Some(vec![RosoutLine::of(log, sample.writer.participant(), lost, &snapshot.borrow())])
+            };
+            Ok((reader, lines))
+        };
+        listen(&self.rosout, closing, read)
+    }
+
+    /// A listener to `/diagnostics`, and what reads it, where nobody did.
+    pub fn diagnostics(
+        &self,
+        endpoints: &Endpoints,
+        closing: &CancellationToken,
+    ) -> Result<(broadcast::Receiver<Arc<DiagnosticStatus>>, Option<Running>), GraphError> {
+        let read = || {
+            let delivery = Delivery::Reliable { depth: 100 };
+            let reader = reader(endpoints, "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", delivery)?;
+            let statuses = |sample: Sample<Cdr>| {
+                let array: DiagnosticArray = sample.message.value(0)?;
+                let (stamp, participant) = (array.stamp, sample.writer.participant());
+                let statuses = array.status.into_iter().take(MAX_STATUSES);
+                Some(statuses.map(|status| DiagnosticStatus::of(status, stamp, participant)).collect())
+            };
+            Ok((reader, statuses))
+        };
+        listen(&self.diagnostics, closing, read)
+    }
+}
+
+fn reader(endpoints: &Endpoints, topic: &str, kind: &str, delivery: Delivery) -> Result<Reader<Cdr>, GraphError> {
+    let invalid = || GraphError::Kind(kind.to_owned());
+    let topic = topic.parse().map_err(|_| invalid())?;
+    let kind = names::type_to_dds(Role::Topic, kind).ok_or_else(invalid)?;
+    endpoints.reader(&names::to_dds(Role::Topic, &topic), &kind, delivery)
+}
+
+/// Joins what is being read, or begins to.
+fn listen<T, M>(
+    feed: &Mutex<Option<broadcast::Sender<Arc<T>>>>,
+    closing: &CancellationToken,
+    read: impl FnOnce() -> Result<(Reader<Cdr>, M), GraphError>,
+) -> Result<(broadcast::Receiver<Arc<T>>, Option<Running>), GraphError>
+where
+    T: Send + Sync + 'static,
+    M: FnMut(Sample<Cdr>) -> Option<Vec<T>> + Send + 'static,
+{
+    let mut feed = feed.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(sender) = &*feed {
+        return Ok((sender.subscribe(), None));
+    }
+    let (reader, mut messages) = read()?;
+    let (sender, receiver) = broadcast::channel(CAPACITY);
+    *feed = Some(sender.clone());
+    let closing = closing.clone();
+    let running = async move {
+        let mut samples = pin!(reader.samples());
+        while let Some(Some(sample)) = closing.run_until_cancelled(samples.next()).await {
+            for message in messages(sample).into_iter().flatten() {
+                // Nobody listens just now: it is not for later.
+                let _ = sender.send(Arc::new(message));
+            }
+        }
+    };
+    Ok((receiver, Some(Box::pin(running))))
+}
+
+/// Finds gaps in writers' numbers.
+#[derive(Default)]
+struct Lost {
+    last: BTreeMap<EndpointId, i64>,
+}
+
+impl Lost {
+    fn before(&mut self, writer: EndpointId, number: i64) -> u64 {
+        if self.last.len() >= MAX_WRITERS && !self.last.contains_key(&writer) {
+            self.last.clear();
+        }
+        let last = self.last.insert(writer, number);
+        last.map_or(0, |last| u64::try_from(number.saturating_sub(last).saturating_sub(1)).unwrap_or(0))
+    }
+}
+
+impl RosoutLine {
+    fn of(log: Log, participant: ParticipantId, lost: u64, snapshot: &Snapshot) -> Self {
+        let level = match log.level {
+            0..=10 => LogLevel::Debug,
+            11..=20 => LogLevel::Info,
+            21..=30 => LogLevel::Warn,
+            31..=40 => LogLevel::Error,
+            _ => LogLevel::Fatal,
+        };
+        Self {
+            at_ms: millis(log.stamp),
+            level,
+            node: node_of(&log.name, participant, snapshot),
+            logger: cut(log.name),
+            text: cut(log.msg),
+            file: cut(log.file),
+            line: log.line,
+            participant,
+            lost,
+        }
+    }
+}
+
+impl DiagnosticStatus {
+    fn of(status: Status, stamp: Time, participant: ParticipantId) -> Self {
+        let level = match status.level {
+            0 => DiagnosticLevel::Ok,
+            1 => DiagnosticLevel::Warn,
+            2 => DiagnosticLevel::Error,
+            _ => DiagnosticLevel::Stale,
+        };
+        let values = status.values.into_iter().take(MAX_STATUSES).map(|(name, value)| (cut(name), cut(value)));
+        Self {
+            at_ms: millis(stamp),
+            level,
+            name: cut(status.name),
+            message: cut(status.message),
+            hardware_id: cut(status.hardware_id),
+            values: values.collect(),
+            participant,
+        }
+    }
+}
+
+/// The participant's node whose logger this is: `/robot/talker` has `robot.talker`, and all below it.
+fn node_of(logger: &str, participant: ParticipantId, snapshot: &Snapshot) -> Option<GraphName> {
+    let is_of = |node: &GraphName| {
+        let name = node.as_str().trim_start_matches('/').replace('/', ".");
+        logger.strip_prefix(&name).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
+    };
+    let nodes = snapshot.nodes.iter().filter(|node| node.participant == participant && is_of(&node.name));
+    // A line may come before its node is known; what a whole name looks like is taken for one.
+    let known = nodes.map(|node| node.name.clone()).max_by_key(|name| name.as_str().len());
+    known.or_else(|| format!("/{}", logger.replace('.', "/")).parse().ok())
+}
+
+fn millis(stamp: Time) -> u64 {
+    u64::try_from(stamp.to_nanos() / 1_000_000).unwrap_or(0)
+}
+
+fn cut(mut text: String) -> String {
+    text.truncate(text.floor_char_boundary(MAX_TEXT_BYTES));
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn gaps_in_numbers_are_lost_messages() {
+        let mut lost = Lost::default();
+        let (one, two) = (EndpointId([1; 16]), EndpointId([2; 16]));
+        let found = [(one, 7), (two, 1), (one, 8), (one, 12), (two, 2), (one, 3), (one, i64::MAX), (one, i64::MIN)]
+            .map(|(writer, number)| lost.before(writer, number));
+        assert_eq!(found[..6], [0, 0, 0, 3, 0, 0]);
+        assert_eq!(found[7], 0);
+    }
+
+    #[test]
+    fn long_texts_are_cut_between_characters() {
+        let text = cut("\u{20ac}".repeat(MAX_TEXT_BYTES));
+        assert!(text.len() <= MAX_TEXT_BYTES && text.len() > MAX_TEXT_BYTES - 3);
+        assert_eq!(cut("short".to_owned()), "short");
+    }
+
+    #[test]
+    fn a_logger_is_its_nodes() {
+        let mut snapshot = Snapshot::empty(std::time::Instant::now());
+        let participant = ParticipantId([1; 12]);
+        for name in ["/robot/talker", "/robot/talker/inner", "/other"] {
+            let (publishers, subscriptions, services, clients) = Default::default();
+            let name = name.parse().expect("name");
+            let node = super::super::Node { name, participant, publishers, subscriptions, services, clients };
+            snapshot.nodes.push(node);
+        }
+        let found = |logger| node_of(logger, participant, &snapshot).map(|name| name.to_string());
+        assert_eq!(found("robot.talker").as_deref(), Some("/robot/talker"));
+        assert_eq!(found("robot.talker.child").as_deref(), Some("/robot/talker"));
+        assert_eq!(found("robot.talker.inner.x").as_deref(), Some("/robot/talker/inner"));
+        assert_eq!(found("robot.talkers").as_deref(), Some("/robot/talkers"));
+        assert_eq!(found("not a name"), None);
+    }
+}

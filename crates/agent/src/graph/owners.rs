@@ -1,0 +1,205 @@
+//! Whose a participant is. DDS does not say which process a participant lives in, but every participant announces the UDP
+//! addresses it listens at, and on this host the kernel knows whose sockets those are. That works with every vendor; where
+//! it cannot tell (another network namespace, no permission, an address that other hosts have too, no UDP at all) it says
+//! so, and [`Participant::first_seen`] is what is left.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::net::{IpAddr, SocketAddr};
+use std::os::unix::fs::MetadataExt;
+use std::path::Path;
+use std::{fs, io};
+
+use nix::ifaddrs::getifaddrs;
+
+use super::snapshot::{Participant, ParticipantId};
+
+/// The most open files of one process that are looked at.
+const MAX_FILES: usize = 65_536;
+
+/// Participants, by whether they live in the processes that were asked about.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Owners {
+    /// In one of these processes.
+    pub theirs: BTreeSet<ParticipantId>,
+    /// In another process, here or elsewhere.
+    pub others: BTreeSet<ParticipantId>,
+    /// It cannot be told.
+    pub unknown: BTreeSet<ParticipantId>,
+}
+
+/// What this host says about UDP sockets and about the processes in question.
+#[derive(Debug, Default)]
+struct Host {
+    addresses: BTreeSet<IpAddr>,
+    /// Sockets by the port they are bound to.
+    sockets: BTreeMap<u16, BTreeSet<u64>>,
+    /// The sockets that the processes hold.
+    held: BTreeSet<u64>,
+    /// Whether every process could be looked at, and shares the agent's network.
+    complete: bool,
+}
+
+impl Owners {
+    /// Asks the kernel. It reads `/proc`, so it belongs on a thread that may block.
+    pub(super) fn of(participants: &BTreeMap<ParticipantId, Participant>, pids: &[u32]) -> Self {
+        let host = Host::look(Path::new("/proc"), pids).unwrap_or_else(|error| {
+            tracing::warn!(error = %error, "cannot tell whose DDS participants are");
+            Host::default()
+        });
+        host.judge(participants)
+    }
+}
+
+impl Host {
+    fn look(proc: &Path, pids: &[u32]) -> io::Result<Self> {
+        let mut host = Self { complete: true, ..Self::default() };
+        host.addresses = getifaddrs()?.filter_map(|interface| ip_of(&interface)).collect();
+        for table in ["net/udp", "net/udp6"] {
+            match fs::read_to_string(proc.join(table)) {
+                Ok(text) => text.lines().skip(1).filter_map(socket_of).for_each(|(port, inode)| {
+                    host.sockets.entry(port).or_default().insert(inode);
+                }),
+                // A kernel without IPv6 has no such table.
+                Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+                Err(error) => return Err(error),
+            }
+        }
+        let network = fs::metadata(proc.join("self/ns/net"))?.ino();
+        for pid in pids {
+            match held_by(&proc.join(pid.to_string()), network) {
+                Ok(Some(sockets)) => host.held.extend(sockets),
+                Ok(None) => host.complete = false,
+                // It has ended, and its sockets with it.
+                Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+                Err(error) => {
+                    tracing::debug!(pid, error = %error, "cannot see a process's sockets");
+                    host.complete = false;
+                }
+            }
+        }
+        Ok(host)
+    }
+
+    fn judge(&self, participants: &BTreeMap<ParticipantId, Participant>) -> Owners {
+        let mut owners = Owners::default();
+        for (id, participant) in participants {
+            let class = match self.holds(&participant.locators) {
+                Some(true) => &mut owners.theirs,
+                Some(false) => &mut owners.others,
+                None => &mut owners.unknown,
+            };
+            class.insert(*id);
+        }
+        owners
+    }
+
+    /// Whether one of the processes listens at these addresses; `None`: it cannot be told.
+    fn holds(&self, locators: &BTreeSet<SocketAddr>) -> Option<bool> {
+        let mut ours = locators.iter().filter(|locator| self.is_here(locator.ip())).peekable();
+        if locators.is_empty() || (ours.peek().is_none() && !self.complete) {
+            return None;
+        }
+        let held = ours
+            .any(|locator| self.sockets.get(&locator.port()).is_some_and(|sockets| !sockets.is_disjoint(&self.held)));
+        // Another host may have one of our addresses too (a container bridge's), but hardly all of them.
+        match (held, locators.iter().all(|locator| self.is_here(locator.ip()))) {
+            (true, true) => Some(true),
+            (true, false) => None,
+            (false, _) => self.complete.then_some(false),
+        }
+    }
+
+    fn is_here(&self, address: IpAddr) -> bool {
+        address.is_loopback() || self.addresses.contains(&address)
+    }
+}
+
+fn ip_of(interface: &nix::ifaddrs::InterfaceAddress) -> Option<IpAddr> {
+    let address = interface.address.as_ref()?;
+    let v4 = address.as_sockaddr_in().map(|v4| IpAddr::V4(v4.ip()));
+    v4.or_else(|| address.as_sockaddr_in6().map(|v6| IpAddr::V6(v6.ip())))
+}
+
+/// Port and inode of a line of `/proc/net/udp`.
+fn socket_of(line: &str) -> Option<(u16, u64)> {
+    let mut words = line.split_whitespace();
+    let (_, port) = words.nth(1)?.rsplit_once(':')?;
+    let inode = words.nth(7)?;
+    Some((u16::from_str_radix(port, 16).ok()?, inode.parse().ok()?))
+}
+
+/// The sockets that a process holds; `None`: it has another network than this.
+fn held_by(process: &Path, network: u64) -> io::Result<Option<BTreeSet<u64>>> {
+    if fs::metadata(process.join("ns/net"))?.ino() != network {
+        return Ok(None);
+    }
+    let mut sockets = BTreeSet::new();
+    for file in fs::read_dir(process.join("fd"))?.take(MAX_FILES) {
+        // A file that was closed in between is no socket any more.
+        let Ok(target) = fs::read_link(file?.path()) else { continue };
+        let inode = target.to_str().and_then(|text| text.strip_prefix("socket:[")?.strip_suffix(']'));
+        sockets.extend(inode.and_then(|inode| inode.parse::<u64>().ok()));
+    }
+    Ok(Some(sockets))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::UdpSocket;
+    use std::time::Instant;
+
+    use super::*;
+
+    fn participant(locators: &[&str]) -> Participant {
+        let locators = locators.iter().map(|text| text.parse().expect("address")).collect();
+        Participant { locators, first_seen: Instant::now() }
+    }
+
+    fn host(complete: bool) -> Host {
+        Host {
+            addresses: BTreeSet::from(["192.168.1.5".parse().expect("ip"), "172.17.0.1".parse().expect("ip")]),
+            sockets: BTreeMap::from([(7411, BTreeSet::from([1])), (7413, BTreeSet::from([2]))]),
+            held: BTreeSet::from([1]),
+            complete,
+        }
+    }
+
+    #[test]
+    fn the_port_decides_only_on_this_host() {
+        for (locators, complete, expected) in [
+            (&["192.168.1.5:7411"][..], true, Some(true)),
+            (&["192.168.1.5:7411", "172.17.0.1:7411"], true, Some(true)),
+            (&["127.0.0.1:7411"], false, Some(true)),
+            (&["192.168.1.5:7413"], true, Some(false)),
+            (&["192.168.1.5:7415"], true, Some(false)),
+            (&["192.168.1.7:7411"], true, Some(false)),
+            // The same container bridge on another host.
+            (&["192.168.1.7:7411", "172.17.0.1:7411"], true, None),
+            (&["192.168.1.7:7413", "172.17.0.1:7413"], true, Some(false)),
+            (&["192.168.1.5:7413"], false, None),
+            (&["192.168.1.7:7411"], false, None),
+            (&[], true, None),
+        ] {
+            let found = host(complete).holds(&participant(locators).locators);
+            assert_eq!(found, expected, "{locators:?} {complete}");
+        }
+    }
+
+    #[test]
+    fn a_socket_of_this_process_is_found() {
+        let socket = UdpSocket::bind("127.0.0.1:0").expect("socket");
+        let address = socket.local_addr().expect("address").to_string();
+        let id = ParticipantId([1; 12]);
+        let participants = BTreeMap::from([(id, participant(&[&address]))]);
+        assert_eq!(Owners::of(&participants, &[std::process::id()]).theirs, BTreeSet::from([id]));
+        assert_eq!(Owners::of(&participants, &[]).others, BTreeSet::from([id]));
+    }
+
+    #[test]
+    fn lines_of_the_table_are_read() {
+        let line =
+            "  512: 00000000:1CF3 00000000:0000 07 00000000:00000000 00:00000000 00000000  1000        0 41557 2 0 0";
+        assert_eq!(socket_of(line), Some((7411, 41557)));
+        assert_eq!(socket_of("   sl  local_address"), None);
+    }
+}

@@ -16,6 +16,7 @@ mod confirm;
 mod deploy;
 mod enroll_token;
 mod output;
+mod outputs;
 mod progress;
 mod push;
 mod robot;
@@ -63,6 +64,12 @@ pub enum Command {
     Stop(task::TaskOrder),
     /// Stop a task and remove it from robots
     Remove(task::RemoveOrder),
+    /// Look at the files that tasks brought back, or fetch them
+    Output {
+        /// What to do.
+        #[command(subcommand)]
+        action: outputs::Action,
+    },
     /// Look at the nodes on a robot's ROS graph
     Node {
         /// What to do.
@@ -192,6 +199,7 @@ async fn dispatch(connection: &Connection, command: Command) -> Result<Outcome, 
         Command::Start(order) => task::run(&connection.open()?, task::Verb::Start, order).await,
         Command::Stop(order) => task::run(&connection.open()?, task::Verb::Stop, order).await,
         Command::Remove(order) => task::remove(&connection.open()?, order).await,
+        Command::Output { action } => outputs::run(&connection.open()?, action).await,
         Command::Node { action } => ros::node(&connection.open()?, action).await,
         Command::Topic { action } => ros::topic(&connection.open()?, action).await,
         Command::Param { action } => ros::param(&connection.open()?, action).await,

@@ -1,0 +1,54 @@
+"""The whole experiment as one command: simulator and mapper together, until the map is saved and scored.
+
+    mapping [--activate] [--ros-args -p simulator:seed:=2 -p simulator:rate:=8.0 -p mapper:particles:=30]
+
+The robot sets off when /mapper is active: somebody else's task, or this command's with --activate. Both nodes share one
+executor, so the robot waits for the mapper and not the other way round: a busy machine takes longer, and the map is the same.
+"""
+
+import argparse
+import sys
+
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.task import Future
+from rclpy.utilities import remove_ros_args
+
+from corridor_mapping import score
+from corridor_mapping.mapper import Mapper
+from corridor_mapping.simulator import Simulator
+
+
+def main():
+    parser = argparse.ArgumentParser(description="Drives through the simulated corridor and maps it.")
+    parser.add_argument("--activate", action="store_true", help="configure and activate /mapper instead of waiting for it")
+    arguments = parser.parse_args(remove_ros_args(sys.argv)[1:])
+    rclpy.init()
+    outcome = Future()
+    mapper, simulator = Mapper(on_end=outcome.set_result), Simulator()
+    executor = SingleThreadedExecutor()
+    executor.add_node(mapper)
+    executor.add_node(simulator)
+    try:
+        if arguments.activate:
+            for transition in (mapper.trigger_configure, mapper.trigger_activate):
+                if transition() != TransitionCallbackReturn.SUCCESS:
+                    sys.exit("mapping: /mapper could not be activated")
+        executor.spin_until_future_complete(outcome)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        if mapper.active and not outcome.done():
+            mapper.save()
+        executor.shutdown()
+        rclpy.try_shutdown()
+    if not outcome.done():
+        sys.exit("mapping: stopped before the drive was over")
+    if outcome.result() is not None:
+        sys.exit(f"mapping: {outcome.result()}")
+    print(score.report(score.score_files(mapper.get_parameter("map_dir").value)), flush=True)
+
+
+if __name__ == "__main__":
+    main()

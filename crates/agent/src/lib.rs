@@ -23,6 +23,7 @@ pub mod link;
 pub mod logs;
 pub mod mqtt;
 pub mod observed;
+pub mod outputs;
 pub mod plan;
 pub mod process;
 pub mod run_dir;

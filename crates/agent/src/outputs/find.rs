@@ -1,0 +1,169 @@
+//! Finds the files that `outputs.paths` names: regular files below one directory. Links are neither followed nor brought
+//! back, because a task could point them at what is not its own.
+
+use std::collections::BTreeMap;
+use std::fs::{self, File, Metadata, OpenOptions};
+use std::io::{self, Read as _};
+use std::os::unix::fs::OpenOptionsExt as _;
+use std::path::{Path, PathBuf};
+
+use sha2::{Digest as _, Sha256};
+use task_proto::Digest;
+use task_proto::desired::BlobRef;
+use task_proto::id::OutputPath;
+use task_proto::output::{MAX_FILES, OutputFile};
+
+use super::{OutputError, too_many};
+
+/// The most names looked at for one pattern.
+const MAX_LOOKED_AT: usize = 200_000;
+/// The deepest directory looked into.
+const MAX_DEPTH: usize = 48;
+
+/// The files that match, sorted by path, with their digests.
+pub(super) fn files(directory: &Path, patterns: &[String], max_bytes: u64) -> Result<Vec<OutputFile>, OutputError> {
+    let mut found = BTreeMap::new();
+    for pattern in patterns {
+        let parts = parts(pattern)?;
+        let mut search = Search { found: &mut found, left: MAX_LOOKED_AT };
+        search.descend(directory, "", &parts, 0)?;
+    }
+    let bytes: u64 = found.values().map(|(_, size)| size).sum();
+    if bytes > max_bytes {
+        return Err(OutputError::TooMuch(format!(
+            "the files have {bytes} bytes, {max_bytes} may be brought back (limits.output_bytes of this robot)"
+        )));
+    }
+    let hashed = found.into_iter().map(|(path, (file, _))| {
+        let blob = hash(&file).map_err(|source| OutputError::Read { path: file, source })?;
+        Ok(OutputFile { path, blob })
+    });
+    hashed.collect()
+}
+
+/// A pattern's parts between slashes.
+fn parts(pattern: &str) -> Result<Vec<glob::Pattern>, OutputError> {
+    let invalid = |reason| OutputError::Pattern { pattern: pattern.to_owned(), reason };
+    let parts = pattern.split('/').filter(|part| !part.is_empty() && *part != ".");
+    parts
+        .map(|part| match part {
+            ".." => Err(invalid("it must stay below the task's directory")),
+            part => glob::Pattern::new(part).map_err(|error| invalid(error.msg)),
+        })
+        .collect()
+}
+
+struct Search<'a> {
+    found: &'a mut BTreeMap<OutputPath, (PathBuf, u64)>,
+    left: usize,
+}
+
+impl Search<'_> {
+    /// Looks for `parts` in `directory`, whose path below the root is `prefix`.
+    fn descend(
+        &mut self,
+        directory: &Path,
+        prefix: &str,
+        parts: &[glob::Pattern],
+        depth: usize,
+    ) -> Result<(), OutputError> {
+        let Some((part, rest)) = parts.split_first() else { return Ok(()) };
+        let is_any_depth = part.as_str() == "**";
+        if is_any_depth {
+            // No directory at all in its place.
+            self.descend(directory, prefix, rest, depth)?;
+        }
+        let entries = match fs::read_dir(directory) {
+            Ok(entries) => entries,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
+            Err(source) => return Err(OutputError::Read { path: directory.to_owned(), source }),
+        };
+        for entry in entries {
+            let entry = entry.map_err(|source| OutputError::Read { path: directory.to_owned(), source })?;
+            self.left = self.left.checked_sub(1).ok_or_else(|| {
+                OutputError::TooMuch(format!("more than {MAX_LOOKED_AT} names would have to be looked at"))
+            })?;
+            // What has no printable name can't be named in a manifest either.
+            let Ok(name) = entry.file_name().into_string() else { continue };
+            if !is_any_depth && !part.matches(&name) {
+                continue;
+            }
+            let path = entry.path();
+            let about = fs::symlink_metadata(&path);
+            let about = match about {
+                Ok(about) => about,
+                Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
+                Err(source) => return Err(OutputError::Read { path, source }),
+            };
+            let below = if prefix.is_empty() { name } else { format!("{prefix}/{name}") };
+            if about.is_dir() && depth < MAX_DEPTH {
+                let rest = if is_any_depth { parts } else { rest };
+                self.descend(&path, &below, rest, depth + 1)?;
+            } else if about.is_file() && rest.is_empty() {
+                self.add(path, &below, &about)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn add(&mut self, path: PathBuf, below: &str, about: &Metadata) -> Result<(), OutputError> {
+        let Ok(name) = below.parse::<OutputPath>() else { return Ok(()) };
+        self.found.insert(name, (path, about.len()));
+        if self.found.len() > MAX_FILES { Err(too_many()) } else { Ok(()) }
+    }
+}
+
+/// Opens a file for reading, if it still is one.
+pub(super) fn open(path: &Path) -> io::Result<File> {
+    let flags = nix::fcntl::OFlag::O_NOFOLLOW | nix::fcntl::OFlag::O_NONBLOCK;
+    let file = OpenOptions::new().read(true).custom_flags(flags.bits()).open(path)?;
+    if file.metadata()?.is_file() { Ok(file) } else { Err(io::Error::other("it is no regular file any more")) }
+}
+
+fn hash(path: &Path) -> io::Result<BlobRef> {
+    let mut file = open(path)?;
+    let (mut hash, mut size) = (Sha256::new(), 0);
+    let mut buffer = vec![0; 256 * 1024];
+    loop {
+        match file.read(&mut buffer)? {
+            0 => return Ok(BlobRef { digest: Digest::from_bytes(hash.finalize().into()), size }),
+            count => {
+                hash.update(&buffer[..count]);
+                size += count as u64;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn names(directory: &Path, patterns: &[&str]) -> Vec<String> {
+        let patterns: Vec<String> = patterns.iter().map(|pattern| (*pattern).to_owned()).collect();
+        let files = files(directory, &patterns, 1 << 20).expect("found");
+        files.into_iter().map(|file| file.path.to_string()).collect()
+    }
+
+    #[test]
+    fn patterns_name_regular_files_below_the_directory() {
+        let temp = tempfile::tempdir().expect("temp dir");
+        let root = temp.path().join("task");
+        fs::create_dir_all(root.join("maps/old")).expect("made");
+        for name in ["maps/a.pgm", "maps/a.yaml", "maps/b.pgm", "maps/old/c.pgm", "log.txt"] {
+            fs::write(root.join(name), name).expect("written");
+        }
+        fs::write(temp.path().join("secret.pgm"), "secret").expect("written");
+        std::os::unix::fs::symlink("../../secret.pgm", root.join("maps/link.pgm")).expect("linked");
+        std::os::unix::fs::symlink("..", root.join("up")).expect("linked");
+
+        assert_eq!(names(&root, &["maps/*.pgm", "maps/a.*"]), ["maps/a.pgm", "maps/a.yaml", "maps/b.pgm"]);
+        assert_eq!(names(&root, &["**/*.pgm"]), ["maps/a.pgm", "maps/b.pgm", "maps/old/c.pgm"]);
+        assert_eq!(names(&root, &["maps/**"]), ["maps/a.pgm", "maps/a.yaml", "maps/b.pgm", "maps/old/c.pgm"]);
+        assert_eq!(names(&root, &["./log.txt", "nothing/*", "maps", "up/*.pgm"]), ["log.txt"]);
+        let blob = files(&root, &["log.txt".to_owned()], 100).expect("found")[0].blob;
+        assert_eq!(blob, BlobRef { digest: Digest::of(b"log.txt"), size: 7 });
+        assert!(matches!(files(&root, &["../*".to_owned()], 100), Err(OutputError::Pattern { .. })));
+        assert!(matches!(files(&root, &["maps/*".to_owned()], 20), Err(OutputError::TooMuch(_))));
+    }
+}

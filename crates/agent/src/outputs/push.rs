@@ -1,0 +1,239 @@
+//! Pushes an output through the OCI distribution API: blobs in chunks that go on where they broke off, then the config,
+//! then the manifest.
+
+use std::collections::BTreeMap;
+use std::io::{Read as _, Seek as _, SeekFrom};
+use std::path::Path;
+use std::time::Duration;
+
+use http::header::{CONTENT_RANGE, CONTENT_TYPE, LOCATION, RANGE, RETRY_AFTER};
+use reqwest::{Method, RequestBuilder, Response, StatusCode, Url};
+use task_proto::Digest;
+use task_proto::desired::BlobRef;
+use task_proto::oci::MANIFEST_TYPE;
+use task_proto::output::OutputSet;
+use task_proto::report::Progress;
+use tokio::sync::watch;
+
+use super::{OutputError, OutputOrder, find};
+use crate::durable;
+
+/// Bytes sent in one request: what a bad link loses at most.
+const CHUNK_BYTES: u64 = 1024 * 1024;
+/// How long one request may take.
+const REQUEST_TIMEOUT: Duration = Duration::from_secs(180);
+/// How often an upload that the server has forgotten is begun again in one go.
+const MAX_BEGINNINGS: u32 = 3;
+/// The most of an error's body that is read.
+const MAX_ERROR_BYTES: usize = 4096;
+
+/// The server's registry, as this robot may use it.
+#[derive(Clone)]
+pub struct Registry {
+    client: reqwest::Client,
+    base: Url,
+    token: String,
+}
+
+/// Uploads under way, by the digest of what they bring.
+type Notes = BTreeMap<Digest, String>;
+
+impl Registry {
+    /// The registry of the server at `base`.
+    pub fn new(client: reqwest::Client, base: Url, token: String) -> Self {
+        Self { client, base, token }
+    }
+
+    fn request(&self, method: Method, path: &str) -> RequestBuilder {
+        let mut url = self.base.clone();
+        let (path, query) = path.split_once('?').map_or((path, None), |(path, query)| (path, Some(query)));
+        url.set_path(&format!("{}{path}", self.base.path().trim_end_matches('/')));
+        url.set_query(query);
+        self.client.request(method, url).bearer_auth(&self.token).timeout(REQUEST_TIMEOUT)
+    }
+
+    async fn send(&self, what: &str, request: RequestBuilder) -> Result<Response, OutputError> {
+        let response = request.send().await.map_err(OutputError::Unreachable)?;
+        if response.status().is_success() { Ok(response) } else { Err(refusal(what, response).await) }
+    }
+}
+
+/// Pushes all of `output`.
+pub(super) async fn push(
+    registry: &Registry,
+    order: &OutputOrder,
+    output: &OutputSet,
+    progress: &watch::Sender<Progress>,
+) -> Result<(), OutputError> {
+    let refused = || OutputError::TooMuch("the robot's or task's name can't be a repository's".to_owned());
+    let (repository, tag) = output.repository().zip(output.tag()).ok_or_else(refused)?;
+    let total = output.files.iter().map(|file| file.blob.size).sum();
+    progress.send_replace(Progress { done: 0, total });
+    let mut push = Push {
+        registry,
+        base: format!("/v2/{repository}"),
+        notes: read_notes(&order.notes),
+        notes_path: &order.notes,
+        done: 0,
+        progress,
+    };
+    for file in &output.files {
+        push.file(&order.directory.join(file.path.as_str()), file.blob).await?;
+        push.done += file.blob.size;
+        progress.send_modify(|progress| progress.done = push.done);
+    }
+    let config = serde_json::to_vec(output).map_err(|error| note_error(&order.notes, error.into()))?;
+    let config_ref = BlobRef { digest: Digest::of(&config), size: config.len() as u64 };
+    push.small(config_ref.digest, config).await?;
+    let manifest =
+        serde_json::to_vec(&output.manifest(config_ref)).map_err(|error| note_error(&order.notes, error.into()))?;
+    let put = registry.request(Method::PUT, &format!("{}/manifests/{tag}", push.base));
+    registry.send("the output", put.header(CONTENT_TYPE, MANIFEST_TYPE).body(manifest)).await?;
+    Ok(())
+}
+
+struct Push<'a> {
+    registry: &'a Registry,
+    base: String,
+    notes: Notes,
+    notes_path: &'a Path,
+    /// Bytes of the files before this one.
+    done: u64,
+    progress: &'a watch::Sender<Progress>,
+}
+
+impl Push<'_> {
+    async fn file(&mut self, path: &Path, blob: BlobRef) -> Result<(), OutputError> {
+        let head = self.registry.request(Method::HEAD, &format!("{}/blobs/{}", self.base, blob.digest));
+        match self.registry.send("a file", head).await {
+            Ok(_) => return Ok(()),
+            Err(OutputError::Refused { status: 404, .. }) => {}
+            Err(error) => return Err(error),
+        }
+        if blob.size <= CHUNK_BYTES {
+            let bytes = read_part(path, 0, blob.size).await?;
+            return self.small(blob.digest, bytes).await;
+        }
+        let mut beginnings = 0;
+        loop {
+            match self.large(path, blob).await {
+                // The server has collected the upload, or took a chunk whose answer was lost.
+                Err(OutputError::Refused { status: 404 | 416, .. }) if beginnings < MAX_BEGINNINGS => {
+                    beginnings += 1;
+                    self.note(blob.digest, None)?;
+                }
+                done => return done,
+            }
+        }
+    }
+
+    /// Pushes what fits into one request.
+    async fn small(&self, digest: Digest, bytes: Vec<u8>) -> Result<(), OutputError> {
+        let post = self.registry.request(Method::POST, &format!("{}/blobs/uploads/?digest={digest}", self.base));
+        let post = post.header(CONTENT_TYPE, "application/octet-stream").body(bytes);
+        self.registry.send("a file", post).await.map(drop)
+    }
+
+    async fn large(&mut self, path: &Path, blob: BlobRef) -> Result<(), OutputError> {
+        let (mut location, mut offset) = match self.notes.get(&blob.digest).cloned() {
+            Some(location) => {
+                let status =
+                    self.registry.send("an upload's state", self.registry.request(Method::GET, &location)).await?;
+                let offset = uploaded(&status).min(blob.size);
+                (location, offset)
+            }
+            None => {
+                let post = self.registry.request(Method::POST, &format!("{}/blobs/uploads/", self.base));
+                let begun = self.registry.send("an upload", post).await?;
+                let location = location(&begun)?;
+                self.note(blob.digest, Some(location.clone()))?;
+                (location, 0)
+            }
+        };
+        while offset < blob.size {
+            let bytes = read_part(path, offset, CHUNK_BYTES.min(blob.size - offset)).await?;
+            let last = offset + bytes.len() as u64 - 1;
+            let patch = self.registry.request(Method::PATCH, &location);
+            let patch = patch.header(CONTENT_RANGE, format!("{offset}-{last}")).body(bytes);
+            let taken = self.registry.send("a part of a file", patch).await?;
+            location = self::location(&taken)?;
+            offset = last + 1;
+            self.progress.send_modify(|progress| progress.done = self.done + offset);
+        }
+        let put = self.registry.request(Method::PUT, &format!("{location}?digest={}", blob.digest));
+        self.registry.send("a file", put).await?;
+        self.note(blob.digest, None)
+    }
+
+    fn note(&mut self, digest: Digest, location: Option<String>) -> Result<(), OutputError> {
+        match location {
+            Some(location) => self.notes.insert(digest, location),
+            None => self.notes.remove(&digest),
+        };
+        let written = serde_json::to_vec(&self.notes).map_err(std::io::Error::from);
+        let written = written.and_then(|bytes| durable::write(self.notes_path, &bytes, 0o600));
+        written.map_err(|source| note_error(self.notes_path, source))
+    }
+}
+
+fn note_error(path: &Path, source: std::io::Error) -> OutputError {
+    OutputError::Note { path: path.to_owned(), source }
+}
+
+/// What an earlier try noted; nothing, if that can't be read: then uploads begin anew.
+fn read_notes(path: &Path) -> Notes {
+    std::fs::read(path).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok()).unwrap_or_default()
+}
+
+async fn read_part(path: &Path, offset: u64, length: u64) -> Result<Vec<u8>, OutputError> {
+    let path = path.to_owned();
+    let read = {
+        let path = path.clone();
+        move || {
+            let mut file = find::open(&path)?;
+            file.seek(SeekFrom::Start(offset))?;
+            let mut bytes = Vec::new();
+            file.take(length).read_to_end(&mut bytes)?;
+            if bytes.len() as u64 == length { Ok(bytes) } else { Err(std::io::Error::other("it became shorter")) }
+        }
+    };
+    let read = tokio::task::spawn_blocking(read).await.map_err(std::io::Error::other).flatten();
+    read.map_err(|source| OutputError::Read { path, source })
+}
+
+/// How many bytes an upload has. A single one can't be told from none, and then it begins anew.
+fn uploaded(status: &Response) -> u64 {
+    let range = status.headers().get(RANGE).and_then(|value| value.to_str().ok());
+    let last = range.and_then(|range| range.strip_prefix("0-")?.parse::<u64>().ok());
+    last.filter(|last| *last > 0).map_or(0, |last| last.saturating_add(1))
+}
+
+/// Where an upload goes on, as a path of this server.
+fn location(response: &Response) -> Result<String, OutputError> {
+    let location = response.headers().get(LOCATION).and_then(|value| value.to_str().ok());
+    let path = location.filter(|location| location.starts_with("/v2/") && !location.contains('?'));
+    path.map(str::to_owned).ok_or_else(|| OutputError::Refused {
+        what: "an upload".to_owned(),
+        status: response.status().as_u16(),
+        text: "its answer does not say where to go on".to_owned(),
+    })
+}
+
+async fn refusal(what: &str, mut response: Response) -> OutputError {
+    let status = response.status();
+    let is_passing = status.is_server_error()
+        || matches!(status, StatusCode::TOO_MANY_REQUESTS | StatusCode::REQUEST_TIMEOUT | StatusCode::UNAUTHORIZED);
+    if is_passing {
+        let seconds = response.headers().get(RETRY_AFTER).and_then(|value| value.to_str().ok()?.parse().ok());
+        return OutputError::Busy { status: status.as_u16(), retry_after: seconds.map(Duration::from_secs) };
+    }
+    let mut body = Vec::new();
+    while let Ok(Some(chunk)) = response.chunk().await {
+        body.extend_from_slice(&chunk);
+        if body.len() > MAX_ERROR_BYTES {
+            break;
+        }
+    }
+    let text = String::from_utf8_lossy(&body[..body.len().min(MAX_ERROR_BYTES)]).replace(char::is_control, " ");
+    OutputError::Refused { what: what.to_owned(), status: status.as_u16(), text }
+}

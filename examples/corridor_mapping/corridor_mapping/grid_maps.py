@@ -1,19 +1,23 @@
 """Occupancy grids, one for each particle, as arrays whose first axis is the particle.
 
 Each has two layers: the log-odds of being occupied, which becomes the map, and the log-likelihood of seeing an echo at a
-place, which scans are matched with. The second is a likelihood field that grows with every echo: a cell keeps the
-likelihood of the nearest one. Maps grow to hold what was seen, up to a limit.
+place, which scans are matched with: a likelihood field, in which a cell has the likelihood of the nearest echo that showed
+a new wall. It forgets none: it is for buildings, not for crowds. Maps grow to hold what was seen, up to a limit.
 """
 
 import numpy as np
 
 # What one scan adds to a cell it found occupied, or free, and how sure a map gets.
 OCCUPIED_GAIN, FREE_GAIN, SURE = 0.9, 0.4, 6.0
-# The likelihood field: how far from a wall its echoes lie, as a standard deviation; what an echo far from any wall is worth,
-# which is never nothing: people walk by, and walls are seen for the first time; and how far from a wall that is.
-FIELD_SIGMA_M = 0.04
+# The likelihood field: how far from a wall its echoes lie, as a standard deviation in cells; what an echo far from any wall
+# is worth, which is never nothing: people walk by, and walls are seen for the first time; how many cells from a wall that
+# is; and what an echo is worth at most that shows a wall the field does not have yet.
+FIELD_SIGMA = 0.8
 NO_WALL = -4.0
-FIELD_REACH_M = FIELD_SIGMA_M * (-2 * NO_WALL) ** 0.5
+FIELD_REACH = FIELD_SIGMA * (-2 * NO_WALL) ** 0.5
+NEW_WALL = -0.7
+# All maps of a filter together, in cells.
+MAX_CELLS = 24_000_000
 GROWTH_M = 2.0
 # Rays are sampled this many times per cell.
 SAMPLES_PER_CELL = 1.4
@@ -26,14 +30,14 @@ class MapTooLarge(Exception):
 class GridMaps:
     """The maps of all particles, on one common raster."""
 
-    def __init__(self, particles, resolution, max_cells=40_000_000):
+    def __init__(self, particles, resolution, max_cells=MAX_CELLS):
         self.particles = particles
         self.resolution = resolution
         self.max_cells = max_cells
         self.corner = np.zeros(2, int)  # the lower left cell's column and row, counted from the frame's origin
         self.log_odds = np.zeros((particles, 0, 0), np.float32)
         self.field = np.zeros((particles, 0, 0), np.float32)
-        reach = int(np.ceil(FIELD_REACH_M / resolution))
+        reach = int(np.ceil(FIELD_REACH))
         self.stamp = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2), axis=-1).reshape(-1, 2)
 
     @property
@@ -54,7 +58,8 @@ class GridMaps:
     def integrate(self, lasers, bearings, ranges):
         """Draws a scan into all maps, each as seen from its own laser pose (particle, 3)."""
         rays = np.stack([np.cos(bearings), np.sin(bearings)], axis=-1)
-        echoes = self._placed(lasers, rays * ranges[:, None])
+        points = rays * ranges[:, None]
+        echoes = self._placed(lasers, points)
         self._grow(np.concatenate([echoes.reshape(-1, 2), lasers[:, :2]]))
         # Samples along each ray, ending one cell before its echo.
         counts = np.maximum((ranges / self.resolution - 1) * SAMPLES_PER_CELL, 0).astype(int)
@@ -69,13 +74,17 @@ class GridMaps:
         change[occupied] = OCCUPIED_GAIN
         self.log_odds += change.reshape(self.log_odds.shape)
         np.clip(self.log_odds, -SURE, SURE, out=self.log_odds)
-        self._stamp_field(echoes)
+        self._stamp_field(lasers, points, echoes)
 
     def match(self, lasers, points):
         """How well a scan's echoes fit, as a log-likelihood.
 
         `lasers` are candidate poses (particle, candidate, 3), `points` the echoes as the laser sees them (echo, 2).
         """
+        return self._likelihoods(lasers, points).sum(axis=-1)
+
+    def _likelihoods(self, lasers, points):
+        """The field at each echo (particle, candidate, echo), between the centres of the four cells around it."""
         placed = self._placed(lasers, points) / np.float32(self.resolution) - (self.corner + 0.5).astype(np.float32)
         height, width = self.field.shape[1:]
         column, row = placed[..., 0], placed[..., 1]
@@ -87,16 +96,21 @@ class GridMaps:
         field = self.field.ravel()
         below = field[base] * (1 - right) + field[base + 1] * right
         above = field[base + width] * (1 - right) + field[base + width + 1] * right
-        return (below * (1 - up) + above * up).sum(axis=-1)
+        return below * (1 - up) + above * up
 
-    def _stamp_field(self, echoes):
-        offsets = (echoes / self.resolution - self.corner) - 0.5
-        centre = np.rint(offsets).astype(np.int32)
-        cells = centre[:, :, None] + self.stamp.astype(np.int32)
-        away = (cells - offsets[:, :, None]) * self.resolution
-        likelihood = (np.square(away).sum(axis=-1) * (-0.5 / FIELD_SIGMA_M**2)).astype(np.float32).ravel()
-        touched = self._flat(cells)
-        np.maximum.at(self.field.reshape(-1), touched, likelihood)
+    def _stamp_field(self, lasers, points, echoes):
+        """Adds the echoes that the field does not explain yet.
+
+        Those it explains would only smear it: the first echoes of a wall are what later scans hold on to.
+        """
+        offsets = echoes / np.float32(self.resolution) - (self.corner + 0.5).astype(np.float32)
+        particle, echo = np.nonzero(self._likelihoods(lasers[:, None], points)[:, 0] < NEW_WALL)
+        offsets = offsets[particle, echo]
+        cells = np.rint(offsets).astype(np.int32)[:, None] + self.stamp.astype(np.int32)
+        likelihood = np.square(cells - offsets[:, None]).sum(axis=-1) * np.float32(-0.5 / FIELD_SIGMA**2)
+        height, width = self.field.shape[1:]
+        touched = (particle[:, None] * height + cells[..., 1]) * width + cells[..., 0]
+        np.maximum.at(self.field.reshape(-1), touched.ravel(), likelihood.ravel())
 
     def _placed(self, lasers, points):
         """Points as the lasers (..., 3) see them, in the maps' frame: (..., point, 2)."""
@@ -118,7 +132,7 @@ class GridMaps:
 
     def _grow(self, places):
         """Makes room for all places and what their echoes touch."""
-        margin = FIELD_REACH_M + 2 * self.resolution
+        margin = (FIELD_REACH + 2) * self.resolution
         low = np.floor((places.min(axis=0) - margin) / self.resolution).astype(int)
         high = np.floor((places.max(axis=0) + margin) / self.resolution).astype(int) + 1
         size = np.array(self.log_odds.shape[:0:-1])

@@ -390,3 +390,68 @@ impl Drop for Tasks {
 fn service_of(node: &GraphName, service: &'static str) -> Result<GraphName, GraphError> {
     format!("{node}/{service}").parse().map_err(|_| GraphError::Name { node: node.clone(), service })
 }
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use ros2_client::dds::rustdds::RTPSEntity;
+
+    use super::endpoint::Writer;
+    use super::entities::{NodeEntities, ParticipantEntities};
+    use super::*;
+
+    const DOMAIN: u16 = 96;
+
+    fn participant() -> DomainParticipant {
+        let builder = DomainParticipantBuilder::new(DOMAIN);
+        builder.with_only_networks([IpAddr::V4(Ipv4Addr::LOCALHOST)]).build().expect("participant")
+    }
+
+    async fn open(node_name: &str) -> Graph {
+        let node_name = node_name.parse().expect("name");
+        let settings = GraphSettings { domain_id: DOMAIN, localhost_only: true, node_name, distro: None };
+        Graph::open(&settings).await.expect("graph")
+    }
+
+    async fn shows(graph: &Graph, node: &str) -> Arc<Snapshot> {
+        let node: GraphName = node.parse().expect("name");
+        let mut changes = graph.changes();
+        let found = changes.wait_for(|snapshot| snapshot.named(&node).next().is_some());
+        let found = tokio::time::timeout(Duration::from_secs(60), found).await;
+        found.unwrap_or_else(|_| panic!("not within a minute: {node}")).expect("open").clone()
+    }
+
+    fn says(writer: &Writer, participant: ParticipantId, node: &str, form: GidForm) {
+        let (name, readers, writers) = (node.parse().expect("name"), Vec::new(), Vec::new());
+        let nodes = vec![NodeEntities { name, readers, writers }];
+        let entities = ParticipantEntities { participant, nodes, misnamed: 0 };
+        writer.put(Cdr::little_endian(entities.encode(form)));
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn both_forms_are_heard_garbage_is_not_and_nobody_speaks_for_another() {
+        let graph = open("/hearer").await;
+        let victim = open("/victim").await;
+        let stolen = shows(&graph, "/victim").await.nodes[0].participant;
+        let forger = participant();
+        let own = EndpointId::of(forger.guid()).participant();
+        let endpoints = Endpoints::of(&forger).expect("endpoints");
+        let lasting = Delivery::Lasting { depth: 500 };
+        let writer = endpoints.writer(names::DISCOVERY_TOPIC, names::DISCOVERY_TYPE, lasting).expect("writer");
+        for length in (0..2000).step_by(7) {
+            let byte = |at: usize| u8::try_from((length * 31 + at * 17) % 256).expect("a byte");
+            writer.put(Cdr::little_endian((0..length).map(byte).collect()));
+        }
+        writer.put(Cdr::little_endian(vec![0xff; 2 * endpoint::MAX_MESSAGE_BYTES]));
+        says(&writer, stolen, "/stolen", GidForm::Bytes16);
+        // Messages of one writer keep their order: what came before was dealt with when this shows.
+        for (node, form) in [("/old", GidForm::Bytes24), ("/new", GidForm::Bytes16), ("/older", GidForm::Bytes24)] {
+            says(&writer, own, node, form);
+            let snapshot = shows(&graph, node).await;
+            let names: Vec<_> = snapshot.nodes.iter().map(|node| node.name.as_str()).collect();
+            assert_eq!(names, if node < "/victim" { [node, "/victim"] } else { ["/victim", node] });
+        }
+        victim.close().await;
+    }
+}

@@ -164,9 +164,9 @@ impl Reader<'_> {
 
     fn gid(&mut self) -> Option<EndpointId> {
         let length = self.form.bytes();
-        let (id, filling) = self.take(length)?.split_at(16);
-        filling.iter().all(|byte| *byte == 0).then_some(())?;
-        Some(EndpointId(id.try_into().ok()?))
+        // What fills the longer form up says nothing, whatever it is.
+        let id = self.take(length)?.first_chunk()?;
+        Some(EndpointId(*id))
     }
 
     /// Gids, all of this participant: nobody speaks for another, and a wrong form does not get past this.
@@ -196,5 +196,142 @@ impl Writer {
     fn gid(&mut self, gid: &EndpointId) {
         self.body.extend(gid.0);
         self.body.resize(self.body.len() + self.form.bytes() - 16, 0);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::collection::vec;
+    use proptest::prelude::*;
+
+    use super::*;
+
+    /// A message as `rmw_dds_common` defines it, put together by hand from the definitions and not by the code under test:
+    /// `Gid { char data[16] }` (up to Humble `data[24]`, of which the last 8 are zero), `NodeEntitiesInfo { string
+    /// node_namespace; string node_name; Gid[] reader_gid_seq; Gid[] writer_gid_seq }`, `ParticipantEntitiesInfo { Gid gid;
+    /// NodeEntitiesInfo[] node_entities_info_seq }`. In CDR numbers are aligned to four bytes from the body's beginning,
+    /// texts are their length with a closing zero, and then that.
+    fn fixture(gid_bytes: usize) -> Vec<u8> {
+        let gid = |entity: [u8; 4]| {
+            let mut gid = [&[0x01, 0x0f, 0xa1, 0xa2, 0xa3, 0xa4, 0xa5, 0xa6, 0, 0, 0, 0][..], &entity].concat();
+            gid.resize(gid_bytes, 0);
+            gid
+        };
+        [
+            gid([0, 0, 1, 0xc1]),
+            vec![2, 0, 0, 0],
+            // "/robot", 7 with its zero, and one of padding
+            vec![7, 0, 0, 0],
+            b"/robot\0\0".to_vec(),
+            // "talker"
+            vec![7, 0, 0, 0],
+            b"talker\0\0".to_vec(),
+            vec![1, 0, 0, 0],
+            gid([0, 0, 1, 4]),
+            vec![2, 0, 0, 0],
+            gid([0, 0, 2, 3]),
+            gid([0, 0, 3, 3]),
+            // "/" and two of padding, then "ear" without any
+            vec![2, 0, 0, 0],
+            b"/\0\0\0".to_vec(),
+            vec![4, 0, 0, 0],
+            b"ear\0".to_vec(),
+            vec![0, 0, 0, 0],
+            vec![0, 0, 0, 0],
+        ]
+        .concat()
+    }
+
+    fn expected() -> ParticipantEntities {
+        let participant = ParticipantId([0x01, 0x0f, 0xa1, 0xa2, 0xa3, 0xa4, 0xa5, 0xa6, 0, 0, 0, 0]);
+        let endpoint = |entity: [u8; 4]| {
+            let mut id = participant.of_participant();
+            id.0[12..].copy_from_slice(&entity);
+            id
+        };
+        let node = |name: &str, readers: Vec<_>, writers: Vec<_>| NodeEntities {
+            name: name.parse().expect("a name"),
+            readers,
+            writers,
+        };
+        let writers = vec![endpoint([0, 0, 2, 3]), endpoint([0, 0, 3, 3])];
+        let nodes = vec![node("/robot/talker", vec![endpoint([0, 0, 1, 4])], writers), node("/ear", vec![], vec![])];
+        ParticipantEntities { participant, nodes, misnamed: 0 }
+    }
+
+    #[test]
+    fn both_forms_are_read_and_written() {
+        for (form, bytes) in [(GidForm::Bytes16, fixture(16)), (GidForm::Bytes24, fixture(24))] {
+            assert_eq!(ParticipantEntities::decode(&bytes, true), Ok((expected(), form)));
+            assert_eq!(expected().encode(form), bytes);
+            let nothing = ParticipantEntities { nodes: vec![], ..expected() };
+            assert_eq!(ParticipantEntities::decode(&nothing.encode(form), true), Ok((nothing, form)));
+        }
+    }
+
+    #[test]
+    fn the_form_follows_the_distribution() {
+        for (distro, form) in [
+            (Some("foxy"), GidForm::Bytes24),
+            (Some("humble"), GidForm::Bytes24),
+            (Some("iron"), GidForm::Bytes16),
+            (Some("kilted"), GidForm::Bytes16),
+            (Some("later"), GidForm::Bytes16),
+            (None, GidForm::Bytes16),
+        ] {
+            assert_eq!(GidForm::of_distro(distro), form, "{distro:?}");
+        }
+    }
+
+    #[test]
+    fn a_message_that_does_not_add_up_is_refused_whole() {
+        for length in [16, 24] {
+            let whole = fixture(length);
+            // The longer form without its end, cut right behind its first gid's 16 bytes, is an empty one of the shorter form.
+            for shorter in (0..whole.len()).filter(|at| length == 16 || !(20..24).contains(at)) {
+                assert_eq!(ParticipantEntities::decode(&whole[..shorter], true), Err(EntitiesError::Malformed));
+            }
+            let longer = [&whole[..], &[0; 4]].concat();
+            assert_eq!(ParticipantEntities::decode(&longer, true), Err(EntitiesError::Malformed));
+            let padded = [&whole[..], &[0; 3]].concat();
+            assert!(ParticipantEntities::decode(&padded, true).is_ok());
+            assert_eq!(ParticipantEntities::decode(&whole, false), Err(EntitiesError::Malformed));
+        }
+        // A gid of another participant, a count that nothing stands behind, and a message without end.
+        let mut stranger = fixture(16);
+        stranger[48] ^= 1;
+        assert_eq!(ParticipantEntities::decode(&stranger, true), Err(EntitiesError::Malformed));
+        let mut endless = fixture(16);
+        endless[16..20].copy_from_slice(&u32::MAX.to_le_bytes());
+        assert_eq!(ParticipantEntities::decode(&endless, true), Err(EntitiesError::Malformed));
+        let huge = vec![0; MAX_BYTES + 1];
+        assert_eq!(ParticipantEntities::decode(&huge, true), Err(EntitiesError::TooLong(MAX_BYTES + 1)));
+    }
+
+    #[test]
+    fn nodes_with_impossible_names_are_counted() {
+        let mut bytes = fixture(16);
+        let at = bytes.windows(6).position(|window| window == b"talker").expect("the name");
+        bytes[at] = b' ';
+        let (entities, _) = ParticipantEntities::decode(&bytes, true).expect("the rest is sound");
+        assert_eq!((entities.misnamed, entities.nodes.len()), (1, 1));
+    }
+
+    proptest! {
+        #[test]
+        fn no_bytes_panic_or_grow(bytes in vec(any::<u8>(), 0..400), little_endian: bool) {
+            if let Ok((entities, _)) = ParticipantEntities::decode(&bytes, little_endian) {
+                prop_assert!(entities.nodes.len() <= bytes.len());
+            }
+        }
+
+        #[test]
+        fn no_flipped_byte_panics(at in 0_usize..200, to: u8, long: bool) {
+            let mut bytes = fixture(if long { 24 } else { 16 });
+            if let Some(byte) = bytes.get_mut(at) {
+                *byte = to;
+            }
+            let _ = ParticipantEntities::decode(&bytes, true);
+        }
     }
 }

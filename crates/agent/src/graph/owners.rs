@@ -2,17 +2,24 @@
 //! addresses it listens at, and on this host the kernel knows whose sockets those are. That works with every vendor; where
 //! it cannot tell (another network namespace, no permission, an address that other hosts have too, no UDP at all) it says
 //! so, and [`Participant::first_seen`] is what is left.
+//!
+//! A killed process's participant stays on the graph until its lease ends, and its ports may be another's by then. So a
+//! participant that was seen before a process was started is never that process's.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::{IpAddr, SocketAddr};
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
+use std::time::Duration;
 use std::{fs, io};
 
 use nix::ifaddrs::getifaddrs;
 
 use super::snapshot::{Participant, ParticipantId};
+use crate::process::ProcessIdentity;
 
+/// How exactly the kernel says when a process was started, and how long ago that is.
+const CLOCK_STEP: Duration = Duration::from_millis(20);
 /// The most open files of one process that are looked at.
 const MAX_FILES: usize = 65_536;
 
@@ -33,8 +40,8 @@ struct Host {
     addresses: BTreeSet<IpAddr>,
     /// Sockets by the port they are bound to.
     sockets: BTreeMap<u16, BTreeSet<u64>>,
-    /// The sockets that the processes hold.
-    held: BTreeSet<u64>,
+    /// The sockets that the processes hold, with the age of the oldest that does.
+    held: BTreeMap<u64, Duration>,
     /// Whether every process could be looked at, and shares the agent's network.
     complete: bool,
 }
@@ -66,8 +73,11 @@ impl Host {
         }
         let network = fs::metadata(proc.join("self/ns/net"))?.ino();
         for pid in pids {
-            match held_by(&proc.join(pid.to_string()), network) {
-                Ok(Some(sockets)) => host.held.extend(sockets),
+            match held_by(*pid, &proc.join(pid.to_string()), network) {
+                Ok(Some((age, sockets))) => sockets.into_iter().for_each(|socket| {
+                    let oldest = host.held.entry(socket).or_default();
+                    *oldest = age.max(*oldest);
+                }),
                 Ok(None) => host.complete = false,
                 // It has ended, and its sockets with it.
                 Err(error) if error.kind() == io::ErrorKind::NotFound => {}
@@ -83,7 +93,7 @@ impl Host {
     fn judge(&self, participants: &BTreeMap<ParticipantId, Participant>) -> Owners {
         let mut owners = Owners::default();
         for (id, participant) in participants {
-            let class = match self.holds(&participant.locators) {
+            let class = match self.holds(&participant.locators, participant.first_seen.elapsed()) {
                 Some(true) => &mut owners.theirs,
                 Some(false) => &mut owners.others,
                 None => &mut owners.unknown,
@@ -93,19 +103,26 @@ impl Host {
         owners
     }
 
-    /// Whether one of the processes listens at these addresses; `None`: it cannot be told.
-    fn holds(&self, locators: &BTreeSet<SocketAddr>) -> Option<bool> {
-        let mut ours = locators.iter().filter(|locator| self.is_here(locator.ip())).peekable();
-        if locators.is_empty() || (ours.peek().is_none() && !self.complete) {
-            return None;
+    /// Whether one of the processes listens at these addresses, and did when they were first seen; `None`: it cannot be
+    /// told.
+    fn holds(&self, locators: &BTreeSet<SocketAddr>, seen_for: Duration) -> Option<bool> {
+        let ports = locators.iter().filter(|locator| self.is_here(locator.ip())).map(SocketAddr::port);
+        let (mut theirs, mut others, mut shared) = (false, false, false);
+        for sockets in ports.filter_map(|port| self.sockets.get(&port)) {
+            let is_held = |socket: &u64| self.held.get(socket).is_some_and(|age| *age + CLOCK_STEP >= seen_for);
+            match sockets.iter().filter(|socket| is_held(socket)).count() {
+                0 => others = true,
+                held if held == sockets.len() => theirs = true,
+                _ => shared = true,
+            }
         }
-        let held = ours
-            .any(|locator| self.sockets.get(&locator.port()).is_some_and(|sockets| !sockets.is_disjoint(&self.held)));
         // Another host may have one of our addresses too (a container bridge's), but hardly all of them.
-        match (held, locators.iter().all(|locator| self.is_here(locator.ip()))) {
-            (true, true) => Some(true),
-            (true, false) => None,
-            (false, _) => self.complete.then_some(false),
+        let all_here = locators.iter().all(|locator| self.is_here(locator.ip()));
+        match (theirs, others, shared) {
+            _ if locators.is_empty() => None,
+            (true, false, _) => all_here.then_some(true),
+            (true, true, _) | (false, false, true) => None,
+            (false, ..) => self.complete.then_some(false),
         }
     }
 
@@ -128,11 +145,12 @@ fn socket_of(line: &str) -> Option<(u16, u64)> {
     Some((u16::from_str_radix(port, 16).ok()?, inode.parse().ok()?))
 }
 
-/// The sockets that a process holds; `None`: it has another network than this.
-fn held_by(process: &Path, network: u64) -> io::Result<Option<BTreeSet<u64>>> {
+/// How old a process is and the sockets it holds; `None`: it has another network than this.
+fn held_by(pid: u32, process: &Path, network: u64) -> io::Result<Option<(Duration, BTreeSet<u64>)>> {
     if fs::metadata(process.join("ns/net"))?.ino() != network {
         return Ok(None);
     }
+    let Some(identity) = ProcessIdentity::of(pid)? else { return Err(io::ErrorKind::NotFound.into()) };
     let mut sockets = BTreeSet::new();
     for file in fs::read_dir(process.join("fd"))?.take(MAX_FILES) {
         // A file that was closed in between is no socket any more.
@@ -140,7 +158,7 @@ fn held_by(process: &Path, network: u64) -> io::Result<Option<BTreeSet<u64>>> {
         let inode = target.to_str().and_then(|text| text.strip_prefix("socket:[")?.strip_suffix(']'));
         sockets.extend(inode.and_then(|inode| inode.parse::<u64>().ok()));
     }
-    Ok(Some(sockets))
+    Ok(Some((identity.age()?, sockets)))
 }
 
 #[cfg(test)]
@@ -158,8 +176,12 @@ mod tests {
     fn host(complete: bool) -> Host {
         Host {
             addresses: BTreeSet::from(["192.168.1.5".parse().expect("ip"), "172.17.0.1".parse().expect("ip")]),
-            sockets: BTreeMap::from([(7411, BTreeSet::from([1])), (7413, BTreeSet::from([2]))]),
-            held: BTreeSet::from([1]),
+            sockets: BTreeMap::from([
+                (7411, BTreeSet::from([1])),
+                (7413, BTreeSet::from([2])),
+                (7417, BTreeSet::from([3, 4])),
+            ]),
+            held: BTreeMap::from([(1, Duration::from_secs(10)), (3, Duration::from_secs(10))]),
             complete,
         }
     }
@@ -178,11 +200,22 @@ mod tests {
             (&["192.168.1.7:7413", "172.17.0.1:7413"], true, Some(false)),
             (&["192.168.1.5:7413"], false, None),
             (&["192.168.1.7:7411"], false, None),
+            // A port that two processes share says nothing, and two that contradict each other no more.
+            (&["192.168.1.5:7417"], true, None),
+            (&["192.168.1.5:7417", "192.168.1.5:7411"], true, Some(true)),
+            (&["192.168.1.5:7411", "192.168.1.5:7413"], true, None),
             (&[], true, None),
         ] {
-            let found = host(complete).holds(&participant(locators).locators);
+            let found = host(complete).holds(&participant(locators).locators, Duration::from_secs(1));
             assert_eq!(found, expected, "{locators:?} {complete}");
         }
+    }
+
+    #[test]
+    fn what_was_seen_before_a_process_was_started_is_not_its_own() {
+        let locators = participant(&["192.168.1.5:7411"]).locators;
+        assert_eq!(host(true).holds(&locators, Duration::from_secs(10)), Some(true));
+        assert_eq!(host(true).holds(&locators, Duration::from_secs(11)), Some(false));
     }
 
     #[test]

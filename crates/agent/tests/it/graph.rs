@@ -246,3 +246,37 @@ async fn a_closed_graph_says_so() {
     let refused = other.lifecycle_state(&name("/mapper"), CALL).await;
     assert!(matches!(refused, Err(GraphError::Closed)), "{refused:?}");
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn nodes_of_a_robot_with_another_distribution_see_the_agent() {
+    for (domain_id, distro) in [(93, "kilted"), (94, "humble")] {
+        let settings = GraphSettings {
+            domain_id,
+            localhost_only: true,
+            node_name: name("/taskd_here"),
+            distro: Some(distro.to_owned()),
+        };
+        let graph = within("the graph to open", Graph::open(&settings)).await.unwrap();
+        let other = open_as(domain_id, "/taskd_there").await;
+        shows(&other, "the agent of either form", |snapshot| has(snapshot, "/taskd_here")).await;
+        graph.close().await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_killed_node_is_not_taken_for_the_one_started_after_it() {
+    let graph = open(97).await;
+    let killed = RosNode::start("talker.py", 97, &[]).await;
+    let before = shows(&graph, "the talker", |snapshot| has(snapshot, "/talker")).await;
+    let ghost = only(&before, "/talker").participant;
+    killed.kill().await;
+    // It gets the ports that have become free, which the killed one's participant still announces.
+    let started = RosNode::start("talker.py", 97, &[]).await;
+    let is_new = |node: &Node| node.name == name("/talker") && node.participant != ghost;
+    let after = shows(&graph, "the second talker", |snapshot| snapshot.nodes.iter().any(is_new)).await;
+    let owners = Graph::owners(after.clone(), vec![started.pid()]).await;
+    let new: Vec<_> = after.nodes.iter().filter(|node| is_new(node)).map(|node| node.participant).collect();
+    assert_eq!(owners.theirs.iter().copied().collect::<Vec<_>>(), new);
+    assert_eq!(owners.others.contains(&ghost), after.participants.contains_key(&ghost), "{owners:?}");
+    started.leave().await;
+}

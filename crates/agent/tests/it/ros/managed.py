@@ -3,7 +3,7 @@ import sys
 import threading
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import Node, TransitionCallbackReturn
 
 
@@ -25,10 +25,13 @@ def leave():
 
 rclpy.init(args=sys.argv)
 node = Managed()
+# Before anybody may end it all: an executor cannot be made in a context that is shut down.
+executor = SingleThreadedExecutor()
+executor.add_node(node)
 threading.Thread(target=leave, daemon=True).start()
 print("up", flush=True)
 try:
-    rclpy.spin(node)
+    executor.spin()
 except (ExternalShutdownException, KeyboardInterrupt):
     pass
 rclpy.try_shutdown()

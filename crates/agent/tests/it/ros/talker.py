@@ -8,7 +8,7 @@ import threading
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.qos import qos_profile_sensor_data
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -56,10 +56,13 @@ def obey():
 
 
 node.get_logger().info("talker is up")
+# Before anybody may end it all: an executor cannot be made in a context that is shut down.
+executor = SingleThreadedExecutor()
+executor.add_node(node)
 threading.Thread(target=obey, daemon=True).start()
 print("up", flush=True)
 try:
-    rclpy.spin(node)
+    executor.spin()
 except (ExternalShutdownException, KeyboardInterrupt):
     pass
 rclpy.try_shutdown()

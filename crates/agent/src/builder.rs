@@ -12,7 +12,7 @@ use task_proto::manifest::BuildTool;
 use task_proto::report::FailureCode;
 use tokio_util::sync::CancellationToken;
 
-use crate::containment::{Containment, ContainmentError, RUN_DIR_VARIABLE};
+use crate::containment::{Containment, ContainmentError, KillOnDrop, RUN_DIR_VARIABLE};
 use crate::durable;
 use crate::layout::VersionDir;
 use crate::process::ExitStatus;
@@ -133,26 +133,16 @@ impl std::fmt::Display for Output {
     }
 }
 
-/// Ends a build whose future was dropped: whatever the reason, none goes on unwatched.
-struct KillOnDrop(Containment);
-
-impl Drop for KillOnDrop {
-    fn drop(&mut self) {
-        // The next build of the same directory looks again.
-        let _ = self.0.kill();
-    }
-}
-
 /// Builds `order`; at once done when there is nothing to build. When it returns, no process of the build is left and
 /// what was installed is on the disk.
 pub async fn build(order: &BuildOrder, cancel: &CancellationToken) -> Result<(), BuildError> {
     let Some(text) = script::build_script(order.tool, &order.version, &order.underlays) else { return Ok(()) };
     let root = order.version.root();
-    let guard = KillOnDrop(Containment::new(root, None));
+    let guard = KillOnDrop::new(Containment::new(root, None));
     // An agent that was killed leaves its build running.
-    guard.0.end(KILL_TIMEOUT).await?;
+    guard.end(KILL_TIMEOUT).await?;
     prepare(order, &text)?;
-    let (status, tail) = run(order, &guard.0, cancel).await?;
+    let (status, tail) = run(order, &guard, cancel).await?;
     let output = Output { log: order.log.clone(), tail: String::from_utf8_lossy(&tail).trim().to_owned() };
     match status {
         Some(ExitStatus::Code(0)) => {}

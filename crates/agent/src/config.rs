@@ -15,6 +15,8 @@ use crate::durable;
 
 /// The file's name.
 pub const FILE_NAME: &str = "agent.toml";
+/// The longest time the gate may be given to answer, in seconds.
+pub const MAX_GATE_TIMEOUT_S: u64 = 300;
 /// What every variable starts with.
 const VARIABLE_PREFIX: &str = "TASK_AGENT_";
 /// Variables that are no settings: the data directory, the log filter, the enrolment token.
@@ -51,6 +53,35 @@ pub struct Settings {
     /// What tasks may use.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub limits: Option<LimitSettings>,
+    /// Who is asked before a task is started, stopped or switched.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub gate: Option<GateSettings>,
+}
+
+/// The `[gate]` table.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GateSettings {
+    /// The program, by its absolute path, and its arguments.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub command: Option<Vec<String>>,
+    /// Seconds it may take to answer.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub timeout_s: Option<u64>,
+    /// What it means when it hangs, crashes or can't be run.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub default: Option<GateDefault>,
+}
+
+/// What holds when the gate gives no answer.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum GateDefault {
+    /// As if it had said yes.
+    Allow,
+    /// As if it had said not now.
+    #[default]
+    Deny,
 }
 
 /// The `[limits]` table.
@@ -80,6 +111,17 @@ pub struct LimitSettings {
     pub parallel_tasks: Option<usize>,
 }
 
+/// The gate's settings that hold.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct GateConfig {
+    /// The program and its arguments.
+    pub command: Vec<String>,
+    /// How long it may take to answer.
+    pub timeout: Duration,
+    /// What it means when there is no answer.
+    pub default: GateDefault,
+}
+
 /// The settings that hold, defaults filled in.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Config {
@@ -103,6 +145,8 @@ pub struct Config {
     pub limits: LimitSettings,
     /// Versions that are prepared at the same time.
     pub parallel_tasks: usize,
+    /// Who is asked before a task is started, stopped or switched; nobody unless a program is named.
+    pub gate: Option<GateConfig>,
 }
 
 /// A setting that can't be used.
@@ -177,12 +221,14 @@ impl Config {
             poll_interval_without_mqtt: Duration::from_secs(settings.poll_interval_without_mqtt_s.unwrap_or(10)),
             parallel_tasks: limits.parallel_tasks.unwrap_or(2),
             limits,
+            gate: settings.gate.map(gate).transpose()?,
         };
         let bounds = [
             ("ros_domain_id", u64::from(config.ros_domain_id.unwrap_or(0)), 0, 232),
             ("poll_interval_s", config.poll_interval.as_secs(), 1, 86_400),
             ("poll_interval_without_mqtt_s", config.poll_interval_without_mqtt.as_secs(), 1, 86_400),
             ("limits.parallel_tasks", config.parallel_tasks as u64, 1, 64),
+            ("gate.timeout_s", config.gate.as_ref().map_or(1, |gate| gate.timeout.as_secs()), 1, MAX_GATE_TIMEOUT_S),
             ("limits.build_timeout_s", config.limits.build_timeout_s.unwrap_or(60), 1, 86_400),
         ];
         for (key, value, least, most) in bounds {
@@ -193,6 +239,16 @@ impl Config {
         }
         Ok(config)
     }
+}
+
+fn gate(settings: GateSettings) -> Result<GateConfig, ConfigError> {
+    let command = settings.command.unwrap_or_default();
+    if command.first().is_none_or(|program| !program.starts_with('/')) {
+        let reason = "needs a program by its absolute path".to_owned();
+        return Err(ConfigError::Invalid { origin: "gate.command".to_owned(), reason });
+    }
+    let timeout = Duration::from_secs(settings.timeout_s.unwrap_or(10));
+    Ok(GateConfig { command, timeout, default: settings.default.unwrap_or_default() })
 }
 
 /// A server's URL as people write it.
@@ -210,6 +266,7 @@ fn override_by(table: &mut Table, name: &str, text: &str) -> Result<(), ConfigEr
     let key = name[VARIABLE_PREFIX.len()..].to_ascii_lowercase();
     let value = match key.as_str() {
         "server" | "name" => Value::String(text.to_owned()),
+        "gate_command" => Value::Array(vec![Value::String(text.to_owned())]),
         "underlays" => {
             let paths = text.split(':').filter(|path| !path.is_empty());
             Value::Array(paths.map(|path| Value::String(path.to_owned())).collect())
@@ -223,11 +280,12 @@ fn override_by(table: &mut Table, name: &str, text: &str) -> Result<(), ConfigEr
         }
         _ => scalar(text),
     };
-    match key.strip_prefix("limits_") {
-        Some(limit) => {
-            let limits = table.entry("limits").or_insert_with(|| Value::Table(Table::new()));
-            if let Value::Table(limits) = limits {
-                limits.insert(limit.to_owned(), value);
+    let nested =
+        ["limits", "gate"].iter().find_map(|outer| Some((*outer, key.strip_prefix(outer)?.strip_prefix('_')?)));
+    match nested {
+        Some((outer, inner)) => {
+            if let Value::Table(table) = table.entry(outer).or_insert_with(|| Value::Table(Table::new())) {
+                table.insert(inner.to_owned(), value);
             }
         }
         None => {
@@ -302,6 +360,21 @@ mod tests {
         assert!(text("server = \"ftp://x\"\n", &[]).contains("server"));
         assert!(text("ros_domain_id = 400\n", &[]).contains("ros_domain_id"));
         assert!(text("poll_interval_s = 0\n", &[]).contains("poll_interval_s"));
+    }
+
+    #[test]
+    fn a_gate_is_a_program_by_its_absolute_path() {
+        assert_eq!(load("", &[]).expect("valid").gate, None);
+        let file = "[gate]\ncommand = [\"/opt/gate\", \"--battery\"]\ndefault = \"allow\"\n";
+        let gate = load(file, &[("TASK_AGENT_GATE_TIMEOUT_S", "3")]).expect("valid").gate.expect("one");
+        assert_eq!((gate.command.len(), gate.timeout.as_secs(), gate.default), (2, 3, GateDefault::Allow));
+        let gate = load("", &[("TASK_AGENT_GATE_COMMAND", "/opt/gate")]).expect("valid").gate.expect("one");
+        assert_eq!((gate.timeout.as_secs(), gate.default), (10, GateDefault::Deny));
+        let text = |file: &str| load(file, &[]).expect_err("refused").to_string();
+        assert!(text("[gate]\ncommand = [\"gate\"]\n").contains("gate.command"));
+        assert!(text("[gate]\ntimeout_s = 5\n").contains("gate.command"));
+        assert!(text("[gate]\ncommand = [\"/g\"]\ntimeout_s = 301\n").contains("gate.timeout_s"));
+        assert!(text("[gate]\ncommand = [\"/g\"]\ndefault = \"maybe\"\n").contains("maybe"));
     }
 
     #[test]

@@ -5,6 +5,7 @@
 
 use std::collections::HashSet;
 use std::io;
+use std::ops::Deref;
 use std::path::Path;
 use std::time::Duration;
 
@@ -40,6 +41,10 @@ pub enum ContainmentError {
         pids: Vec<u32>,
     },
 }
+
+/// Kills all members when it is dropped, for what must not outlive the one who waits for it.
+#[derive(Debug)]
+pub struct KillOnDrop(Containment);
 
 impl Containment {
     /// The processes that were started for the directory `dir`, and those below `shim`.
@@ -118,6 +123,28 @@ impl Containment {
         };
         let members = table.iter().filter(is_member).map(|entry| entry.identity(&boot_id)).collect();
         Ok((table, members))
+    }
+}
+
+impl KillOnDrop {
+    /// Kills what is in `containment` when it is dropped.
+    pub fn new(containment: Containment) -> Self {
+        Self(containment)
+    }
+}
+
+impl Deref for KillOnDrop {
+    type Target = Containment;
+
+    fn deref(&self) -> &Containment {
+        &self.0
+    }
+}
+
+impl Drop for KillOnDrop {
+    fn drop(&mut self) {
+        // Who starts the same again looks again.
+        let _ = self.0.kill();
     }
 }
 

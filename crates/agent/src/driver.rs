@@ -283,7 +283,7 @@ impl<E: Effects> Driver<E> {
         for _ in 0..MAX_TURNS {
             let mut changed = false;
             until_ms = None;
-            for lane in [Lane::Run, Lane::Prepare] {
+            for lane in Lane::ALL {
                 let planned = |(other, step): &(TaskName, Step)| other == task && step.lane() == lane;
                 if self.under_way.contains_key(&(task.clone(), lane)) || begin.iter().any(planned) {
                     continue;
@@ -332,6 +332,7 @@ impl<E: Effects> Driver<E> {
         self.situation(task, view, desired, &steps).map_or(rest, |situation| match lane {
             Lane::Run => plan::supervise(&situation),
             Lane::Prepare => plan::prepare(&situation),
+            Lane::Gate => plan::consult(&situation),
         })
     }
 
@@ -351,10 +352,12 @@ impl<E: Effects> Driver<E> {
             process: view.process.as_ref().unwrap_or(&ProcessState::None),
             health: &view.health,
             preparing: steps.iter().any(|step| step.lane() == Lane::Prepare),
+            acting: steps.iter().any(|step| step.lane() == Lane::Run),
             deleting: steps.iter().any(|step| step.deletes()),
             robot: &self.robot,
             may_begin: self.may_begin(now),
             held: self.held,
+            gated: self.effects.is_gated(),
             boot_id: &self.speaker.boot_id,
             now_ms: now.boot_ms,
             jitter: rand::random(),

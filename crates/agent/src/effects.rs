@@ -9,7 +9,7 @@ use task_proto::{Digest, TaskName};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
-use crate::ledger::{ActiveRun, Ledger, LedgerError, ProcessRecord};
+use crate::ledger::{ActiveRun, GateQuestion, Ledger, LedgerError, ProcessRecord};
 use crate::observed::{Health, Prepared, ProcessState, RobotFacts};
 use crate::plan::StepFailure;
 
@@ -40,6 +40,9 @@ pub trait Effects: Send + Sync + 'static {
 
     /// Whether a person at the robot said `hold`.
     fn is_held(&self) -> bool;
+
+    /// Whether the robot has a gate that is to be asked.
+    fn is_gated(&self) -> bool;
 
     /// What packages may require of this robot, apart from the labels the server knows better, with the ROS that was
     /// last seen.
@@ -92,6 +95,13 @@ pub trait Effects: Send + Sync + 'static {
         &self,
         package: &PackageRef,
         cancel: &CancellationToken,
+    ) -> impl Future<Output = Result<(), StepFailure>> + Send;
+
+    /// Asks the robot's gate; a failure is the reason of its no.
+    fn ask_gate(
+        &self,
+        task: &TaskName,
+        question: &GateQuestion,
     ) -> impl Future<Output = Result<(), StepFailure>> + Send;
 
     /// Makes the run's version the current one and starts the process that its record names; gives the process id.

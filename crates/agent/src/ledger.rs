@@ -12,7 +12,7 @@ use task_proto::desired::{Delivery, DesiredTask, PackageRef, Wanted};
 use task_proto::envelope::Envelope;
 use task_proto::manifest::{OnBoot, Restart, TaskKind, TaskManifest};
 use task_proto::report::{Failure, Phase};
-use task_proto::{DeploymentId, Digest, Generation, TaskName};
+use task_proto::{DeploymentId, Digest, Generation, TaskName, Version};
 
 use crate::durable;
 
@@ -58,10 +58,19 @@ pub struct TaskRecord {
     pub preparation: Preparation,
     /// The run that is kept alive, of the ordered version or, until that is staged, of the one before.
     pub active: Option<ActiveRun>,
+    /// The run that comes back should the active one, which took its place, not get ready.
+    #[serde(default)]
+    pub fallback: Option<ActiveRun>,
     /// The version that was active before.
     pub previous: Option<PackageRef>,
     /// Runs that have ended for good, the oldest first. An order that comes back is not done twice.
     pub finished: Vec<FinishedRun>,
+    /// What the robot's gate was asked about this task, while that matters.
+    #[serde(default)]
+    pub gate: Option<GateRecord>,
+    /// Starts of a process of this task.
+    #[serde(default)]
+    pub starts: u64,
     /// The phase as it was last reported.
     pub phase: Phase,
     /// Since when.
@@ -96,9 +105,7 @@ pub struct ActiveRun {
     pub rules: RunRules,
     /// The process that was started last and is not known to have ended.
     pub process: Option<ProcessRecord>,
-    /// Starts of a process in this run.
-    pub starts: u32,
-    /// Those of them that the restart policy made.
+    /// Starts of a process that the restart policy made.
     pub restarts: u32,
     /// Those of them since it last ran calmly.
     pub restarts_in_a_row: u32,
@@ -108,6 +115,9 @@ pub struct ActiveRun {
     pub first_start_ms: u64,
     /// Whether a process of this run was ever ready.
     pub ever_ready: bool,
+    /// Whether one was started in this boot, so that the robot's gate need not be asked again.
+    #[serde(default)]
+    pub admitted: bool,
     /// Set once the run is over for good.
     pub end: Option<End>,
 }
@@ -181,6 +191,54 @@ pub struct End {
     pub failure: Option<Failure>,
 }
 
+/// What the robot's gate was asked, and what it said.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct GateRecord {
+    /// The question.
+    pub question: GateQuestion,
+    /// The last answer to it.
+    pub answer: Option<GateAnswer>,
+    /// How often the answer was no.
+    pub refusals: u32,
+    /// It is not asked again before this time.
+    pub retry_at_ms: u64,
+}
+
+/// A question to the robot's gate.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct GateQuestion {
+    /// What is about to be done.
+    pub step: GateStep,
+    /// With which order's run.
+    pub deployment: DeploymentId,
+    /// Which of its runs.
+    pub run: u64,
+    /// Of which version.
+    pub version: Version,
+}
+
+/// What the robot's gate may forbid.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum GateStep {
+    /// To start a task that does not run.
+    Start,
+    /// To stop one that runs.
+    Stop,
+    /// To replace one version by another.
+    Switch,
+}
+
+/// What the robot's gate said.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum GateAnswer {
+    /// Yes.
+    Allowed,
+    /// Not now, and why.
+    Refused(Failure),
+}
+
 /// The ledger could not be written or read.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot use the ledger {path}")]
@@ -242,8 +300,12 @@ impl Ledger {
         durable::write(path, &bytes, 0o600).map_err(failed)
     }
 
-    /// Takes the times of another boot out of the records: in this one they mean nothing.
+    /// Takes out of the records what means nothing to a new agent, and in a new boot the times of the one before.
     pub fn enter_boot(&mut self, boot_id: &str, now_ms: u64) {
+        for record in self.tasks.values_mut() {
+            // The robot may have been given a load since it said yes.
+            record.gate.take_if(|gate| gate.answer == Some(GateAnswer::Allowed));
+        }
         if self.boot_id == boot_id {
             return;
         }
@@ -251,9 +313,11 @@ impl Ledger {
         for record in self.tasks.values_mut() {
             record.phase_since_ms = now_ms;
             record.preparation.retry_at_ms = 0;
-            if let Some(active) = &mut record.active {
-                active.retry_at_ms = 0;
-                active.first_start_ms = now_ms;
+            if let Some(gate) = &mut record.gate {
+                gate.retry_at_ms = 0;
+            }
+            for run in [&mut record.active, &mut record.fallback].into_iter().flatten() {
+                (run.retry_at_ms, run.first_start_ms, run.admitted) = (0, now_ms, false);
             }
         }
     }
@@ -279,8 +343,11 @@ impl TaskRecord {
             order,
             preparation: Preparation::default(),
             active: None,
+            fallback: None,
             previous: None,
             finished: Vec::new(),
+            gate: None,
+            starts: 0,
             phase: Phase::Assigned,
             phase_since_ms: now_ms,
         };
@@ -320,6 +387,9 @@ impl TaskRecord {
         if self.order.wanted == Wanted::Stopped && self.active.as_ref().is_none_or(|active| active.process.is_none()) {
             return (Phase::Stopped, None);
         }
+        if let Some((_, refusal)) = self.refusal().filter(|(question, _)| self.concerns_order(question)) {
+            return (Phase::Deferred, Some(refusal));
+        }
         if let Some(end) = self.end_of_order() {
             return (end.phase, end.failure.as_ref());
         }
@@ -328,6 +398,20 @@ impl TaskRecord {
             Some(_) => (Phase::Starting, None),
             None => (self.preparation.phase, self.preparation.failure.as_ref()),
         }
+    }
+
+    /// What the robot's gate forbids, and why.
+    pub fn refusal(&self) -> Option<(&GateQuestion, &Failure)> {
+        match &self.gate {
+            Some(GateRecord { question, answer: Some(GateAnswer::Refused(failure)), .. }) => Some((question, failure)),
+            _ => None,
+        }
+    }
+
+    /// Whether what the gate is asked decides where the order stands, and not only whether an older run goes on.
+    pub fn concerns_order(&self, question: &GateQuestion) -> bool {
+        let same = question.deployment == self.order.deployment && question.run == self.order.run;
+        question.step == GateStep::Stop || same
     }
 
     /// Brings the stored phase up to date after any change.
@@ -339,25 +423,55 @@ impl TaskRecord {
         }
     }
 
-    /// Makes place for the ordered run: remembers how the active one ended, and its version.
-    pub fn retire_active(&mut self) {
-        let Some(active) = self.active.take() else { return };
-        if let Some(end) = active.end {
-            self.finished.retain(|run| run.deployment != active.deployment || run.run != active.run);
-            self.finished.push(FinishedRun { deployment: active.deployment, run: active.run, end });
-            let surplus = self.finished.len().saturating_sub(MAX_FINISHED);
-            self.finished.drain(..surplus);
+    /// Makes place for `successor`: remembers how the active run ended, its version and, if it was good and does not
+    /// come back anyway, the run itself.
+    pub fn retire_active(&mut self, successor: &ActiveRun) {
+        let is_good = |run: &&mut ActiveRun| run.ever_ready && run.end.is_none() && run.rules.kind == TaskKind::Service;
+        if let Some(good) = self.active.as_mut().filter(is_good) {
+            (good.process, good.retry_at_ms, good.restarts_in_a_row) = (None, 0, 0);
+            self.fallback.clone_from(&self.active);
         }
-        if active.package != self.order.package {
-            self.previous = Some(active.package);
+        self.lay_down_active(&successor.package);
+        // A job that failed has failed: what it has done can't be undone by starting something else.
+        let is_job = successor.rules.kind == TaskKind::Job;
+        self.fallback.take_if(|fallback| is_job || fallback.package == successor.package);
+        if let Some(fallback) = &self.fallback {
+            self.previous = Some(fallback.package.clone());
         }
     }
 
-    /// The versions that must stay on disk: ordered, active and the one before.
+    /// What the operator had stopped neither starts nor comes back in place of what is ordered now.
+    pub fn forget_stopped(&mut self, next: &DesiredTask, now_ms: u64) {
+        self.fallback = None;
+        match &mut self.active {
+            Some(active) if active.is_for(next) => (active.ever_ready, active.first_start_ms) = (false, now_ms),
+            _ => self.lay_down_active(&next.package),
+        }
+    }
+
+    /// Takes the active run away and remembers how it ended and, unless that is the next one's, its version.
+    fn lay_down_active(&mut self, next: &PackageRef) {
+        let Some(active) = self.active.take() else { return };
+        if active.package != *next {
+            self.previous = Some(active.package);
+        }
+        if let Some(end) = active.end {
+            self.finish(active.deployment, active.run, end);
+        }
+    }
+
+    /// Remembers what came of a run.
+    pub fn finish(&mut self, deployment: DeploymentId, run: u64, end: End) {
+        self.finished.retain(|other| other.deployment != deployment || other.run != run);
+        self.finished.push(FinishedRun { deployment, run, end });
+        let surplus = self.finished.len().saturating_sub(MAX_FINISHED);
+        self.finished.drain(..surplus);
+    }
+
+    /// The versions that must stay on disk: ordered, active, the one before and the one that may come back.
     pub fn kept_versions(&self) -> Vec<Digest> {
-        let active = self.active.as_ref().map(|active| &active.package);
-        let mut kept: Vec<Digest> =
-            [Some(&self.order.package), active, self.previous.as_ref()].into_iter().flatten().map(digest_of).collect();
+        let runs = [&self.active, &self.fallback].into_iter().flatten().map(|run| &run.package);
+        let mut kept: Vec<Digest> = runs.chain([&self.order.package]).chain(&self.previous).map(digest_of).collect();
         kept.sort();
         kept.dedup();
         kept
@@ -446,6 +560,41 @@ mod tests {
             assert!(!path.exists());
             assert_eq!(std::fs::read(&aside).expect("kept"), bytes);
         }
+    }
+
+    #[test]
+    fn a_ledger_of_an_agent_that_knew_no_rollback_is_read() {
+        let mut ledger = Ledger::new(3);
+        let order = order();
+        let mut record = TaskRecord::new(order.clone(), 5);
+        let manifest = serde_json::json!({
+            "name": "talker", "version": "1.0", "run": {"exec": ["true"]},
+            "content": {"tar_digest": Digest::of(b""), "tar_size": 0, "entries": 0},
+        });
+        let rules = RunRules::from(&serde_json::from_value::<TaskManifest>(manifest).expect("manifest"));
+        record.active = Some(ActiveRun {
+            process: Some(ProcessRecord {
+                dir: "d.1.1.1".to_owned(),
+                boot_id: "boot".to_owned(),
+                started_ms: 1,
+                pid: Some(7),
+                ready: true,
+                condemned: None,
+            }),
+            ..ActiveRun::of(&order, rules, 1)
+        });
+        ledger.tasks.insert(order.task.clone(), record);
+        let mut old = serde_json::to_value(&ledger).expect("json");
+        let task = &mut old["tasks"]["talker"];
+        let mut drop = |at: &str, keys: &[&str]| {
+            let table = task.pointer_mut(at).and_then(serde_json::Value::as_object_mut).expect("a table");
+            keys.iter().for_each(|key| assert!(table.remove(*key).is_some(), "{at} has no {key}"));
+        };
+        drop("", &["fallback", "gate", "starts"]);
+        drop("/active", &["admitted"]);
+        drop("/active/process", &["condemned"]);
+        drop("/active/rules", &["deadline_s"]);
+        assert_eq!(serde_json::from_value::<Ledger>(old).expect("read"), ledger);
     }
 
     #[test]

@@ -13,6 +13,7 @@ pub mod durable;
 pub mod effects;
 pub mod environment;
 pub mod fetch;
+pub mod gate;
 pub mod graph;
 pub mod identity;
 pub mod installation;

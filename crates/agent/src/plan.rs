@@ -5,20 +5,24 @@
 //!
 //! ```text
 //! assigned ─► fetching ─► unpacking ─► building ─► staged ──► (handed to the active run)
-//!     │           └──────────┴────────────┴──► failed           ▲ deferred: a person holds the robot
-//!     └► unmet    a retry waits in its phase
+//!     │           └──────────┴────────────┴──► failed           ▲ deferred: a person holds the robot,
+//!     └► unmet    a retry waits in its phase                      or its gate says not now
 //! ```
 //!
 //! and one run of one version is kept alive:
 //!
 //! ```text
 //! starting ─► running ─► succeeded | failed | stopped
-//!     ▲           │
-//!     └───────────┘ restart policy, reboot: after a backoff
+//!     ▲ │         │
+//!     │ │         └─ degraded for too long: stopped, and as if it had ended
+//!     │ └─ not ready in time, refused: stopped, then failed or, with a good run before it, rolled_back
+//!     └── restart policy, reboot: after a backoff
 //! ```
 //!
-//! A staged version takes over: the old process is stopped, `current` is swapped, the new one is started. Each half has
-//! at most one step under way ([`Lane`]); a process is only ever started by the second, so there are never two of a task.
+//! A staged version takes over: the old process is stopped, `current` is swapped, the new one is started. The old run
+//! stays in the record until the new one is ready; if that never comes, the old one becomes the active run again and the
+//! order has ended as `rolled_back`. Each half has at most one step under way ([`Lane`]); a process is only ever started
+//! by the second, so there are never two of a task.
 
 use std::time::Duration;
 
@@ -26,14 +30,17 @@ use task_proto::desired::{DesiredTask, PackageRef, Wanted};
 use task_proto::report::{Failure, FailureCode, Phase};
 use task_proto::{Digest, TaskName};
 
-use crate::ledger::{ActiveRun, ProcessRecord, RunRules, TaskRecord};
+use crate::ledger::{ActiveRun, GateQuestion, ProcessRecord, RunRules, TaskRecord};
 use crate::observed::{Health, Prepared, ProcessState, RobotFacts};
+use gate::Verdict;
 
 mod alive;
+mod gate;
 #[cfg(test)]
 mod tests;
 mod transition;
 
+pub use gate::consult;
 pub use transition::{StepFailure, adopted, backoff_ms, begun, finished};
 
 /// All that the next step depends on.
@@ -51,6 +58,8 @@ pub struct Situation<'a> {
     pub health: &'a Health,
     /// Whether a step of [`Lane::Prepare`] is under way.
     pub preparing: bool,
+    /// Whether a step of [`Lane::Run`] is under way.
+    pub acting: bool,
     /// Whether a step that deletes versions is under way.
     pub deleting: bool,
     /// What packages may require.
@@ -59,6 +68,8 @@ pub struct Situation<'a> {
     pub may_begin: bool,
     /// A person at the robot said `hold`.
     pub held: bool,
+    /// The robot has a gate that is to be asked.
+    pub gated: bool,
     /// The kernel's boot id.
     pub boot_id: &'a str,
     /// Milliseconds since boot.
@@ -92,6 +103,8 @@ pub enum Step {
     PullContent(PackageRef),
     /// Build it.
     Build(PackageRef),
+    /// Ask the robot's gate.
+    Ask(GateQuestion),
     /// Make this run the active one and start a process of it.
     Start(Box<ActiveRun>),
     /// Stop this run's process; it is the active one.
@@ -112,6 +125,13 @@ pub enum Lane {
     Prepare,
     /// Starts, stops, removes.
     Run,
+    /// Asks the robot's gate. Meanwhile the run that lives is looked after.
+    Gate,
+}
+
+impl Lane {
+    /// All of them.
+    pub const ALL: [Self; 3] = [Self::Run, Self::Prepare, Self::Gate];
 }
 
 impl Step {
@@ -120,6 +140,7 @@ impl Step {
         match self {
             Self::PullManifest(_) | Self::LookForRos(_) | Self::PullContent(_) | Self::Build(_) => Lane::Prepare,
             Self::Start(_) | Self::Stop(_) | Self::Prune { .. } | Self::Remove => Lane::Run,
+            Self::Ask(_) => Lane::Gate,
         }
     }
 
@@ -129,6 +150,8 @@ impl Step {
         let seconds = match self {
             Self::PullContent(_) | Self::Build(_) => return None,
             Self::PullManifest(_) | Self::LookForRos(_) | Self::Start(_) => STEP_DEADLINE_S,
+            // Its own, shorter limit is a setting.
+            Self::Ask(_) => STEP_DEADLINE_S + crate::config::MAX_GATE_TIMEOUT_S,
             Self::Stop(run) => STEP_DEADLINE_S + 2 * u64::from(run.rules.stop_timeout_s),
             Self::Prune { .. } | Self::Remove => DELETE_DEADLINE_S,
         };
@@ -142,8 +165,11 @@ impl Step {
 
     /// Whether this step, already under way, still serves what is desired. If not it is interrupted; steps of
     /// [`Lane::Run`] are short and are finished.
-    pub fn is_wanted(&self, desired: Option<&DesiredTask>) -> bool {
+    pub fn is_wanted(&self, desired: Option<&DesiredTask>, record: Option<&TaskRecord>) -> bool {
         match self {
+            Self::Ask(question) => {
+                record.and_then(|record| record.gate.as_ref()).is_some_and(|gate| gate.question == *question)
+            }
             Self::PullManifest(package)
             | Self::LookForRos(package)
             | Self::PullContent(package)
@@ -248,7 +274,8 @@ fn takes_over(s: &Situation<'_>) -> bool {
 fn with_process(s: &Situation<'_>, active: &ActiveRun, process: &ProcessRecord) -> Next {
     let replaced = !active.is_for(&s.record.order) && takes_over(s);
     let wanted = s.desired.is_some_and(|task| task.wanted == Wanted::Running);
-    if !wanted || replaced { alive::stop(s, active) } else { alive::next(s, active, process) }
+    let stops = (!wanted || replaced) && process.condemned.is_none() && gate::verdict(s) == Verdict::Go;
+    if stops { alive::stop(s, active) } else { alive::next(s, active, process) }
 }
 
 fn without_process(s: &Situation<'_>, active: Option<&ActiveRun>) -> Next {
@@ -264,20 +291,28 @@ fn without_process(s: &Situation<'_>, active: Option<&ActiveRun>) -> Next {
     if order.wanted == Wanted::Stopped {
         return tidy(s, None);
     }
+    let verdict = gate::verdict(s);
+    if verdict == Verdict::Asked {
+        return Next::Rest { until_ms: None };
+    }
     if takes_over(s)
+        && verdict == Verdict::Go
         && active.is_none_or(|active| !active.is_for(order))
         && let Some(manifest) = &s.prepared.manifest
     {
-        return Next::Act(Step::Start(Box::new(ActiveRun::of(order, RunRules::from(manifest), s.now_ms))));
+        // A run that was replaced and is ordered again goes on as the good one it was.
+        let before = s.record.fallback.as_ref().filter(|run| run.is_for(order)).cloned();
+        let run = before.unwrap_or_else(|| ActiveRun::of(order, RunRules::from(manifest), s.now_ms));
+        return Next::Act(Step::Start(Box::new(run)));
     }
-    match active {
-        Some(active) if active.end.is_none() && s.held => tidy(s, None),
-        Some(active) if active.end.is_none() && s.now_ms < active.retry_at_ms => {
-            Next::Rest { until_ms: Some(active.retry_at_ms) }
-        }
-        Some(active) if active.end.is_none() => Next::Act(Step::Start(Box::new(active.clone()))),
-        _ => tidy(s, None),
+    let Some(active) = active.filter(|active| active.end.is_none()) else { return tidy(s, None) };
+    if s.held || (verdict == Verdict::NotNow && !active.admitted) {
+        return tidy(s, None);
     }
+    if s.now_ms < active.retry_at_ms {
+        return Next::Rest { until_ms: Some(active.retry_at_ms) };
+    }
+    Next::Act(Step::Start(Box::new(active.clone())))
 }
 
 /// Deletes versions that nothing needs any more, once nothing else is to be done.
@@ -291,9 +326,10 @@ fn record(record: TaskRecord) -> Next {
     Next::Record(Box::new(record))
 }
 
-/// The name of a run's directory: one for each start, never used twice.
-pub fn run_dir_name(run: &ActiveRun, start: u64) -> String {
-    format!("{}.{}.{start}.{}", run.deployment, run.run, run.starts)
+/// The name of a run's directory: one for each start, never used twice. `start` counts the agent's starts, `starts` the
+/// task's.
+pub fn run_dir_name(run: &ActiveRun, start: u64, starts: u64) -> String {
+    format!("{}.{}.{start}.{starts}", run.deployment, run.run)
 }
 
 /// The line that names a step in the log.
@@ -303,6 +339,7 @@ pub fn describe(task: &TaskName, step: &Step) -> String {
         Step::LookForRos(package) => format!("look for the ROS that {task} {} needs", package.version),
         Step::PullContent(package) => format!("pull {task} {}", package.version),
         Step::Build(package) => format!("build {task} {}", package.version),
+        Step::Ask(question) => format!("ask the gate about {task} {}", question.version),
         Step::Start(run) => format!("start {task} {} (run {})", run.package.version, run.run),
         Step::Stop(_) => format!("stop {task}"),
         Step::Prune { .. } => format!("delete old versions of {task}"),

@@ -301,6 +301,22 @@ pub fn spawn_build(
     tokio::process::Command::from(command).spawn()
 }
 
+/// Starts the robot's gate with exactly `environment`, in its own process group.
+pub fn spawn_gate(
+    words: &[String],
+    directory: &Path,
+    environment: &BTreeMap<String, String>,
+    output: PipeWriter,
+) -> io::Result<tokio::process::Child> {
+    let (program, arguments) = words.split_first().ok_or(io::ErrorKind::InvalidInput)?;
+    let mut command = command(Path::new(program), environment);
+    command.args(arguments).current_dir(directory).process_group(0);
+    command.stdin(Stdio::null()).stdout(output.try_clone()?).stderr(output);
+    // SAFETY: `reset_for_exec` only makes async-signal-safe system calls and allocates nothing.
+    unsafe { command.pre_exec(reset_for_exec) };
+    tokio::process::Command::from(command).spawn()
+}
+
 /// Makes the caller the shim of what it starts: orphans below it become its children, signals meant for others do not
 /// end it, and the end of a child can be waited for with [`next_child`].
 pub fn become_shim() -> io::Result<()> {

@@ -65,7 +65,7 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
     let client = server::client().context("cannot make an HTTP client")?;
     let fetcher =
         Fetcher::new(client.clone(), base.clone(), identity.token.clone(), data.clone(), fetch_settings(&config));
-    let robot = Arc::new(Robot::new(data.clone(), fetcher, &config, identity.mac));
+    let robot = Arc::new(Robot::new(data.clone(), fetcher, &config, &identity.robot_id, identity.mac));
     let shutdown = CancellationToken::new();
     let shared = Shared::new(shutdown.clone());
     let instance = InstanceId::random();

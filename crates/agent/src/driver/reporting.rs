@@ -8,7 +8,7 @@ use task_proto::{Generation, TaskName};
 use super::{Driver, View};
 use crate::admission;
 use crate::effects::Effects;
-use crate::ledger::{ActiveRun, TaskRecord};
+use crate::ledger::TaskRecord;
 use crate::observed::{Health, ProcessState};
 
 impl<E: Effects> Driver<E> {
@@ -80,11 +80,13 @@ fn says_the_same(last: &Report, next: &Report) -> bool {
     without_times(last) == without_times(next)
 }
 
-/// Why the run that lives is not as it should be, once it was.
-fn degraded(active: &ActiveRun, health: &Health) -> Option<Failure> {
-    match health {
-        Health::Missing(missing) if active.process.as_ref()?.ready => Some(missing.failure()),
-        _ => None,
+/// Why the run that is kept alive is not as it should be: something is missing that it once had, or the robot does not
+/// let an older one than ordered start again.
+fn degraded(record: &TaskRecord, view: Option<&View>) -> Option<Failure> {
+    let ready = record.active.as_ref().and_then(|active| active.process.as_ref()).is_some_and(|process| process.ready);
+    match view.map(|view| &view.health) {
+        Some(Health::Missing(missing)) if ready => Some(missing.failure()),
+        _ => record.refusal().filter(|(question, _)| !record.concerns_order(question)).map(|(_, why)| why.clone()),
     }
 }
 
@@ -108,7 +110,7 @@ fn task_report(task: &TaskName, record: &TaskRecord, view: Option<&View>, now_ms
         attempts: record.preparation.attempts,
         restarts: for_order.map_or(0, |active| active.restarts),
         failure: failure.cloned(),
-        degraded: view.and_then(|view| degraded(active?, &view.health)),
+        degraded: degraded(record, view),
         active: active.and_then(|active| {
             let process = active.process.as_ref()?;
             let pid = match view.and_then(|view| view.process.as_ref()) {

@@ -39,6 +39,7 @@ impl<E: Effects> Driver<E> {
                     }
                     Step::PullContent(package) => effects.pull_content(package, &progress, &stop).await.map(done),
                     Step::Build(package) => effects.build(package, &stop).await.map(done),
+                    Step::Ask(question) => effects.ask_gate(&name, question).await.map(done),
                     Step::Start(run) => effects.start(&name, run).await.map(Some),
                     Step::Stop(run) => effects.stop(&name, run).await.map(done),
                     Step::Prune { kept } => effects.prune(&name, kept, running.as_ref()).await.map(done),
@@ -60,7 +61,9 @@ impl<E: Effects> Driver<E> {
         let unwanted: Vec<(TaskName, Lane)> = self
             .under_way
             .iter()
-            .filter(|((task, _), under_way)| !under_way.step.is_wanted(self.desired_task(task).as_ref()))
+            .filter(|((task, _), under_way)| {
+                !under_way.step.is_wanted(self.desired_task(task).as_ref(), self.ledger.tasks.get(task))
+            })
             .map(|(key, _)| key.clone())
             .collect();
         for key in unwanted {

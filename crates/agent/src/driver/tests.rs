@@ -12,7 +12,7 @@ use task_proto::{DeploymentId, Digest, Generation};
 
 use super::*;
 use crate::installation::Installation;
-use crate::ledger::{ActiveRun, LedgerError, ProcessRecord};
+use crate::ledger::{ActiveRun, GateQuestion, GateStep, LedgerError, ProcessRecord};
 use crate::observed::Missing;
 
 /// How long a test waits for what should come at once.
@@ -40,6 +40,11 @@ struct State {
     exec_depends: Vec<String>,
     ros_packages: BTreeSet<String>,
     seen_packages: BTreeSet<String>,
+    /// What the robot's gate says, if it has one, and what it was asked.
+    gate: Option<Result<(), String>>,
+    asked: Vec<GateStep>,
+    /// Versions that never get ready.
+    bad: BTreeSet<Digest>,
     /// What ROS says of every process that lives.
     health: watch::Sender<Health>,
 }
@@ -69,6 +74,10 @@ impl Effects for Fake {
 
     fn is_held(&self) -> bool {
         self.state(|state| state.held)
+    }
+
+    fn is_gated(&self) -> bool {
+        self.state(|state| state.gate.is_some())
     }
 
     fn robot_facts(&self) -> RobotFacts {
@@ -107,7 +116,11 @@ impl Effects for Fake {
         std::future::pending().await
     }
 
-    fn watch(&self, _task: &TaskName, _run: &ActiveRun) -> watch::Receiver<Health> {
+    fn watch(&self, _task: &TaskName, run: &ActiveRun) -> watch::Receiver<Health> {
+        if self.state(|state| state.bad.contains(&run.package.manifest.digest)) {
+            let failure = Failure::new(FailureCode::LIFECYCLE_FAILED, "it will not");
+            return watch::channel(Health::Refused(failure)).1;
+        }
         self.state(|state| state.health.subscribe())
     }
 
@@ -138,6 +151,17 @@ impl Effects for Fake {
 
     async fn build(&self, _package: &PackageRef, _cancel: &CancellationToken) -> Result<(), StepFailure> {
         Ok(())
+    }
+
+    async fn ask_gate(&self, _task: &TaskName, question: &GateQuestion) -> Result<(), StepFailure> {
+        let answer = self.state(|state| {
+            state.asked.push(question.step);
+            state.gate.clone().expect("only then it is asked")
+        });
+        answer.map_err(|text| {
+            let failure = Failure::new(FailureCode::GATE_REFUSED, text);
+            StepFailure { failure, retry_after_ms: Some(0) }
+        })
     }
 
     async fn start(&self, task: &TaskName, run: &ActiveRun) -> Result<u32, StepFailure> {
@@ -364,6 +388,52 @@ async fn what_ros_says_makes_a_task_ready_degraded_and_whole_again() {
     let report = bench.phase(Phase::Failed).await;
     assert_eq!(report.tasks[0].failure.as_ref().expect("why").code, FailureCode::LIFECYCLE_FAILED);
     assert!(bench.fake.state(|state| state.alive.is_empty()), "it is stopped before it has failed");
+}
+
+#[tokio::test]
+async fn the_old_version_comes_back_when_the_new_one_does_not_get_ready() {
+    let bench = Bench::new().await;
+    let (old, new) = (order("1.0"), order("2.0"));
+    bench.order(1, vec![old.clone()]).await;
+    bench.phase(Phase::Running).await;
+    bench.fake.state(|state| state.bad.insert(new.package.manifest.digest));
+    bench.order(2, vec![new.clone()]).await;
+    let back = |report: &Report| report.tasks[0].phase == Phase::RolledBack && report.tasks[0].active.is_some();
+    let report = bench.report(back).await;
+    let task = &report.tasks[0];
+    assert_eq!((&task.deployment, task.run), (&new.deployment, 1));
+    assert_eq!(task.failure.as_ref().expect("why").to_string(), "lifecycle_failed: it will not");
+    assert_eq!(task.active.as_ref().expect("the old one").deployment, old.deployment);
+    // Neither a report nor a new agent makes it try again; a new run does.
+    let (fake, key, robot) = (bench.fake.clone(), SigningKey::from_bytes(bench.key.to_bytes()), bench.robot.clone());
+    let ledger = bench.end().await;
+    let bench = Bench::with(fake, ledger, key, robot).await;
+    bench.report(back).await;
+    assert_eq!(bench.fake.state(|state| state.started.len()), 3);
+    bench.fake.state(|state| state.bad.clear());
+    bench.order(3, vec![DesiredTask { run: 2, ..new }]).await;
+    bench.phase(Phase::Running).await;
+}
+
+#[tokio::test]
+async fn the_gate_is_asked_first_and_its_reason_is_reported() {
+    let bench = Bench::new().await;
+    bench.fake.state(|state| state.gate = Some(Err("carries a load".to_owned())));
+    let order = order("1.0");
+    bench.order(1, vec![order.clone()]).await;
+    let report = bench.phase(Phase::Deferred).await;
+    assert_eq!(report.tasks[0].failure.as_ref().expect("why").to_string(), "gate_refused: carries a load");
+    assert!(bench.fake.state(|state| state.started.is_empty()));
+    bench.fake.state(|state| state.gate = Some(Ok(())));
+    bench.phase(Phase::Running).await;
+    bench.fake.state(|state| state.gate = Some(Err("busy".to_owned())));
+    bench.order(2, vec![DesiredTask { wanted: Wanted::Stopped, ..order }]).await;
+    let report = bench.phase(Phase::Deferred).await;
+    assert!(report.tasks[0].active.is_some(), "it runs on");
+    bench.fake.state(|state| state.gate = None);
+    bench.phase(Phase::Stopped).await;
+    let asked = bench.fake.state(|state| state.asked.clone());
+    assert!(asked.starts_with(&[GateStep::Start]) && asked.ends_with(&[GateStep::Stop]), "{asked:?}");
 }
 
 #[tokio::test]

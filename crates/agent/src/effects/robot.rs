@@ -10,7 +10,7 @@ use std::time::Duration;
 use task_proto::desired::PackageRef;
 use task_proto::manifest::{BuildTool, TaskManifest};
 use task_proto::report::{Failure, FailureCode, HostFacts, Isolation, Progress};
-use task_proto::{Digest, MacAddress, TaskName};
+use task_proto::{Digest, MacAddress, RobotId, TaskName};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
@@ -18,9 +18,10 @@ use super::{Effects, Now};
 use crate::builder::{self, BuildError, BuildLimits, BuildOrder};
 use crate::config::Config;
 use crate::fetch::{self, FetchError, Fetcher};
+use crate::gate::Gate;
 use crate::installation::Installation;
 use crate::layout::{DataDir, VersionDir};
-use crate::ledger::{ActiveRun, Ledger, LedgerError, ProcessRecord};
+use crate::ledger::{ActiveRun, GateQuestion, Ledger, LedgerError, ProcessRecord};
 use crate::observed::{Exit, Health, Prepared, ProcessState, RobotFacts};
 use crate::plan::StepFailure;
 use crate::run_dir::{LogSpec, RunSpec};
@@ -41,6 +42,7 @@ const TAIL_BYTES: u64 = 3072;
 pub struct Robot {
     data: DataDir,
     fetcher: Fetcher,
+    gate: Option<Gate>,
     supervisor: Supervisor,
     /// The configured setup files.
     underlays: Vec<PathBuf>,
@@ -54,7 +56,7 @@ pub struct Robot {
 
 impl Robot {
     /// The robot whose data is in `data`.
-    pub fn new(data: DataDir, fetcher: Fetcher, config: &Config, mac: MacAddress) -> Self {
+    pub fn new(data: DataDir, fetcher: Fetcher, config: &Config, robot: &RobotId, mac: MacAddress) -> Self {
         let mut settings: BTreeMap<String, String> = environment::ROS_VARIABLES
             .iter()
             .filter_map(|name| Some(((*name).to_owned(), std::env::var(name).ok()?)))
@@ -65,13 +67,16 @@ impl Robot {
             build_limits.timeout = Duration::from_secs(timeout_s);
         }
         build_limits.memory_bytes = config.limits.build_memory_bytes.or(build_limits.memory_bytes);
+        let environment = environment::of_this_robot(&settings);
+        let gate = config.gate.clone().map(|gate| Gate::new(gate, robot.clone(), environment.clone(), data.root()));
         Self {
             data,
             fetcher,
+            gate,
             supervisor: Supervisor::of_this_program(),
             ros: RwLock::new(underlay::find(&config.underlays, &Places::of_this_machine())),
             underlays: config.underlays.clone(),
-            environment: environment::of_this_robot(&settings),
+            environment,
             build_limits,
             log_bytes: config.limits.log_bytes,
             mac,
@@ -119,6 +124,10 @@ impl Effects for Robot {
 
     fn is_held(&self) -> bool {
         self.data.root().join(super::HOLD_FILE).exists()
+    }
+
+    fn is_gated(&self) -> bool {
+        self.gate.is_some()
     }
 
     fn robot_facts(&self) -> RobotFacts {
@@ -246,6 +255,11 @@ impl Effects for Robot {
         builder::build(&order, cancel).await.map_err(build_failure)?;
         let marker = version.root().join(BUILT_MARKER);
         durable::write(&marker, b"", 0o600).map_err(|error| finally(FailureCode::IO_ERROR, &error))
+    }
+
+    async fn ask_gate(&self, task: &TaskName, question: &GateQuestion) -> Result<(), StepFailure> {
+        let Some(gate) = &self.gate else { return Ok(()) };
+        gate.ask(task, question).await.map_err(|failure| StepFailure { failure, retry_after_ms: Some(0) })
     }
 
     async fn start(&self, task: &TaskName, run: &ActiveRun) -> Result<u32, StepFailure> {

@@ -11,7 +11,8 @@ use task_proto::{DeploymentId, Digest};
 
 use super::*;
 use crate::installation::Installation;
-use crate::observed::Exit;
+use crate::ledger::GateStep;
+use crate::observed::{Exit, Missing};
 use crate::process::ExitStatus;
 
 /// One robot with one task.
@@ -35,8 +36,11 @@ struct World {
     may_begin: bool,
     manifest: Run,
     ros_seen: bool,
-    /// What ROS says of the process that lives.
+    /// What ROS says of the process that lives, unless its version is bad.
     health: Health,
+    /// The number of the package that never gets ready.
+    bad: Option<u8>,
+    gated: bool,
 }
 
 /// What can happen.
@@ -62,9 +66,38 @@ enum Happening {
     Reboot,
     Hold(bool),
     MayBegin(bool),
+    Gate(bool),
+    Sees(Sight),
     Wait {
         ms: u64,
     },
+}
+
+/// What ROS can be seen to say.
+#[derive(Debug, Clone, Copy)]
+enum Sight {
+    Nothing,
+    All,
+    NotAll,
+    Refused,
+}
+
+fn sight() -> impl Strategy<Value = Sight> {
+    prop_oneof![1 => Just(Sight::Nothing), 4 => Just(Sight::All), 1 => Just(Sight::NotAll), 1 => Just(Sight::Refused)]
+}
+
+fn health(sight: Sight, since_ms: u64) -> Health {
+    match sight {
+        Sight::Nothing => Health::Unknown,
+        Sight::All => Health::Holds { since_ms },
+        Sight::NotAll => Health::Missing(Missing {
+            since_ms,
+            code: FailureCode::NODE_VANISHED,
+            what: "`/mapper` is gone".to_owned(),
+            seen: String::new(),
+        }),
+        Sight::Refused => Health::Refused(Failure::new(FailureCode::NODE_NAME_TAKEN, "it was there before")),
+    }
 }
 
 fn happening() -> impl Strategy<Value = Happening> {
@@ -81,6 +114,8 @@ fn happening() -> impl Strategy<Value = Happening> {
         1 => Just(Reboot),
         1 => any::<bool>().prop_map(Hold),
         1 => any::<bool>().prop_map(MayBegin),
+        1 => any::<bool>().prop_map(Gate),
+        3 => sight().prop_map(Sees),
         3 => (0..90_000u64).prop_map(|ms| Wait { ms }),
     ]
 }
@@ -129,6 +164,8 @@ impl World {
             ros_seen: false,
             manifest,
             health: Health::Holds { since_ms: 0 },
+            bad: None,
+            gated: false,
         }
     }
 
@@ -144,26 +181,31 @@ impl World {
             Happening::Learn => self.learn(),
             Happening::ProcessEnds { code } => self.end_process(Some(ExitStatus::Code(code))),
             Happening::ProcessVanishes => self.end_process(None),
-            Happening::AgentDies => {
-                self.steps.clear();
-                self.start += 1;
-            }
+            Happening::AgentDies => self.start_agent(self.boot),
             Happening::Reboot => {
                 self.end_process(None);
-                self.steps.clear();
-                self.start += 1;
-                self.boot += 1;
-                let mut ledger = crate::ledger::Ledger::new(1);
-                ledger.tasks.extend(self.record.take().map(|record| (record.order.task.clone(), record)));
                 self.now_ms = 1000;
-                ledger.enter_boot(&self.boot.to_string(), self.now_ms);
-                self.record = ledger.tasks.into_values().next();
+                self.health = health(Sight::All, 0);
+                self.start_agent(self.boot + 1);
             }
             Happening::Hold(held) => self.held = held,
             Happening::MayBegin(may_begin) => self.may_begin = may_begin,
+            Happening::Gate(gated) => self.gated = gated,
+            Happening::Sees(sight) => self.health = health(sight, self.now_ms),
             Happening::Wait { ms } => self.now_ms += ms,
         }
         self.plan();
+    }
+
+    fn start_agent(&mut self, boot: u32) {
+        self.steps.clear();
+        self.start += 1;
+        let mut ledger = crate::ledger::Ledger::new(1);
+        ledger.boot_id = self.boot.to_string();
+        ledger.tasks.extend(self.record.take().map(|record| (record.order.task.clone(), record)));
+        self.boot = boot;
+        ledger.enter_boot(&self.boot.to_string(), self.now_ms);
+        self.record = ledger.tasks.into_values().next();
     }
 
     fn end_process(&mut self, status: Option<ExitStatus>) {
@@ -176,18 +218,23 @@ impl World {
     fn plan(&mut self) {
         let desired = self.desired.clone();
         // An interrupted step has no further effect; the driver waits for that before it begins another.
-        self.steps.retain(|(step, _)| step.is_wanted(desired.as_ref()));
+        self.steps.retain(|(step, _)| step.is_wanted(desired.as_ref(), self.record.as_ref()));
         if self.record.is_none() {
             self.record = desired.map(|order| TaskRecord::new(order, self.now_ms));
         }
         for round in 0.. {
             assert!(round < 20, "the plan does not come to rest: {:?}", self.record);
             let before = (self.record.clone(), self.steps.len());
-            for lane in [Lane::Run, Lane::Prepare] {
+            for lane in Lane::ALL {
                 if self.record.is_none() || self.steps.iter().any(|(step, _)| step.lane() == lane) {
                     continue;
                 }
-                match self.with_situation(|s| if lane == Lane::Run { supervise(s) } else { prepare(s) }) {
+                let next = self.with_situation(|s| match lane {
+                    Lane::Run => supervise(s),
+                    Lane::Prepare => prepare(s),
+                    Lane::Gate => consult(s),
+                });
+                match next {
                     Next::Rest { .. } => {}
                     Next::Record(record) => self.record = Some(*record),
                     Next::Act(step) => self.begin(step),
@@ -230,17 +277,22 @@ impl World {
                 None => ProcessState::NeverStarted,
             },
         };
+        let active = record.active.as_ref().map(|active| &active.package);
+        let bad = self.bad.is_some_and(|number| active == Some(&package(number)));
+        let health = if bad { health(Sight::NotAll, 0) } else { self.health.clone() };
         ask(&Situation {
             desired: self.desired.as_ref(),
             record,
             prepared: &prepared,
             process: &process,
-            health: &self.health,
+            health: &health,
             preparing: self.steps.iter().any(|(step, _)| step.lane() == Lane::Prepare),
+            acting: self.steps.iter().any(|(step, _)| step.lane() == Lane::Run),
             deleting: self.steps.iter().any(|(step, _)| step.deletes()),
             robot: &RobotFacts { installations: self.ros_seen.then(|| vec![ros()]), ..RobotFacts::default() },
             may_begin: self.may_begin,
             held: self.held,
+            gated: self.gated,
             boot_id: &self.boot.to_string(),
             now_ms: self.now_ms,
             jitter: 0.5,
@@ -261,6 +313,7 @@ impl World {
         match &step {
             Step::PullManifest(package) => self.raise(package, 1),
             Step::LookForRos(_) => self.ros_seen = true,
+            Step::Ask(_) => {}
             Step::PullContent(package) => self.raise(package, 2),
             Step::Build(package) => self.raise(package, 3),
             Step::Start(run) => {
@@ -275,13 +328,17 @@ impl World {
                 }
             }
             Step::Stop(run) => {
+                assert_eq!(self.record.as_ref().and_then(|record| record.active.as_ref()), Some(&**run));
                 let process = run.process.as_ref().expect("what lives");
                 self.alive.retain(|dir| *dir != process.dir);
                 self.ended.push((process.dir.clone(), Some(ExitStatus::Signal(2))));
             }
             Step::Prune { kept } => {
                 let active = self.record.as_ref().and_then(|record| record.active.as_ref());
-                assert!(active.is_none_or(|active| kept.contains(&active.package.manifest.digest)), "prunes what runs");
+                let fallback = self.record.as_ref().and_then(|record| record.fallback.as_ref());
+                for run in [active, fallback].into_iter().flatten() {
+                    assert!(kept.contains(&run.package.manifest.digest), "prunes what runs or may come back");
+                }
                 self.disk.retain(|(package, _)| kept.contains(&package.manifest.digest));
             }
             Step::Remove => {
@@ -315,6 +372,7 @@ impl World {
     fn settle(&mut self) {
         self.happen(Happening::Hold(false));
         self.happen(Happening::MayBegin(true));
+        self.health = health(Sight::All, 0);
         for _ in 0..60 {
             self.happen(Happening::Effect { well: true });
             self.happen(Happening::Learn);
@@ -359,9 +417,10 @@ proptest! {
     #[test]
     fn whatever_happens_it_is_safe_and_converges(
         rules in run_rules(),
+        bad in prop_oneof![Just(None), Just(Some(0)), Just(Some(1))],
         happenings in prop::collection::vec(happening(), 1..80),
     ) {
-        let mut world = World::new(rules);
+        let mut world = World { bad, ..World::new(rules) };
         for happening in happenings {
             world.happen(happening);
             prop_assert!(world.alive.len() <= 1);
@@ -382,6 +441,10 @@ proptest! {
                         let runs = active.is_some_and(|active| active.process.is_some()) && world.alive.len() == 1;
                         prop_assert!(runs == (phase == Phase::Running), "{phase} {active:?} {:?}", world.alive);
                         prop_assert!(runs || phase.is_final(), "stuck in {phase}: {record:?}");
+                        let old_runs = active.is_none() && world.alive.len() == 1;
+                        prop_assert!(phase != Phase::RolledBack || old_runs, "nothing came back: {record:?}");
+                        let bad = bad.is_some_and(|number| order.package == package(number));
+                        prop_assert!(!(bad && runs), "it runs, and is not ready");
                     }
                 }
                 prop_assert!(world.disk.len() <= 3);
@@ -462,7 +525,7 @@ fn a_job_that_the_robot_lost_is_interrupted_unless_it_is_idempotent() {
 
 #[test]
 fn a_service_that_never_gets_ready_fails_with_its_exit_code() {
-    let mut world = running(Run::default());
+    let mut world = World::new(Run::default());
     world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
     for _ in 0..200 {
         world.happen(Happening::Effect { well: true });
@@ -475,6 +538,212 @@ fn a_service_that_never_gets_ready_fails_with_its_exit_code() {
     let (phase, failure) = world.record.as_ref().expect("a record").standing();
     assert_eq!(phase, Phase::Failed);
     assert!(failure.expect("a failure").text.contains("exited with code 3"));
+}
+
+fn bad_switch(world: &mut World) -> String {
+    let old = world.alive[0].clone();
+    world.bad = Some(1);
+    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
+    while !world.alive.iter().any(|dir| dir.starts_with("d0000000000000001")) {
+        world.happen(Happening::Effect { well: true });
+        world.happen(Happening::Learn);
+    }
+    old
+}
+
+#[test]
+fn a_version_that_does_not_get_ready_is_stopped_and_the_old_one_started_again() {
+    let mut world = running(Run::default());
+    bad_switch(&mut world);
+    assert_eq!(phase(&world), Phase::Starting);
+    world.happen(Happening::Wait { ms: 30_000 });
+    assert!(matches!(world.steps[..], [(Step::Stop(_), false)]), "{:?}", world.steps);
+    assert_eq!(phase(&world), Phase::Starting, "it is not final before the process is gone");
+    world.happen(Happening::Effect { well: true });
+    world.happen(Happening::Learn);
+    let record = world.record.as_ref().expect("a record");
+    let (phase, failure) = record.standing();
+    assert_eq!(phase, Phase::RolledBack);
+    assert_eq!(failure.expect("why").to_string(), "not_ready: `/mapper` is gone within 30 s");
+    assert!(matches!(&world.steps[..], [(Step::Start(run), false)] if run.package == package(0)), "{:?}", world.steps);
+    world.settle();
+    assert_eq!((world.alive.len(), world.record.as_ref().expect("a record").phase), (1, Phase::RolledBack));
+    // A reboot brings the old one back, and the order is not tried again by itself.
+    world.happen(Happening::Reboot);
+    world.settle();
+    let record = world.record.as_ref().expect("a record");
+    assert_eq!((record.phase, &record.active.as_ref().expect("active").package), (Phase::RolledBack, &package(0)));
+    world.bad = None;
+    world.happen(Happening::Order { deployment: 1, run: 2, stop: false });
+    world.settle();
+    assert_eq!(world.record.as_ref().expect("a record").phase, Phase::Running);
+}
+
+#[test]
+fn a_rollback_survives_a_power_cut_before_and_after_every_step() {
+    for cut in 0..12 {
+        let mut world = running(Run::default());
+        bad_switch(&mut world);
+        for at in 0..12 {
+            if at == cut {
+                world.happen(Happening::Reboot);
+            }
+            world.happen(if at % 2 == 0 { Happening::Wait { ms: 15_000 } } else { Happening::Effect { well: true } });
+            world.happen(Happening::Learn);
+        }
+        world.settle();
+        assert_eq!((phase(&world), world.alive.len()), (Phase::RolledBack, 1), "cut at {cut}");
+    }
+}
+
+#[test]
+fn when_the_old_version_fails_after_it_came_back_the_order_has_failed() {
+    let mut world = running(Run::default());
+    bad_switch(&mut world);
+    for _ in 0..10_000 {
+        world.happen(Happening::Effect { well: true });
+        world.happen(Happening::Learn);
+        if phase(&world) == Phase::RolledBack {
+            world.happen(Happening::ProcessEnds { code: 3 });
+        }
+        world.happen(Happening::Wait { ms: 30_000 });
+    }
+    let (phase, failure) = world.record.as_ref().expect("a record").standing();
+    let text = &failure.expect("why").text;
+    assert_eq!((phase, world.alive.len()), (Phase::Failed, 0));
+    assert!(text.contains("within 30 s\n1.0, which had come back, failed: the process ended"), "{text}");
+}
+
+#[test]
+fn what_the_operator_had_stopped_does_not_come_back() {
+    let mut world = running(Run::default());
+    world.happen(Happening::Order { deployment: 0, run: 2, stop: true });
+    world.settle();
+    assert_eq!(phase(&world), Phase::Stopped);
+    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
+    assert!(world.steps.iter().all(|(step, _)| step.lane() == Lane::Prepare), "the old one stays down meanwhile");
+    bad_order(&mut world);
+    assert_eq!((phase(&world), world.alive.len()), (Phase::Failed, 0));
+}
+
+#[test]
+fn a_first_version_and_a_job_that_do_not_get_ready_have_failed() {
+    let mut world = World::new(Run::default());
+    bad_order(&mut world);
+    assert_eq!((phase(&world), world.alive.len()), (Phase::Failed, 0));
+    let mut world = running(Run::default());
+    world.manifest.kind = TaskKind::Job;
+    bad_order(&mut world);
+    assert_eq!((phase(&world), world.alive.len()), (Phase::Failed, 0));
+}
+
+fn bad_order(world: &mut World) {
+    world.bad = Some(1);
+    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
+    world.settle();
+}
+
+#[test]
+fn a_task_that_stays_degraded_is_started_again_unless_its_policy_is_never() {
+    for (restart, again) in [(Restart::OnFailure, true), (Restart::Always, true), (Restart::Never, false)] {
+        let mut world = running(Run { restart, ..Run::default() });
+        world.happen(Happening::Sees(Sight::NotAll));
+        world.happen(Happening::Wait { ms: 29_999 });
+        assert!(world.steps.is_empty());
+        world.happen(Happening::Wait { ms: 1 });
+        assert_eq!(matches!(world.steps[..], [(Step::Stop(_), false)]), again, "{restart:?}");
+        assert_eq!(phase(&world), Phase::Running);
+        world.settle();
+        let active = world.record.as_ref().expect("a record").active.as_ref().expect("active");
+        assert_eq!((phase(&world), active.restarts), (Phase::Running, u32::from(again)));
+    }
+}
+
+#[test]
+fn a_task_must_hold_for_its_time_without_a_break() {
+    let mut world = World::new(Run::default());
+    world.health = Health::Unknown;
+    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+    while world.alive.is_empty() {
+        world.happen(Happening::Effect { well: true });
+        world.happen(Happening::Learn);
+    }
+    for sight in [Sight::All, Sight::NotAll, Sight::All] {
+        world.happen(Happening::Sees(sight));
+        world.happen(Happening::Wait { ms: 1999 });
+        assert_eq!(phase(&world), Phase::Starting);
+    }
+    world.happen(Happening::Wait { ms: 1 });
+    assert_eq!(phase(&world), Phase::Running);
+    let mut world = running(Run::default());
+    world.happen(Happening::Sees(Sight::Refused));
+    assert_eq!((phase(&world), world.steps.len()), (Phase::Running, 0), "only a start can be refused");
+}
+
+#[test]
+fn a_job_has_its_deadline() {
+    let mut world = running(Run { kind: TaskKind::Job, deadline_s: Some(60), ..Run::default() });
+    world.happen(Happening::Wait { ms: 57_999 });
+    assert!(world.steps.is_empty());
+    world.happen(Happening::Wait { ms: 1 });
+    assert!(matches!(world.steps[..], [(Step::Stop(_), false)]), "{:?}", world.steps);
+    world.settle();
+    let (phase, failure) = world.record.as_ref().expect("a record").standing();
+    assert_eq!((phase, &failure.expect("why").code), (Phase::Failed, &FailureCode::DEADLINE_EXCEEDED));
+}
+
+#[test]
+fn the_gate_allows_a_switch_as_a_whole() {
+    let mut world = running(Run::default());
+    world.gated = true;
+    let old = world.alive.clone();
+    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
+    while !matches!(world.steps[..], [(Step::Ask(_), _)]) {
+        world.happen(Happening::Effect { well: true });
+        world.happen(Happening::Learn);
+    }
+    let step = |world: &World| match &world.steps[..] {
+        [(Step::Ask(question), false)] => Some(question.step),
+        _ => None,
+    };
+    assert_eq!(step(&world), Some(GateStep::Switch));
+    for _ in 0..3 {
+        world.happen(Happening::Effect { well: false });
+        assert_eq!((phase(&world), &world.alive), (Phase::Deferred, &old));
+        assert!(world.steps.is_empty(), "it is asked again later");
+        world.happen(Happening::Wait { ms: 60_000 });
+        assert_eq!((phase(&world), step(&world)), (Phase::Deferred, Some(GateStep::Switch)));
+    }
+    world.happen(Happening::Effect { well: true });
+    world.happen(Happening::Learn);
+    assert!(matches!(world.steps[..], [(Step::Stop(_), false)]), "{:?}", world.steps);
+    world.happen(Happening::Effect { well: true });
+    world.happen(Happening::Learn);
+    assert!(matches!(world.steps[..], [(Step::Start(_), false)]), "{:?}", world.steps);
+    world.settle();
+    // A crash is no new start, a reboot is.
+    world.happen(Happening::ProcessEnds { code: 1 });
+    world.happen(Happening::Wait { ms: 60_000 });
+    assert!(matches!(world.steps[..], [(Step::Start(_), false)]), "{:?}", world.steps);
+    world.settle();
+    world.happen(Happening::Reboot);
+    assert_eq!(step(&world), Some(GateStep::Start));
+    world.happen(Happening::Effect { well: false });
+    assert_eq!(phase(&world), Phase::Deferred);
+}
+
+#[test]
+fn a_stop_that_the_gate_refuses_waits_while_the_task_is_looked_after() {
+    let mut world = running(Run::default());
+    world.gated = true;
+    world.happen(Happening::Order { deployment: 0, run: 2, stop: true });
+    world.happen(Happening::Effect { well: false });
+    assert_eq!((phase(&world), world.alive.len()), (Phase::Deferred, 1));
+    world.happen(Happening::Sees(Sight::NotAll));
+    world.happen(Happening::Wait { ms: 30_000 });
+    assert!(world.steps.iter().any(|(step, _)| matches!(step, Step::Stop(_))), "what failed is stopped unasked");
+    world.settle();
+    assert_eq!((phase(&world), world.alive.len()), (Phase::Stopped, 0));
 }
 
 #[test]

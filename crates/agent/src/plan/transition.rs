@@ -1,11 +1,13 @@
 //! How a record changes: by an order, by the beginning and end of a step, by what a process did. Pure, like the plan.
 
-use task_proto::desired::DesiredTask;
+use task_proto::desired::{DesiredTask, Wanted};
 use task_proto::manifest::{OnBoot, Restart, TaskKind};
 use task_proto::report::{Failure, FailureCode, Phase};
 
 use super::{MAX_RESTARTS_IN_A_ROW, Situation, Step, run_dir_name};
-use crate::ledger::{ActiveRun, Condemned, End, Preparation, ProcessRecord, RunRules, TaskRecord};
+use crate::ledger::{
+    ActiveRun, Condemned, End, GateAnswer, GateRecord, Preparation, ProcessRecord, RunRules, TaskRecord,
+};
 use crate::observed::Exit;
 
 /// A step that did not succeed.
@@ -21,6 +23,8 @@ pub struct StepFailure {
 const BACKOFF_BASE_MS: u64 = 1000;
 /// The longest wait before a step is tried again.
 const MAX_STEP_BACKOFF_MS: u64 = 5 * 60 * 1000;
+/// The longest wait before the robot's gate is asked again.
+const MAX_GATE_BACKOFF_MS: u64 = 60 * 1000;
 /// The longest wait before a process is started again.
 const MAX_RESTART_BACKOFF_MS: u64 = 60 * 1000;
 
@@ -34,6 +38,10 @@ pub fn backoff_ms(attempt: u32, max_ms: u64, jitter: f64) -> u64 {
 /// The record under a new order. A run that is alive goes on until the new version takes over.
 pub fn adopted(record: &TaskRecord, order: &DesiredTask, now_ms: u64) -> TaskRecord {
     let mut record = record.clone();
+    let is_down = record.active.as_ref().is_none_or(|active| active.process.is_none());
+    if record.order.wanted == Wanted::Stopped && is_down {
+        record.forget_stopped(order, now_ms);
+    }
     record.order = order.clone();
     record.preparation = Preparation::default();
     record.settle_phase(now_ms);
@@ -46,7 +54,7 @@ pub fn begun(record: &TaskRecord, step: &Step, boot_id: &str, start: u64, now_ms
     let phase = match step {
         Step::PullManifest(_) | Step::LookForRos(_) | Step::PullContent(_) => Some(Phase::Fetching),
         Step::Build(_) => Some(Phase::Building),
-        Step::Start(_) | Step::Stop(_) | Step::Prune { .. } | Step::Remove => None,
+        Step::Ask(_) | Step::Start(_) | Step::Stop(_) | Step::Prune { .. } | Step::Remove => None,
     };
     if let Some(phase) = phase {
         let again = record.preparation.phase == phase && record.preparation.failure.is_some();
@@ -56,12 +64,14 @@ pub fn begun(record: &TaskRecord, step: &Step, boot_id: &str, start: u64, now_ms
     if let Step::Start(run) = step {
         let same = |active: &ActiveRun| active.deployment == run.deployment && active.run == run.run;
         if !record.active.as_ref().is_some_and(same) {
-            record.retire_active();
+            record.retire_active(run);
         }
+        record.gate = None;
+        record.starts = record.starts.saturating_add(1);
         let mut run = ActiveRun::clone(run);
-        run.starts = run.starts.saturating_add(1);
+        run.admitted = true;
         run.process = Some(ProcessRecord {
-            dir: run_dir_name(&run, start),
+            dir: run_dir_name(&run, start, record.starts),
             boot_id: boot_id.to_owned(),
             started_ms: now_ms,
             pid: None,
@@ -69,6 +79,11 @@ pub fn begun(record: &TaskRecord, step: &Step, boot_id: &str, start: u64, now_ms
             condemned: None,
         });
         record.active = Some(run);
+    }
+    if let Step::Ask(question) = step
+        && record.gate.as_ref().is_none_or(|gate| gate.question != *question)
+    {
+        record.gate = Some(GateRecord { question: question.clone(), answer: None, refusals: 0, retry_at_ms: 0 });
     }
     record.settle_phase(now_ms);
     record
@@ -96,22 +111,28 @@ pub fn finished(s: &Situation<'_>, step: &Step, outcome: Result<Option<u32>, Ste
         (Step::Start(_), Err(error)) => {
             if let Some(active) = &mut record.active {
                 active.process = None;
-                give_up_or_retry(active, s, error.failure, error.retry_after_ms.is_some());
             }
+            give_up_or_retry(&mut record, s, error.failure, error.retry_after_ms.is_some());
         }
         (Step::Stop(_), Ok(_)) => {
-            if let Some(active) = &mut record.active {
-                let condemned = active.process.take().and_then(|process| process.condemned);
-                if let Some(condemned) = condemned {
-                    give_up_or_retry(active, s, condemned.failure, condemned.again);
-                } else if active.rules.kind == TaskKind::Job && active.end.is_none() {
-                    active.end = Some(interrupted("the job was stopped before it had ended"));
-                }
+            let process = record.active.as_mut().and_then(|active| active.process.take());
+            if let Some(condemned) = process.and_then(|process| process.condemned) {
+                give_up_or_retry(&mut record, s, condemned.failure, condemned.again);
+            } else if let Some(active) = &mut record.active
+                && active.rules.kind == TaskKind::Job
+                && active.end.is_none()
+            {
+                active.end = Some(interrupted("the job was stopped before it had ended"));
             }
         }
         (Step::Stop(_), Err(_)) => {
             if let Some(active) = &mut record.active {
                 active.retry_at_ms = s.now_ms + backoff_ms(1, MAX_STEP_BACKOFF_MS, s.jitter).max(BACKOFF_BASE_MS);
+            }
+        }
+        (Step::Ask(question), outcome) => {
+            if let Some(gate) = record.gate.as_mut().filter(|gate| gate.question == *question) {
+                answered(gate, s, outcome.err());
             }
         }
         (Step::Remove, Err(_)) => {
@@ -123,6 +144,17 @@ pub fn finished(s: &Situation<'_>, step: &Step, outcome: Result<Option<u32>, Ste
     }
     record.settle_phase(s.now_ms);
     record
+}
+
+fn answered(gate: &mut GateRecord, s: &Situation<'_>, refusal: Option<StepFailure>) {
+    gate.answer = Some(match refusal {
+        None => GateAnswer::Allowed,
+        Some(StepFailure { failure, .. }) => {
+            gate.refusals = gate.refusals.saturating_add(1);
+            gate.retry_at_ms = s.now_ms + backoff_ms(gate.refusals, MAX_GATE_BACKOFF_MS, s.jitter).max(BACKOFF_BASE_MS);
+            GateAnswer::Refused(failure)
+        }
+    });
 }
 
 fn prepared(preparation: &mut Preparation, s: &Situation<'_>, error: Option<StepFailure>) {
@@ -157,12 +189,22 @@ pub(super) fn prepared_to(s: &Situation<'_>, phase: Phase, failure: Option<Failu
 /// The record once all that makes the process ready has held long enough.
 pub(super) fn ready(s: &Situation<'_>) -> TaskRecord {
     let mut record = s.record.clone();
+    // It has proved itself: what it replaced is not needed any more.
+    record.fallback = None;
     if let Some(active) = &mut record.active {
         active.ever_ready = true;
         if let Some(process) = &mut active.process {
             process.ready = true;
         }
     }
+    record.settle_phase(s.now_ms);
+    record
+}
+
+/// The record once there is nothing to ask the gate.
+pub(super) fn ungated(s: &Situation<'_>) -> TaskRecord {
+    let mut record = s.record.clone();
+    record.gate = None;
     record.settle_phase(s.now_ms);
     record
 }
@@ -202,25 +244,32 @@ pub(super) fn ended(s: &Situation<'_>, exit: &Exit) -> TaskRecord {
     let Some(process) = active.process.take() else { return record };
     let job_done = active.rules.kind == TaskKind::Job && exit.is_success();
     if let Some(condemned) = process.condemned {
-        give_up_or_retry(active, s, condemned.failure, condemned.again);
+        give_up_or_retry(&mut record, s, condemned.failure, condemned.again);
     } else if process.boot_id != s.boot_id && !job_done {
         // Whatever status it left, it ended because the robot went down.
-        after_reboot(active, s.now_ms);
+        after_reboot(&mut record, s.now_ms);
     } else if active.rules.kind == TaskKind::Job {
         job_ended(active, exit);
     } else {
-        service_ended(active, s, exit);
+        let again = match active.rules.restart {
+            Restart::Never => false,
+            Restart::OnFailure => !exit.is_success(),
+            Restart::Always => true,
+        };
+        give_up_or_retry(&mut record, s, Failure::new(FailureCode::PROCESS_EXITED, exit.text()), again);
     }
     record.settle_phase(s.now_ms);
     record
 }
 
-fn after_reboot(active: &mut ActiveRun, now_ms: u64) {
+fn after_reboot(record: &mut TaskRecord, now_ms: u64) {
+    let Some(active) = &mut record.active else { return };
     let job = active.rules.kind == TaskKind::Job;
     if job && !active.rules.idempotent {
         active.end = Some(interrupted("the robot was restarted while the job ran"));
     } else if active.rules.on_boot == OnBoot::Hold {
         active.end = Some(End { phase: Phase::Stopped, failure: None });
+        came_back_in_vain(record, Phase::Stopped, "stays down after the reboot");
     } else {
         active.retry_at_ms = 0;
         active.first_start_ms = now_ms;
@@ -236,28 +285,44 @@ fn job_ended(active: &mut ActiveRun, exit: &Exit) {
     };
 }
 
-fn service_ended(active: &mut ActiveRun, s: &Situation<'_>, exit: &Exit) {
-    let again = match active.rules.restart {
-        Restart::Never => false,
-        Restart::OnFailure => !exit.is_success(),
-        Restart::Always => true,
-    };
-    let failure = Failure::new(FailureCode::PROCESS_EXITED, exit.text());
-    give_up_or_retry(active, s, failure, again);
-}
-
 /// A service that was never ready gets its readiness time to be so; one that was gets [`MAX_RESTARTS_IN_A_ROW`].
-fn give_up_or_retry(active: &mut ActiveRun, s: &Situation<'_>, failure: Failure, again: bool) {
+fn give_up_or_retry(record: &mut TaskRecord, s: &Situation<'_>, failure: Failure, again: bool) {
+    let Some(active) = &mut record.active else { return };
     let tried_ms = s.now_ms.saturating_sub(active.first_start_ms);
     let too_late = !active.ever_ready && tried_ms >= u64::from(active.rules.ready_timeout_s) * 1000;
     let a_job = active.rules.kind == TaskKind::Job;
     if !again || a_job || too_late || active.restarts_in_a_row >= MAX_RESTARTS_IN_A_ROW {
-        active.end = Some(End { phase: Phase::Failed, failure: Some(failure) });
-        return;
+        return give_up(record, s, failure);
     }
     active.restarts = active.restarts.saturating_add(1);
     active.restarts_in_a_row += 1;
     active.retry_at_ms = s.now_ms + backoff_ms(active.restarts_in_a_row, MAX_RESTART_BACKOFF_MS, s.jitter);
+}
+
+/// The active run is over for good. The one it replaced comes back, if it was never as good as that.
+fn give_up(record: &mut TaskRecord, s: &Situation<'_>, failure: Failure) {
+    let Some(active) = &mut record.active else { return };
+    let Some(mut before) = record.fallback.take() else {
+        let text = failure.text.clone();
+        active.end = Some(End { phase: Phase::Failed, failure: Some(failure) });
+        return came_back_in_vain(record, Phase::Failed, &format!("failed: {text}"));
+    };
+    let (deployment, run) = (active.deployment.clone(), active.run);
+    before.first_start_ms = s.now_ms;
+    record.active = Some(before);
+    record.finish(deployment, run, End { phase: Phase::RolledBack, failure: Some(failure) });
+}
+
+/// After a rollback the order stands by the run that came back: once that is over as well, it is not `rolled_back`.
+fn came_back_in_vain(record: &mut TaskRecord, phase: Phase, what: &str) {
+    let Some(active) = record.active.as_ref().filter(|active| !active.is_for(&record.order)) else { return };
+    let Some(end) = record.end_of_order().filter(|end| end.phase == Phase::RolledBack) else { return };
+    let why = end.failure.clone().map(|failure| {
+        let version = &active.package.version;
+        Failure::new(failure.code, format!("{}\n{version}, which had come back, {what}", failure.text))
+    });
+    let (deployment, run) = (record.order.deployment.clone(), record.order.run);
+    record.finish(deployment, run, End { phase, failure: why });
 }
 
 fn exited(exit: &Exit) -> End {
@@ -277,12 +342,12 @@ impl ActiveRun {
             package: order.package.clone(),
             rules,
             process: None,
-            starts: 0,
             restarts: 0,
             restarts_in_a_row: 0,
             retry_at_ms: 0,
             first_start_ms: now_ms,
             ever_ready: false,
+            admitted: false,
             end: None,
         }
     }

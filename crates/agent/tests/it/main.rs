@@ -6,6 +6,7 @@ mod agent;
 mod archive;
 mod build;
 mod fetch;
+mod gate;
 mod graph;
 mod harness;
 mod ros;

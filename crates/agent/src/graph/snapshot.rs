@@ -180,7 +180,7 @@ impl Node {
         node
     }
 
-    /// Whether it can be asked for its lifecycle state.
+    /// Whether it can be asked for its lifecycle state. A node that has just appeared may not have said so yet.
     pub fn has_lifecycle(&self) -> bool {
         let wanted = format!("{}/get_state", self.name);
         self.services

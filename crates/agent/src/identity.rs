@@ -9,10 +9,10 @@ use task_proto::api::MqttEndpoint;
 use task_proto::envelope::PublicKey;
 use task_proto::{MacAddress, RobotId};
 
-use crate::durable;
+use crate::{durable, permanent_address};
 
 /// Where the kernel lists network interfaces.
-pub const INTERFACES: &str = "/sys/class/net";
+const INTERFACES: &str = "/sys/class/net";
 /// The kernel's "the address is the hardware's own" in `addr_assign_type`.
 const PERMANENT: &str = "0";
 
@@ -90,9 +90,15 @@ impl Identity {
     }
 }
 
+/// [`find_mac`] on this machine.
+pub fn find_own_mac() -> Result<MacAddress, MacError> {
+    // An interface that can't be asked is as one that has no answer.
+    find_mac(Path::new(INTERFACES), |name| permanent_address::of(name).ok().flatten())
+}
+
 /// The MAC to register by: the permanent address of the first physical interface below `interfaces`, by name, so that
-/// `eth0` comes before `wlan0`.
-pub fn find_mac(interfaces: &Path) -> Result<MacAddress, MacError> {
+/// `eth0` comes before `wlan0`. For one that uses another address `permanent` tells the hardware's own, if it can.
+pub fn find_mac(interfaces: &Path, permanent: impl Fn(&str) -> Option<MacAddress>) -> Result<MacAddress, MacError> {
     let read = |dir: &Path, file: &str| std::fs::read_to_string(dir.join(file)).map(|text| text.trim().to_owned());
     let mut dirs: Vec<PathBuf> =
         std::fs::read_dir(interfaces).into_iter().flatten().flatten().map(|entry| entry.path()).collect();
@@ -105,10 +111,13 @@ pub fn find_mac(interfaces: &Path) -> Result<MacAddress, MacError> {
         if !is_physical {
             continue;
         }
-        if read(&dir, "addr_assign_type").is_ok_and(|kind| kind == PERMANENT) && !mac.is_locally_administered() {
-            return Ok(mac);
+        let name = dir.file_name().unwrap_or_default().to_string_lossy();
+        let is_own = read(&dir, "addr_assign_type").is_ok_and(|kind| kind == PERMANENT);
+        let own = if is_own { Some(mac) } else { permanent(&name) };
+        if let Some(own) = own.filter(|own| !own.is_locally_administered()) {
+            return Ok(own);
         }
-        made_up.push(format!("{} {mac}", dir.file_name().unwrap_or_default().to_string_lossy()));
+        made_up.push(format!("{name} {mac}"));
     }
     if made_up.is_empty() { Err(MacError::NoneFound) } else { Err(MacError::MadeUp(made_up.join(", "))) }
 }
@@ -132,16 +141,19 @@ mod tests {
     #[test]
     fn the_mac_is_a_physical_permanent_address() {
         let root = tempfile::tempdir().expect("a directory");
-        assert_eq!(find_mac(root.path()), Err(MacError::NoneFound));
+        assert_eq!(find_mac(root.path(), |_| None), Err(MacError::NoneFound));
         interface(root.path(), "docker0", "00:11:22:33:44:50", "0", false);
         interface(root.path(), "lo", "00:00:00:00:00:00", "0", false);
-        assert_eq!(find_mac(root.path()), Err(MacError::NoneFound));
+        assert_eq!(find_mac(root.path(), |_| None), Err(MacError::NoneFound));
         interface(root.path(), "eth0", "02:11:22:33:44:51", "0", true);
         interface(root.path(), "usb0", "00:11:22:33:44:52", "1", true);
-        let error = find_mac(root.path()).expect_err("only made-up addresses").to_string();
+        let error = find_mac(root.path(), |_| None).expect_err("only made-up addresses").to_string();
         assert!(error.contains("eth0 02:11:22:33:44:51") && error.contains("usb0") && error.contains("--mac"));
+        // The Wi-Fi made one up, but its hardware has one.
+        let burned_in = |name: &str| (name == "usb0").then(|| "00:11:22:33:44:99".parse().expect("valid"));
+        assert_eq!(find_mac(root.path(), burned_in).expect("found").to_string(), "00:11:22:33:44:99");
         interface(root.path(), "wlan0", "00:11:22:33:44:53", "0", true);
-        assert_eq!(find_mac(root.path()).expect("found").to_string(), "00:11:22:33:44:53");
+        assert_eq!(find_mac(root.path(), |_| None).expect("found").to_string(), "00:11:22:33:44:53");
     }
 
     #[test]

@@ -25,6 +25,7 @@ pub mod logs;
 pub mod mqtt;
 pub mod observed;
 pub mod outputs;
+pub mod permanent_address;
 pub mod plan;
 pub mod process;
 pub mod run_dir;

@@ -2,7 +2,7 @@
 //! property file. Flags answer questions; with `--yes` the rest keeps its value.
 
 use std::io::{IsTerminal as _, Write as _};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::{Context as _, bail};
@@ -43,7 +43,7 @@ pub struct Arguments {
 pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     let data = Layout::new(&arguments.data.data)?;
     let mut settings = Settings::read(data.root())?;
-    match identity::find_mac(Path::new(identity::INTERFACES)) {
+    match identity::find_own_mac() {
         Ok(mac) => say(format_args!("MAC address: {mac}")),
         Err(error) => say(format_args!("MAC address: {error} when you enroll")),
     }

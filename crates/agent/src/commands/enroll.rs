@@ -73,7 +73,7 @@ async fn enroll(arguments: Arguments) -> anyhow::Result<ExitCode> {
     };
     let mac = match arguments.mac {
         Some(mac) => mac,
-        None => identity::find_mac(std::path::Path::new(identity::INTERFACES))?,
+        None => identity::find_own_mac()?,
     };
     durable::create_dir_all(data.root()).with_context(|| format!("cannot make {}", data.root().display()))?;
 

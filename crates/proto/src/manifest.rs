@@ -340,6 +340,10 @@ impl TaskManifest {
             if name.is_empty() || name.starts_with('-') || name.contains(":=") {
                 problems.add("run.args", format!("{name:?} is not the name of a launch argument"));
             }
+            if value.is_empty() {
+                let reason = "is empty: no launcher takes that; leave it out and give the launch file a default";
+                problems.add("run.args", format!("{name:?} {reason}"));
+            }
         }
         if !(1..=600).contains(&run.stop_timeout_s) {
             problems.add("run.stop_timeout_s", "must be between 1 and 600".to_owned());
@@ -461,6 +465,9 @@ mod tests {
         assert_eq!(keys(&manifest(Run::default())), ["run"]);
         assert_eq!(keys(&manifest(run(&[]))), ["run.exec"]);
         assert_eq!(keys(&manifest(run(&["a\nb"]))), ["run.exec"]);
+        let launch = Some(["talker".to_owned(), "talker.launch.py".to_owned()]);
+        let args = [("map".to_owned(), String::new())].into();
+        assert_eq!(keys(&manifest(Run { launch, args, ..Run::default() })), ["run.args"]);
         let mut odd = manifest(run(&["true"]));
         odd.ready.nodes = vec!["mapper".to_owned()];
         odd.outputs.paths = vec!["../secrets".to_owned()];

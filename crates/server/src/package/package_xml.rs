@@ -12,8 +12,11 @@ pub(super) struct PackageXml {
     pub(super) name: String,
     pub(super) version: String,
     pub(super) build_type: BuildType,
-    /// Names from exec_depend, depend and run_depend, sorted, each once.
+    /// Names from exec_depend, depend and run_depend, sorted, each once. Without those that have a condition, which only
+    /// a robot could judge.
     pub(super) exec_depends: Vec<String>,
+    /// Those that have one.
+    pub(super) conditional_depends: Vec<String>,
     /// What catkin_pkg, and with it colcon and catkin, would refuse.
     pub(super) invalid: Vec<String>,
 }
@@ -28,6 +31,13 @@ pub(super) enum BuildType {
     One(String),
     /// Several, told apart by conditions.
     Several(Vec<String>),
+}
+
+impl PackageXml {
+    /// Whether it says that it needs `package` to run, under whatever condition.
+    pub(super) fn depends_on(&self, package: &str) -> bool {
+        self.exec_depends.iter().chain(&self.conditional_depends).any(|name| name == package)
+    }
 }
 
 /// Reads `text`; the error says what is wrong and where.
@@ -52,17 +62,27 @@ pub(super) fn parse(text: &str) -> Result<PackageXml, String> {
         1 => BuildType::One(types.remove(0)),
         _ => BuildType::Several(types),
     };
-    let mut exec_depends: Vec<String> =
-        ["exec_depend", "depend", "run_depend"].iter().flat_map(|tag| texts(package, tag)).collect();
-    exec_depends.sort();
-    exec_depends.dedup();
+    let (conditional_depends, exec_depends) = (depends(package, true), depends(package, false));
     Ok(PackageXml {
         name: texts(package, "name").next().unwrap_or_default(),
         version: texts(package, "version").next().unwrap_or_default(),
         build_type,
         exec_depends,
+        conditional_depends,
         invalid: invalid(package),
     })
+}
+
+/// What is needed to run the package, with or without a condition.
+fn depends(package: Node<'_, '_>, conditional: bool) -> Vec<String> {
+    let tags = ["exec_depend", "depend", "run_depend"];
+    let elements = tags.iter().flat_map(|tag| children(package, tag));
+    let mut names: Vec<String> =
+        elements.filter(|element| element.has_attribute("condition") == conditional).map(text_of).collect();
+    names.retain(|name| !name.is_empty());
+    names.sort();
+    names.dedup();
+    names
 }
 
 /// The rules of catkin_pkg's `Package.validate`: a file that breaks one is no ROS package to colcon, which then builds an
@@ -157,7 +177,8 @@ mod tests {
         <package format="3">
           <name>talker</name><version>1.2.3</version><description>Says <b>hello</b>.</description>
           <maintainer email="a@example.org">A</maintainer><license>Apache-2.0</license>
-          <exec_depend>rclpy</exec_depend><depend>std_msgs</depend><depend>rclpy</depend><test_depend>pytest</test_depend>
+          <exec_depend>rclpy</exec_depend><depend>std_msgs</depend><depend>rclpy</depend>
+          <exec_depend condition="$ROS_VERSION == 1">rospy</exec_depend><test_depend>pytest</test_depend>
           <export><build_type>ament_python</build_type></export>
         </package>"#;
 
@@ -166,7 +187,10 @@ mod tests {
         let xml = parse(TALKER).expect("valid");
         assert_eq!((xml.name.as_str(), xml.version.as_str()), ("talker", "1.2.3"));
         assert_eq!(xml.build_type, BuildType::One("ament_python".to_owned()));
-        assert_eq!(xml.exec_depends, ["rclpy", "std_msgs"]);
+        assert_eq!(
+            (&*xml.exec_depends, &*xml.conditional_depends),
+            (&["rclpy", "std_msgs"].map(str::to_owned)[..], &["rospy".to_owned()][..])
+        );
         assert_eq!(xml.invalid, Vec::<String>::new());
     }
 

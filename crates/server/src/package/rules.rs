@@ -108,12 +108,8 @@ fn check_launch(
         })
     };
     if manifest.build.tool == BuildTool::None {
-        // An install tree is isolated or merged, and it is in install/ or is the directory itself.
-        let shares =
-            ["install/", ""].map(|top| [format!("{top}{package}/share/{package}/"), format!("{top}share/{package}/")]);
-        let shares = shares.as_flattened();
-        let install = tree.entries.keys().any(|path| shares.iter().any(|share| path.starts_with(share)));
-        if !install {
+        let shares = shares(package);
+        if !is_in_install_tree(tree, package) {
             refuse(format!("needs a package.xml to build {package:?} from, or an install/ tree that has it"));
         } else if !shares.iter().any(|share| has_file(share)) {
             refuse(format!("{file:?} is not in the install tree below share/{package}"));
@@ -127,9 +123,22 @@ fn check_launch(
                 refuse(format!("{file:?} is not in the package {package:?}"));
             }
         }
-        None if packages.iter().any(|found| found.xml.exec_depends.iter().any(|name| name == package)) => {}
+        None if packages.iter().any(|found| found.xml.depends_on(package)) => {}
         None => refuse(format!("{package:?} is neither in this directory nor an exec_depend of package.xml")),
     }
+}
+
+/// Where an install tree has what `package` shares: it is isolated or merged, and in install/ or the directory itself.
+fn shares(package: &str) -> [String; 4] {
+    let isolated = |top: &str| format!("{top}{package}/share/{package}/");
+    let merged = |top: &str| format!("{top}share/{package}/");
+    [isolated("install/"), merged("install/"), isolated(""), merged("")]
+}
+
+/// Whether the tree brings `package` built.
+pub(super) fn is_in_install_tree(tree: &Tree, package: &str) -> bool {
+    let shares = shares(package);
+    tree.entries.keys().any(|path| shares.iter().any(|share| path.starts_with(share)))
 }
 
 /// A command with a slash comes with the package, unless it is absolute. Where it is relative to: see docs/package.md.

@@ -61,8 +61,10 @@ pub(super) fn read(dir: &Path) -> Result<Source, PackageError> {
     let tree = Tree::walk(dir, tool != BuildTool::None, &mut problems)?;
     let manifest = merge(toml, toml_is_whole, xml.as_ref(), tool, &mut problems);
     match manifest {
-        Some(manifest) if toml_is_whole => {
+        Some(mut manifest) if toml_is_whole => {
             rules::check(&manifest, &tree, &mut problems)?;
+            // A robot looks for the others among its own.
+            manifest.exec_depends.retain(|name| !rules::is_in_install_tree(&tree, name));
             if problems.is_empty() { Ok(Source { manifest, tree }) } else { Err(invalid(problems)) }
         }
         _ => Err(invalid(problems)),

@@ -50,7 +50,7 @@ class Mapper(LifecycleNode):
         super().__init__("mapper")
         self.on_end = on_end
         self.settings = None
-        self.active = self.ended = False
+        self.active = False
         self.forget()
         self.add_on_set_parameters_callback(self.on_set_parameters)
         for name in LIMITS:
@@ -61,6 +61,7 @@ class Mapper(LifecycleNode):
     def forget(self):
         """Drops what was heard so far."""
         self.run = None
+        self.ended = False
         self.geometry = None
         self.drive_ended_at = None
         self.odometry = deque(maxlen=ODOMETRY_KEPT)
@@ -242,7 +243,12 @@ class Mapper(LifecycleNode):
 
     def end(self, problem):
         """The drive is over, or nothing more can be mapped: saves and says so, once."""
-        self.publish_map(self.get_clock().now().to_msg())
+        if self.ended:
+            return
+        if self.run is None:
+            problem = problem or "the drive is over and no scan could be used"
+        else:
+            self.publish_map(self.get_clock().now().to_msg())
         if not self.save():
             problem = problem or "the map could not be saved"
         if problem:

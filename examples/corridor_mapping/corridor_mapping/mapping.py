@@ -47,7 +47,10 @@ def main():
         sys.exit("mapping: stopped before the drive was over")
     if outcome.result() is not None:
         sys.exit(f"mapping: {outcome.result()}")
-    print(score.report(score.score_files(mapper.get_parameter("map_dir").value)), flush=True)
+    try:
+        print(score.report(score.score_files(mapper.get_parameter("map_dir").value)), flush=True)
+    except OSError as error:
+        sys.exit(f"mapping: the score could not be saved: {error}")
 
 
 if __name__ == "__main__":

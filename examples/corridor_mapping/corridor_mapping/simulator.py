@@ -58,8 +58,10 @@ class Simulator(Node):
                 if self.drives and parameter.value != self.simulation.seed:
                     return SetParametersResult(reason="seed can't change any more: the robot has set off")
                 if self.simulation is not None and not self.drives:
+                    # The robot's clock never goes back.
+                    ticks = self.simulation.ticks
                     self.simulation = Simulation(parameter.value)
-                    self.started = self.get_clock().now()
+                    self.simulation.ticks = ticks
         return SetParametersResult(successful=True)
 
     def on_map(self, _map):

@@ -121,6 +121,14 @@ class Nodes(unittest.TestCase):
         mapper.end(None)
         self.assertEqual(self.ends, ["the map could not be saved"])
 
+    def test_a_drive_without_scans_fails_the_run(self):
+        mapper = self.active_mapper()
+        mapper.on_drive_finished(Header(stamp=Time(sec=1)))
+        mapper.on_odometry(odometry(1))
+        mapper.on_scan(scan(1, beams=0))
+        mapper.end("asked twice")
+        self.assertEqual(self.ends, ["the drive is over and no scan could be used"])
+
     def test_odd_messages_do_no_harm(self):
         mapper = self.active_mapper()
         mapper.on_odometry(odometry(1, float("nan")))
@@ -142,7 +150,9 @@ class Nodes(unittest.TestCase):
     def test_the_robot_keeps_its_seed_once_it_drives(self):
         simulator = Simulator()
         self.addCleanup(simulator.destroy_node)
+        simulator.on_timer()
         self.refused(simulator, None, seed=4)
+        self.assertEqual(simulator.simulation.ticks, 1)
         self.assertEqual(simulator.simulation.seed, 4)
         self.refused(simulator, "rate is 0.0, must be from 0.1 to 20", rate=0.0)
         simulator.on_map(None)

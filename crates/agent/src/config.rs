@@ -47,6 +47,9 @@ pub struct Settings {
     /// Seconds between two polls without MQTT.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub poll_interval_without_mqtt_s: Option<u64>,
+    /// Seconds after which the robot asks for a new token.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub token_lifetime_s: Option<u64>,
     /// The labels the robot gives itself; the server's win.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub labels: Option<Labels>,
@@ -141,6 +144,8 @@ pub struct Config {
     pub poll_interval: Duration,
     /// Between two polls without MQTT.
     pub poll_interval_without_mqtt: Duration,
+    /// The age at which the robot asks for a new token.
+    pub token_lifetime: Duration,
     /// What tasks may use.
     pub limits: LimitSettings,
     /// Versions that are prepared at the same time.
@@ -219,6 +224,7 @@ impl Config {
             ros_domain_id: settings.ros_domain_id,
             poll_interval: Duration::from_secs(settings.poll_interval_s.unwrap_or(300)),
             poll_interval_without_mqtt: Duration::from_secs(settings.poll_interval_without_mqtt_s.unwrap_or(10)),
+            token_lifetime: Duration::from_secs(settings.token_lifetime_s.unwrap_or(30 * 86_400)),
             parallel_tasks: limits.parallel_tasks.unwrap_or(2),
             limits,
             gate: settings.gate.map(gate).transpose()?,
@@ -227,6 +233,7 @@ impl Config {
             ("ros_domain_id", u64::from(config.ros_domain_id.unwrap_or(0)), 0, 232),
             ("poll_interval_s", config.poll_interval.as_secs(), 1, 86_400),
             ("poll_interval_without_mqtt_s", config.poll_interval_without_mqtt.as_secs(), 1, 86_400),
+            ("token_lifetime_s", config.token_lifetime.as_secs(), 3600, 3650 * 86_400),
             ("limits.parallel_tasks", config.parallel_tasks as u64, 1, 64),
             ("gate.timeout_s", config.gate.as_ref().map_or(1, |gate| gate.timeout.as_secs()), 1, MAX_GATE_TIMEOUT_S),
             ("limits.build_timeout_s", config.limits.build_timeout_s.unwrap_or(60), 1, 86_400),

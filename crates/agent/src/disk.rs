@@ -3,6 +3,7 @@
 
 use std::io;
 use std::path::Path;
+use std::time::Duration;
 
 use task_proto::desired::PackageRef;
 use task_proto::manifest::{BuildTool, TaskManifest};
@@ -11,6 +12,11 @@ use task_proto::manifest::{BuildTool, TaskManifest};
 const BYTES_PER_ENTRY: u64 = 4096 + 256;
 /// A build and its install tree together take about this many times the sources.
 const BUILD_FACTOR: u64 = 2;
+
+/// How long to wait before a full disk is looked at again: somebody has to make room.
+pub const FULL_PAUSE: Duration = Duration::from_secs(5 * 60);
+/// With less than this free, whatever failed may have failed for want of room.
+const NO_ROOM_BYTES: u64 = 16 * 1024 * 1024;
 
 /// The bytes that one package needs, by what they are for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -75,6 +81,13 @@ impl Need {
     }
 }
 
+impl Room {
+    /// Whether hardly anything can be written any more.
+    pub fn is_used_up(self) -> bool {
+        self.free < NO_ROOM_BYTES
+    }
+}
+
 /// The room on the file system that holds `path`.
 pub fn room(path: &Path) -> io::Result<Room> {
     let stat = nix::sys::statvfs::statvfs(path)?;
@@ -96,6 +109,12 @@ mod tests {
             full.to_string(),
             "99 of 500 bytes are free, 100 are needed: 10 for the package, 20 for its tree, 40 for the build, 30 in reserve"
         );
+    }
+
+    #[test]
+    fn a_disk_with_hardly_any_room_is_used_up() {
+        assert!(Room { free: NO_ROOM_BYTES - 1, total: u64::MAX }.is_used_up());
+        assert!(!Room { free: NO_ROOM_BYTES, total: u64::MAX }.is_used_up());
     }
 
     #[test]

@@ -26,6 +26,7 @@ use tokio_util::sync::CancellationToken;
 
 use self::download::Download;
 use self::intake::Intake;
+use crate::credential::Credential;
 use crate::disk::{self, DiskFull, Need};
 use crate::durable;
 use crate::layout::DataDir;
@@ -155,18 +156,20 @@ impl FetchError {
 
     /// Whether the same pull may succeed later without anyone's doing.
     pub fn is_retryable(&self) -> bool {
-        self.is_cut() || matches!(self, Self::NotTheServer(_) | Self::Busy { .. } | Self::Unauthorized)
+        self.is_cut()
+            || matches!(self, Self::NotTheServer(_) | Self::Busy { .. } | Self::Unauthorized | Self::DiskFull(_))
     }
 
-    /// Whether it ends the pull for good.
-    fn is_final(&self) -> bool {
-        !self.is_retryable() && !matches!(self, Self::Cancelled)
+    /// Whether what was gathered is to go: it is of no use, or takes up the room that is missing.
+    fn spoils_gathered(&self) -> bool {
+        matches!(self, Self::DiskFull(_)) || !self.is_retryable() && !matches!(self, Self::Cancelled)
     }
 
-    /// How long the server wants to be left alone.
+    /// How long to wait at least before it is tried again.
     pub fn retry_after(&self) -> Option<Duration> {
         match self {
             Self::Busy { retry_after, .. } => *retry_after,
+            Self::DiskFull(_) => Some(disk::FULL_PAUSE),
             _ => None,
         }
     }
@@ -185,7 +188,7 @@ impl FetchError {
 pub struct Fetcher {
     client: reqwest::Client,
     server: reqwest::Url,
-    token: String,
+    token: Credential,
     data: DataDir,
     settings: FetchSettings,
     turns: Turns,
@@ -196,11 +199,11 @@ impl Fetcher {
     pub fn new(
         client: reqwest::Client,
         server: reqwest::Url,
-        token: String,
+        token: impl Into<Credential>,
         data: DataDir,
         settings: FetchSettings,
     ) -> Self {
-        Self { client, server, token, data, settings, turns: Turns::default() }
+        Self { client, server, token: token.into(), data, settings, turns: Turns::default() }
     }
 
     /// The package's task manifest, from the disk if it is there whole. Its bytes are verified either way.
@@ -240,8 +243,8 @@ impl Fetcher {
             }
             result => result,
         };
-        if result.as_ref().is_err_and(FetchError::is_final) {
-            // Nobody comes back for these bytes, and where the disk is full the ledger needs their room.
+        if result.as_ref().is_err_and(FetchError::spoils_gathered) {
+            // Nobody comes back for these bytes, or the disk is full and the ledger needs their room.
             self.discard(package)?;
         }
         result
@@ -359,7 +362,7 @@ impl Fetcher {
             }
             Err(()) => return Err(FetchError::NotTheServer(format!("{} is not an HTTP address", self.server))),
         }
-        let request = self.client.get(url).bearer_auth(&self.token);
+        let request = self.client.get(url).bearer_auth(self.token.current());
         Download::start(request, package, blob, offset, self.settings.stall_timeout).await
     }
 

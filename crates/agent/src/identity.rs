@@ -1,4 +1,5 @@
-//! Who this robot is: `identity.json` (0600), written once by `enroll`, and the MAC it was registered by. Finding the MAC
+//! Who this robot is: `identity.json` (0600), written by `enroll` and when the token
+//! changes, and the MAC it was registered by. Finding the MAC
 //! reads `/sys/class/net`; nothing here talks to the server.
 
 use std::io;
@@ -23,6 +24,12 @@ pub struct Identity {
     pub robot_id: RobotId,
     /// Its bearer token and MQTT password.
     pub token: String,
+    /// The token after it, from before its first use until that is seen to have worked.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub next_token: Option<String>,
+    /// Since when `token` is the one, by this robot's clock.
+    #[serde(default)]
+    pub token_since_ms: u64,
     /// The server it registered at.
     pub server: String,
     /// The key that signs its desired states.
@@ -164,6 +171,8 @@ mod tests {
         let identity = Identity {
             robot_id: RobotId::random(),
             token: "tskr_…".to_owned(),
+            next_token: None,
+            token_since_ms: 0,
             server: "http://server".to_owned(),
             server_key: task_proto::envelope::SigningKey::random().public_key(),
             mqtt: MqttEndpoint { host: None, port: 1883, prefix: Default::default() },

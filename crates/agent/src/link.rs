@@ -59,6 +59,8 @@ pub struct Shared {
     pub settled: watch::Sender<bool>,
     /// Whether a session is up.
     pub mqtt_up: watch::Sender<bool>,
+    /// Says that the server did not accept the token.
+    pub token_refused: Arc<Notify>,
     /// Asks for a poll now.
     pub poll: Arc<Notify>,
     /// Asks for a report over HTTP now, whether MQTT is up or not.
@@ -102,6 +104,7 @@ impl Shared {
             confirmed: watch::Sender::new(0),
             settled: watch::Sender::new(false),
             mqtt_up: watch::Sender::new(false),
+            token_refused: Arc::default(),
             poll: Arc::default(),
             post: Arc::default(),
             shutdown,
@@ -125,6 +128,9 @@ pub async fn poll(server: Server, shared: Shared, intervals: Intervals, heard: m
         };
         if let Ok(Some(sent)) = &outcome {
             tag.clone_from(&sent.tag);
+        }
+        if matches!(outcome, Err(ServerError::TokenRefused(_))) {
+            shared.token_refused.notify_one();
         }
         if heard.send(heard_of(outcome)).await.is_err() {
             return;

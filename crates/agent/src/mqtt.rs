@@ -14,6 +14,7 @@ use task_proto::topic::{RobotTopic, Topic, TopicPrefix};
 use tokio::sync::mpsc;
 use tokio::time::Instant;
 
+use crate::credential::Credential;
 use crate::link::{Heard, Message, Shared, Talk};
 use crate::plan::backoff_ms;
 
@@ -44,7 +45,7 @@ pub struct MqttAccess {
     /// Client id and user name.
     pub robot: RobotId,
     /// The password.
-    pub token: String,
+    pub token: Credential,
     /// What every status says; `connection` counts up from it.
     pub status: Status,
 }
@@ -251,7 +252,7 @@ impl Session<'_> {
 
 fn options(access: &MqttAccess) -> MqttOptions {
     let mut options = MqttOptions::new(access.robot.as_str(), &access.host, access.port);
-    options.set_credentials(access.robot.as_str(), &access.token);
+    options.set_credentials(access.robot.as_str(), access.token.current());
     options.set_clean_session(true);
     options.set_keep_alive(KEEP_ALIVE);
     // Base64 and JSON around the payload are counted in the limit, topic and header are not.

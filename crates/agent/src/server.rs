@@ -8,9 +8,11 @@ use reqwest::{Method, StatusCode, Url};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use task_proto::RobotId;
-use task_proto::api::{EnrollRequest, EnrollResponse, ErrorBody, ReportReply};
+use task_proto::api::{EnrollRequest, EnrollResponse, ErrorBody, ReportReply, RobotToken};
 use task_proto::envelope::Envelope;
 use task_proto::report::Report;
+
+use crate::credential::Credential;
 
 /// The longest answer that is read.
 const MAX_ANSWER_BYTES: usize = 8 * 1024 * 1024;
@@ -55,7 +57,7 @@ pub struct Server {
     client: reqwest::Client,
     base: Url,
     robot: RobotId,
-    token: String,
+    token: Credential,
 }
 
 /// A desired state as the server sent it.
@@ -92,14 +94,19 @@ pub async fn enroll(
 
 impl Server {
     /// The server at `base`, for the robot with this token.
-    pub fn new(client: reqwest::Client, base: Url, robot: RobotId, token: String) -> Self {
-        Self { client, base, robot, token }
+    pub fn new(client: reqwest::Client, base: Url, robot: RobotId, token: impl Into<Credential>) -> Self {
+        Self { client, base, robot, token: token.into() }
+    }
+
+    /// The same with another token.
+    pub fn with_token(&self, token: String) -> Self {
+        Self { token: token.into(), ..self.clone() }
     }
 
     /// The signed desired state; `None` if it is still the one that was sent with the tag `known`.
     pub async fn desired(&self, known: Option<&HeaderValue>) -> Result<Option<Sent>, ServerError> {
         let url = at(&self.base, &format!("robots/{}/desired", self.robot));
-        let answer = send::<()>(&self.client, Method::GET, url, &self.token, None, known).await?;
+        let answer = self.ask::<()>(Method::GET, url, None, known).await?;
         if answer.status == StatusCode::NOT_MODIFIED {
             return Ok(None);
         }
@@ -109,8 +116,33 @@ impl Server {
     /// Delivers a report; once this returns it is stored.
     pub async fn report(&self, report: &Report) -> Result<ReportReply, ServerError> {
         let url = at(&self.base, &format!("robots/{}/report", self.robot));
-        let answer = send(&self.client, Method::POST, url, &self.token, Some(report), None).await?;
+        let answer = self.ask(Method::POST, url, Some(report), None).await?;
         parse(&answer.body)
+    }
+
+    /// Asks for a token to go over to. The first use of it ends the one in use.
+    pub async fn next_token(&self) -> Result<String, ServerError> {
+        let url = at(&self.base, &format!("robots/{}/token", self.robot));
+        let answer = self.ask::<()>(Method::POST, url, None, None).await?;
+        let RobotToken { token } = parse(&answer.body)?;
+        Ok(token)
+    }
+
+    /// Sends; once more if the token was replaced while the request was under way.
+    async fn ask<B: Serialize>(
+        &self,
+        method: Method,
+        url: Url,
+        body: Option<&B>,
+        known: Option<&HeaderValue>,
+    ) -> Result<Answer, ServerError> {
+        let token = self.token.current();
+        match send(&self.client, method.clone(), url.clone(), &token, body, known).await {
+            Err(ServerError::TokenRefused(_)) if self.token.current() != token => {
+                send(&self.client, method, url, &self.token.current(), body, known).await
+            }
+            answer => answer,
+        }
     }
 }
 

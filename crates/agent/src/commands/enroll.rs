@@ -1,6 +1,7 @@
 //! `task-agent enroll`: registers this robot at a server with an enrolment token, and keeps who it is.
 
 use std::process::ExitCode;
+use std::time::Duration;
 
 use anyhow::{Context as _, bail};
 use task_proto::api::{EnrollRequest, EnrollResponse};
@@ -11,11 +12,18 @@ use task_proto::{MacAddress, RobotName};
 
 use super::{DataDir, say};
 use crate::admission;
+use crate::clock;
 use crate::config::{Config, Settings, parse_server};
 use crate::durable;
 use crate::identity::{self, Identity};
 use crate::layout::DataDir as Layout;
-use crate::server::{self, Server};
+use crate::plan::backoff_ms;
+use crate::server::{self, Server, ServerError};
+
+/// How often the server is asked.
+const TRIES: u32 = 4;
+/// The longest pause between two tries.
+const MAX_PAUSE_MS: u64 = 4000;
 
 /// Arguments of `enroll`.
 #[derive(Debug, clap::Args)]
@@ -81,25 +89,53 @@ async fn enroll(arguments: Arguments) -> anyhow::Result<ExitCode> {
     labels.extend(arguments.labels.iter().cloned());
     let request = EnrollRequest { mac, name: arguments.name.clone().or(config.name.clone()), labels: labels.clone() };
     let client = server::client()?;
-    let response = match server::enroll(&client, &server, &arguments.token, &request).await {
+    let response = match register(&client, &server, &arguments.token, &request).await {
         Ok(response) => response,
         Err(error) => return Err(anyhow::Error::new(error).context(format!("{server} did not register the robot"))),
     };
-    check_key(&Server::new(client, server.clone(), response.robot_id.clone(), response.token.clone()), &response, key)
-        .await?;
-
     remember_settings(&data, &arguments, &server, &response, labels)?;
     let robot = Identity {
         robot_id: response.robot_id.clone(),
-        token: response.token,
+        token: response.token.clone(),
+        next_token: None,
+        token_since_ms: clock::wall_ms(),
         server: server.to_string(),
         server_key: key.clone(),
-        mqtt: response.mqtt,
+        mqtt: response.mqtt.clone(),
         mac,
     };
+    // Written before the token is used: once it was, the server gives no other for the same enrolment token.
+    let before = Identity::read(&data.identity()).ok();
     robot.write(&data.identity())?;
+    let registered = Server::new(client, server.clone(), response.robot_id.clone(), response.token.clone());
+    if let Err(error) = check_key(&registered, &response, key).await {
+        match before {
+            Some(before) => before.write(&data.identity())?,
+            None => durable::remove_file(&data.identity()).context("cannot remove the identity")?,
+        }
+        return Err(error);
+    }
     say(format_args!("{} is registered at {server} as {}, by {mac}", response.name, response.robot_id));
     Ok(ExitCode::SUCCESS)
+}
+
+/// Registers, again if no answer came: while nobody has used the token that was in it, the same answer can be had anew.
+async fn register(
+    client: &reqwest::Client,
+    server: &reqwest::Url,
+    token: &str,
+    request: &EnrollRequest,
+) -> Result<EnrollResponse, ServerError> {
+    let mut tried = 0;
+    loop {
+        tried += 1;
+        match server::enroll(client, server, token, request).await {
+            Err(ServerError::Unreachable(_) | ServerError::Busy { .. }) if tried < TRIES => {
+                tokio::time::sleep(Duration::from_millis(backoff_ms(tried, MAX_PAUSE_MS, rand::random()))).await;
+            }
+            answer => return answer,
+        }
+    }
 }
 
 /// The server must hold the key that the token pins: a desired state that it signed shows it.

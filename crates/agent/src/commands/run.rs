@@ -16,6 +16,7 @@ use tokio_util::sync::CancellationToken;
 use super::DataDir;
 use crate::answers::Answers;
 use crate::config::{Config, parse_server};
+use crate::credential::Credential;
 use crate::driver::{Driver, Speaker};
 use crate::effects::Robot;
 use crate::fetch::{FetchSettings, Fetcher};
@@ -24,6 +25,7 @@ use crate::layout::DataDir as Layout;
 use crate::ledger::{Found, Ledger};
 use crate::link::{self, Intervals, Shared, Talk};
 use crate::mqtt::{self, MqttAccess};
+use crate::rotation::Rotation;
 use crate::server::{self, Server};
 use crate::{clock, process};
 
@@ -63,8 +65,8 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
         None => parse_server(&identity.server)?,
     };
     let client = server::client().context("cannot make an HTTP client")?;
-    let fetcher =
-        Fetcher::new(client.clone(), base.clone(), identity.token.clone(), data.clone(), fetch_settings(&config));
+    let credential = Credential::from(identity.token.clone());
+    let fetcher = Fetcher::new(client.clone(), base.clone(), credential.clone(), data.clone(), fetch_settings(&config));
     let robot = Arc::new(Robot::new(data.clone(), fetcher, &config, &identity.robot_id, identity.mac));
     let shutdown = CancellationToken::new();
     let shared = Shared::new(shutdown.clone());
@@ -83,14 +85,22 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
     tracing::info!(robot = %identity.robot_id, server = %base, "task-agent runs");
 
     let (heard, messages) = mpsc::channel(QUEUED_MESSAGES);
-    let server = Server::new(client, base.clone(), identity.robot_id.clone(), identity.token.clone());
+    let server = Server::new(client, base.clone(), identity.robot_id.clone(), credential.clone());
     let intervals = Intervals { slow: config.poll_interval, fast: config.poll_interval_without_mqtt };
     tokio::spawn(link::poll(server.clone(), shared.clone(), intervals, heard.clone()));
-    tokio::spawn(link::post(server, shared.clone(), heard.clone()));
+    tokio::spawn(link::post(server.clone(), shared.clone(), heard.clone()));
+    let rotation = Rotation {
+        server,
+        credential: credential.clone(),
+        identity: identity.clone(),
+        path: data.identity(),
+        lifetime: config.token_lifetime,
+    };
+    tokio::spawn(rotation.run(shared.clone(), clock::wall_ms));
     if config.mqtt {
         let host = identity.mqtt.host.clone().or_else(|| base.host_str().map(str::to_owned)).unwrap_or_default();
         let (port, prefix) = (identity.mqtt.port, identity.mqtt.prefix.clone());
-        let access = MqttAccess { host, port, prefix, robot: identity.robot_id, token: identity.token, status };
+        let access = MqttAccess { host, port, prefix, robot: identity.robot_id, token: credential, status };
         let answers = Answers { robot_id: access.robot.clone() };
         let (requests, asked) = mpsc::channel(QUEUED_QUESTIONS);
         let (messages, said) = mpsc::channel(QUEUED_MESSAGES);

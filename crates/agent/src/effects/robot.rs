@@ -113,6 +113,21 @@ impl Robot {
     }
 }
 
+impl Robot {
+    /// A build that failed on a disk without room says little of the package: it is tried again.
+    fn build_failure(&self, error: BuildError) -> StepFailure {
+        let Some(code) = error.code() else { return later(FailureCode::BUILD_FAILED, &error, 0) };
+        match disk::room(self.data.root()) {
+            Ok(room) if room.is_used_up() => {
+                let text = format!("{} of {} bytes are free; {}", room.free, room.total, chain(&error));
+                let least_ms = u64::try_from(disk::FULL_PAUSE.as_millis()).unwrap_or(u64::MAX);
+                StepFailure { failure: Failure::new(FailureCode::DISK_FULL, text), retry_after_ms: Some(least_ms) }
+            }
+            _ => finally(code, &error),
+        }
+    }
+}
+
 impl Effects for Robot {
     fn now(&self) -> Now {
         Now { boot_ms: clock::boot_ms(), wall_ms: clock::wall_ms() }
@@ -252,7 +267,7 @@ impl Effects for Robot {
             limits: self.build_limits,
             version: version.clone(),
         };
-        builder::build(&order, cancel).await.map_err(build_failure)?;
+        builder::build(&order, cancel).await.map_err(|error| self.build_failure(error))?;
         let marker = version.root().join(BUILT_MARKER);
         durable::write(&marker, b"", 0o600).map_err(|error| finally(FailureCode::IO_ERROR, &error))
     }
@@ -351,13 +366,6 @@ fn fetch_failure(error: FetchError) -> StepFailure {
         return later(code, &error, least_ms);
     }
     finally(code, &error)
-}
-
-fn build_failure(error: BuildError) -> StepFailure {
-    match error.code() {
-        Some(code) => finally(code, &error),
-        None => later(FailureCode::BUILD_FAILED, &error, 0),
-    }
 }
 
 fn finally(code: FailureCode, error: &dyn Error) -> StepFailure {

@@ -10,7 +10,10 @@ use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
 use task_agent::admission::{self, Refused};
+use task_agent::credential::Credential;
+use task_agent::identity::Identity;
 use task_agent::link::{self, Heard, Intervals, Shared};
+use task_agent::rotation::Rotation;
 use task_agent::server::{self, Server, ServerError};
 use task_proto::desired::DesiredState;
 use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
@@ -40,6 +43,7 @@ impl Fake {
         let routes = Router::new()
             .route("/api/v1/robots/{id}/desired", get(answer_canned))
             .route("/api/v1/robots/{id}/report", post(answer_canned))
+            .route("/api/v1/robots/{id}/token", post(answer_canned))
             .with_state(fake.clone());
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap();
@@ -96,6 +100,57 @@ async fn only_the_servers_own_no_is_a_refusal() {
     assert!(matches!(server.desired(None).await, Err(ServerError::Refused { code, .. }) if code == "diverged"));
     fake.set((304, "application/json", String::new()));
     assert!(server.desired(None).await.unwrap().is_none());
+}
+
+#[tokio::test]
+async fn a_new_token_is_on_the_disk_before_it_is_used_and_the_old_one_until_it_worked() {
+    let robot = RobotId::random();
+    let (fake, url) = Fake::start((201, "application/json", r#"{"token":"new"}"#.to_owned())).await;
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("identity.json");
+    let identity = Identity {
+        robot_id: robot.clone(),
+        token: "old".to_owned(),
+        next_token: None,
+        token_since_ms: 1_000,
+        server: url.to_string(),
+        server_key: SigningKey::random().public_key(),
+        mqtt: task_proto::api::MqttEndpoint { host: None, port: 1, prefix: Default::default() },
+        mac: "02:00:00:00:00:01".parse().unwrap(),
+    };
+    identity.write(&path).unwrap();
+    let credential = Credential::from("old".to_owned());
+    let server = Server::new(server::client().unwrap(), url.clone(), robot, credential.clone());
+    let lifetime = Duration::from_secs(3600);
+    let mut rotation = Rotation { server, credential: credential.clone(), identity, path: path.clone(), lifetime };
+    let tokens = || {
+        let Identity { token, next_token, .. } = Identity::read(&path).unwrap();
+        (token, next_token, credential.current())
+    };
+    let is = |token: &str, next: Option<&str>| (token.to_owned(), next.map(str::to_owned), token.to_owned());
+
+    rotation.step(1_000 + 3_599_999).await;
+    assert_eq!(tokens(), is("old", None), "too young");
+    rotation.step(1_000 + 3_600_000).await;
+    assert_eq!(tokens(), is("old", Some("new")));
+    // No answer: the server may have taken it or not, so both are kept.
+    fake.set((503, "text/plain", String::new()));
+    rotation.step(4_000_000).await;
+    assert_eq!(tokens(), is("old", Some("new")));
+    fake.set((401, "application/json", REFUSAL.to_owned()));
+    rotation.step(4_000_000).await;
+    assert_eq!(tokens(), is("old", None), "it is good for nothing");
+    fake.set((201, "application/json", r#"{"token":"newer"}"#.to_owned()));
+    rotation.step(8_000_000).await;
+    fake.set((409, "application/json", REFUSAL.replace("unauthorized", "diverged")));
+    rotation.step(8_000_000).await;
+    assert_eq!(tokens(), is("newer", None), "whoever is told no was recognised");
+    // Somebody registered the robot anew beside the running agent.
+    let anew = Identity { token: "anew".to_owned(), ..Identity::read(&path).unwrap() };
+    anew.write(&path).unwrap();
+    fake.set((201, "application/json", r#"{"token":"lost"}"#.to_owned()));
+    rotation.step(80_000_000).await;
+    assert_eq!(Identity::read(&path).unwrap().token, "anew");
 }
 
 #[tokio::test]

@@ -417,7 +417,8 @@ async fn a_refused_archive_is_blamed_only_when_its_bytes_are_the_ordered_ones() 
 async fn too_little_room_is_said_before_anything_travels() {
     let site = Site::with(&tar(), FetchSettings { reserve_bytes: u64::MAX, ..settings() }).await;
     let error = site.pull().await.unwrap_err();
-    assert_eq!(error.code(), Some(FailureCode::DISK_FULL));
+    assert_eq!((error.code(), error.is_retryable()), (Some(FailureCode::DISK_FULL), true));
+    assert_eq!(error.retry_after(), Some(task_agent::disk::FULL_PAUSE));
     assert!(error.to_string().contains("in reserve"), "{error}");
     assert_eq!(site.asked(), [0; 0]);
 

@@ -94,7 +94,7 @@ fn judge(view: &DeploymentView) -> Verdict {
     let (open, offline): (Vec<_>, Vec<_>) = open.into_iter().partition(|a| a.online);
     let mut lines = vec![format!("{} of {} succeeded", succeeded.len(), assignments.len())];
     lines.extend(failed.iter().map(|a| format!("{}: {}", a.name, reason(a))));
-    lines.extend(open.iter().map(|a| format!("{}: not done in time, still {}", a.name, a.phase)));
+    lines.extend(open.iter().map(|a| format!("{}: not done in time, still {}", a.name, reason(a))));
     if !offline.is_empty() {
         lines.push(format!("offline, and following when back: {}", names(&offline)));
     }

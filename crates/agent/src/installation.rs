@@ -46,7 +46,7 @@ pub enum NoInstallation {
 }
 
 /// Names of ROS packages that have no underscore and that no system package shares.
-const PLAIN_NAMES: [&str; 5] = ["rclcpp", "rclpy", "roscpp", "roslaunch", "rospy"];
+const PLAIN_NAMES: [&str; 6] = ["rclcpp", "rclpy", "ros2launch", "roscpp", "roslaunch", "rospy"];
 /// The one name with an underscore that `rosdep` knows as a system package.
 const SYSTEM_NAMES: [&str; 1] = ["onvif_zeep"];
 
@@ -58,10 +58,9 @@ impl Installation {
 
     /// Those of `needed` that are certainly not in it. Only names that can't be anything but ROS packages are judged:
     /// others are keys of `rosdep` for what the operating system or pip provides, which no index of ROS lists.
-    pub fn lacks<'a>(&self, needed: &'a [String]) -> Vec<&'a str> {
-        let Some(packages) = &self.packages else { return Vec::new() };
-        let absent = |name: &&String| is_ros_package(name) && !packages.contains(*name);
-        needed.iter().filter(absent).map(String::as_str).collect()
+    pub fn lacks<'a>(&self, needed: impl IntoIterator<Item = &'a str>) -> BTreeSet<&'a str> {
+        let Some(packages) = &self.packages else { return BTreeSet::new() };
+        needed.into_iter().filter(|name| is_ros_package(name) && !packages.contains(*name)).collect()
     }
 }
 
@@ -141,11 +140,10 @@ mod tests {
 
     #[test]
     fn only_what_is_certainly_absent_is_lacking() {
-        let needed = ["nav2_bringup", "rclpy", "std_msgs", "python3-numpy", "eigen", "xacro", "onvif_zeep", "libFoo_x"]
-            .map(str::to_owned);
+        let needed = ["nav2_bringup", "rclpy", "std_msgs", "python3-numpy", "eigen", "xacro", "onvif_zeep", "libFoo_x"];
         let mut found = installation("jazzy", RosVersion::Ros2);
-        assert!(found.lacks(&needed).is_empty(), "nobody has looked");
+        assert!(found.lacks(needed).is_empty(), "nobody has looked");
         found.packages = Some(["std_msgs".to_owned()].into());
-        assert_eq!(found.lacks(&needed), ["nav2_bringup", "rclpy"]);
+        assert_eq!(found.lacks(needed), ["nav2_bringup", "rclpy"].into());
     }
 }

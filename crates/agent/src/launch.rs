@@ -17,6 +17,8 @@ pub struct Launch {
     pub interrupt: Interrupt,
     /// The ROS it can't do without.
     pub ros: Option<RosVersion>,
+    /// The ROS package that brings the launcher.
+    pub package: Option<&'static str>,
 }
 
 /// Who gets the SIGINT with which a stop begins.
@@ -50,17 +52,17 @@ pub fn of(manifest: &TaskManifest) -> Launch {
 
 fn ros2_launch(file: &[String; 2], arguments: &BTreeMap<String, String>) -> Launch {
     let command = words(&["ros2", "launch"], file, arguments);
-    Launch { command, interrupt: Interrupt::Leader, ros: Some(RosVersion::Ros2) }
+    Launch { command, interrupt: Interrupt::Leader, ros: Some(RosVersion::Ros2), package: Some("ros2launch") }
 }
 
 /// It puts the master and each node in a session of its own and ends them in that order; a group would miss them.
 fn roslaunch(file: &[String; 2], arguments: &BTreeMap<String, String>) -> Launch {
     let command = words(&["roslaunch"], file, arguments);
-    Launch { command, interrupt: Interrupt::Leader, ros: Some(RosVersion::Ros1) }
+    Launch { command, interrupt: Interrupt::Leader, ros: Some(RosVersion::Ros1), package: Some("roslaunch") }
 }
 
 fn exec(command: &[String]) -> Launch {
-    Launch { command: command.to_vec(), interrupt: Interrupt::Group, ros: None }
+    Launch { command: command.to_vec(), interrupt: Interrupt::Group, ros: None, package: None }
 }
 
 fn words(launcher: &[&str], file: &[String; 2], arguments: &BTreeMap<String, String>) -> Vec<String> {

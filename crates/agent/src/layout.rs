@@ -5,6 +5,7 @@
 //! ledger.json                       what the agent was doing
 //! blobs/sha256/<hex>.part           bytes of a package's content that have arrived so far
 //! staging/                          trees being unpacked; emptied at every start
+//! survey/                           what was last asked about the ROS installations
 //! tasks/<name>/current              link to the active version
 //! tasks/<name>/run/                 the shim's files: pid, exit status
 //! tasks/<name>/logs/                the task's and the build's output

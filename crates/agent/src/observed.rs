@@ -117,10 +117,12 @@ impl RobotFacts {
             lacks.push(format!("arch {} (it is {})", requires.arch.join(" or "), self.arch));
         }
         let Some(installations) = &self.installations else { return lacks };
+        let launcher = launch::of(manifest);
         let lacks_of = |chosen: &Installation| -> Vec<String> {
-            chosen.lacks(&manifest.exec_depends).into_iter().map(|name| format!("ROS package {name}")).collect()
+            let needed = manifest.exec_depends.iter().map(String::as_str).chain(launcher.package);
+            chosen.lacks(needed).into_iter().map(|name| format!("ROS package {name}")).collect()
         };
-        lacks.extend(match installation::choose(installations, launch::of(manifest).ros, &requires.ros_distro) {
+        lacks.extend(match installation::choose(installations, launcher.ros, &requires.ros_distro) {
             Ok(Some(chosen)) => lacks_of(chosen),
             Ok(None) => lacks_of(&Installation { packages: Some(BTreeSet::new()), ..Installation::default() }),
             Err(error) => vec![error.to_string()],

@@ -9,6 +9,7 @@ mod fetch;
 mod gate;
 mod graph;
 mod harness;
+mod launch;
 mod ros;
 mod supervise;
 mod unpack;

@@ -8,5 +8,6 @@ mod orders;
 mod proxy;
 mod registry;
 mod restore;
+mod ros1;
 mod talker;
 mod tidy;

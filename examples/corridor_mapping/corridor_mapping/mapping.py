@@ -7,11 +7,13 @@ executor, so the robot waits for the mapper and not the other way round: a busy 
 """
 
 import argparse
+import signal
 import sys
 
 import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 
@@ -24,27 +26,30 @@ def main():
     parser = argparse.ArgumentParser(description="Drives through the simulated corridor and maps it.")
     parser.add_argument("--activate", action="store_true", help="configure and activate /mapper instead of waiting for it")
     arguments = parser.parse_args(remove_ros_args(sys.argv)[1:])
-    rclpy.init()
+    # A signal ends the run between two callbacks; rclpy's own handlers would take ROS away in the middle of one.
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     outcome = Future()
-    mapper, simulator = Mapper(on_end=outcome.set_result), Simulator()
+
+    def end(problem):
+        if not outcome.done():
+            outcome.set_result(problem)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: end("stopped before the drive was over"))
+    mapper, simulator = Mapper(on_end=end), Simulator()
     executor = SingleThreadedExecutor()
     executor.add_node(mapper)
     executor.add_node(simulator)
-    try:
-        if arguments.activate:
-            for transition in (mapper.trigger_configure, mapper.trigger_activate):
-                if transition() != TransitionCallbackReturn.SUCCESS:
-                    sys.exit("mapping: /mapper could not be activated")
-        executor.spin_until_future_complete(outcome)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    finally:
-        if mapper.active and not outcome.done():
-            mapper.save()
-        executor.shutdown()
-        rclpy.try_shutdown()
-    if not outcome.done():
-        sys.exit("mapping: stopped before the drive was over")
+    if arguments.activate:
+        for transition in (mapper.trigger_configure, mapper.trigger_activate):
+            if transition() != TransitionCallbackReturn.SUCCESS:
+                sys.exit("mapping: /mapper could not be activated")
+    executor.spin_until_future_complete(outcome)
+    if mapper.active:
+        # Only does something when the run was stopped: what there is of the map is worth keeping.
+        mapper.save()
+    executor.shutdown()
+    rclpy.shutdown()
     if outcome.result() is not None:
         sys.exit(f"mapping: {outcome.result()}")
     try:

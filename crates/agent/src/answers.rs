@@ -5,12 +5,16 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use task_proto::RobotId;
+use task_proto::log::LogBatch;
 use task_proto::request::{Answer, Ask, MAX_REPLY_BYTES, MAX_TTL_MS, Outcome, Refusal, Reply, Request};
 use task_proto::topic::RobotTopic;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 
+use crate::clock;
 use crate::link::Message;
+use crate::logs::Logs;
+use crate::logs::archive::Wanted;
 
 /// Questions answered at the same time; a lifecycle transition may take seconds and should not hold up a list.
 const AT_A_TIME: usize = 8;
@@ -19,6 +23,8 @@ const AT_A_TIME: usize = 8;
 pub struct Answers {
     /// The robot.
     pub robot_id: RobotId,
+    /// What its tasks said.
+    pub logs: Logs,
 }
 
 /// A refusal with `code` and `text`.
@@ -70,8 +76,22 @@ impl Answers {
 
     async fn answer(&self, ask: Ask) -> Result<Answer, Refusal> {
         match ask {
+            Ask::Logs { task, level, since_ms, max_lines } => {
+                self.kept_lines(Wanted { task, level, since_ms, max_lines }).await
+            }
+            Ask::Follow { level, lease_ms } => {
+                self.logs.follow(level, Duration::from_millis(lease_ms));
+                Ok(Answer::Following)
+            }
             Ask::Unknown => Err(refusal("unsupported", "this agent does not know the question; it may be too old")),
             _ => Err(refusal("no_ros", "this robot has no ROS graph to look at")),
         }
+    }
+
+    async fn kept_lines(&self, wanted: Wanted) -> Result<Answer, Refusal> {
+        let lines = self.logs.kept(wanted).await;
+        let lines = lines.map_err(|error| refusal("no_such_task", error.to_string()))?;
+        let robot_id = self.robot_id.clone();
+        Ok(Answer::Logs(LogBatch { robot_id, now_ms: clock::wall_ms(), lines, suppressed: 0 }))
     }
 }

@@ -9,9 +9,11 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 use task_proto::RobotName;
 use task_proto::id::Labels;
+use task_proto::log::LogLevel;
 use toml::{Table, Value};
 
 use crate::durable;
+use crate::logs::forwarder::ForwardSettings;
 
 /// The file's name.
 pub const FILE_NAME: &str = "agent.toml";
@@ -59,6 +61,9 @@ pub struct Settings {
     /// Who is asked before a task is started, stopped or switched.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gate: Option<GateSettings>,
+    /// Which log lines go to the server by themselves.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub logs: Option<LogSettings>,
 }
 
 /// The `[gate]` table.
@@ -85,6 +90,18 @@ pub enum GateDefault {
     /// As if it had said not now.
     #[default]
     Deny,
+}
+
+/// The `[logs]` table.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LogSettings {
+    /// The least serious lines that go to the server while nobody follows; all are kept here.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub forward_level: Option<LogLevel>,
+    /// How many of them a second, for each task.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub forward_lines_per_s: Option<u32>,
 }
 
 /// The `[limits]` table.
@@ -148,6 +165,8 @@ pub struct Config {
     pub token_lifetime: Duration,
     /// What tasks may use.
     pub limits: LimitSettings,
+    /// Which log lines go to the server by themselves.
+    pub forward: ForwardSettings,
     /// Versions that are prepared at the same time.
     pub parallel_tasks: usize,
     /// Who is asked before a task is started, stopped or switched; nobody unless a program is named.
@@ -215,6 +234,11 @@ impl Config {
 
     fn from_settings(settings: Settings) -> Result<Self, ConfigError> {
         let limits = settings.limits.unwrap_or_default();
+        let logs = settings.logs.unwrap_or_default();
+        let forward = ForwardSettings {
+            level: logs.forward_level.unwrap_or(LogLevel::Warn),
+            lines_per_s: logs.forward_lines_per_s.unwrap_or(10),
+        };
         let config = Self {
             server: settings.server.as_deref().map(parse_server).transpose()?,
             mqtt: settings.mqtt.unwrap_or(true),
@@ -228,6 +252,7 @@ impl Config {
             parallel_tasks: limits.parallel_tasks.unwrap_or(2),
             limits,
             gate: settings.gate.map(gate).transpose()?,
+            forward,
         };
         let bounds = [
             ("ros_domain_id", u64::from(config.ros_domain_id.unwrap_or(0)), 0, 232),
@@ -236,6 +261,7 @@ impl Config {
             ("token_lifetime_s", config.token_lifetime.as_secs(), 3600, 3650 * 86_400),
             ("limits.parallel_tasks", config.parallel_tasks as u64, 1, 64),
             ("gate.timeout_s", config.gate.as_ref().map_or(1, |gate| gate.timeout.as_secs()), 1, MAX_GATE_TIMEOUT_S),
+            ("logs.forward_lines_per_s", u64::from(config.forward.lines_per_s), 0, 1000),
             ("limits.build_timeout_s", config.limits.build_timeout_s.unwrap_or(60), 1, 86_400),
         ];
         for (key, value, least, most) in bounds {
@@ -288,7 +314,7 @@ fn override_by(table: &mut Table, name: &str, text: &str) -> Result<(), ConfigEr
         _ => scalar(text),
     };
     let nested =
-        ["limits", "gate"].iter().find_map(|outer| Some((*outer, key.strip_prefix(outer)?.strip_prefix('_')?)));
+        ["limits", "logs", "gate"].iter().find_map(|outer| Some((*outer, key.strip_prefix(outer)?.strip_prefix('_')?)));
     match nested {
         Some((outer, inner)) => {
             if let Value::Table(table) = table.entry(outer).or_insert_with(|| Value::Table(Table::new())) {
@@ -346,12 +372,14 @@ mod tests {
             ("TASK_AGENT_UNDERLAYS", "/opt/ros/jazzy/setup.bash:/ws/install/setup.bash"),
             ("TASK_AGENT_LABELS", "site=lab,base=turtlebot"),
             ("TASK_AGENT_LIMITS_LOG_BYTES", "7"),
+            ("TASK_AGENT_LOGS_FORWARD_LEVEL", "error"),
             ("TASK_AGENT_DATA", "/elsewhere"),
             ("PATH", "/bin"),
         ];
         let config = load(file, &variables).expect("valid");
         assert_eq!((config.mqtt, config.ros_domain_id), (false, Some(3)));
         assert_eq!((config.limits.log_bytes, config.limits.build_timeout_s), (Some(7), Some(9)));
+        assert_eq!(config.forward, ForwardSettings { level: LogLevel::Error, lines_per_s: 10 });
         assert_eq!(config.underlays.len(), 2);
         assert_eq!(config.labels.expect("given").len(), 2);
         assert_eq!(config.poll_interval, Duration::from_secs(300));
@@ -367,6 +395,8 @@ mod tests {
         assert!(text("server = \"ftp://x\"\n", &[]).contains("server"));
         assert!(text("ros_domain_id = 400\n", &[]).contains("ros_domain_id"));
         assert!(text("poll_interval_s = 0\n", &[]).contains("poll_interval_s"));
+        assert!(text("[logs]\nforward_level = \"loud\"\n", &[]).contains("forward_level"));
+        assert!(text("", &[("TASK_AGENT_LOGS_FORWARD_LINES_PER_S", "100000")]).contains("logs.forward_lines_per_s"));
     }
 
     #[test]

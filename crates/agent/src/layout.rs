@@ -6,9 +6,10 @@
 //! blobs/sha256/<hex>.part           bytes of a package's content that have arrived so far
 //! staging/                          trees being unpacked; emptied at every start
 //! survey/                           what was last asked about the ROS installations
+//! logs/                             what nodes say that are of no task
 //! tasks/<name>/current              link to the active version
 //! tasks/<name>/run/                 the shim's files: pid, exit status
-//! tasks/<name>/logs/                the task's and the build's output
+//! tasks/<name>/logs/                the task's and the build's output, and what its nodes say on ROS topics
 //! tasks/<name>/<hex>/               one version, by the digest of its OCI manifest
 //!   task.json                       the task manifest, byte for byte as it was pulled
 //!   src/  build/  install/  run.sh
@@ -77,6 +78,11 @@ impl DataDir {
         self.root.join("staging")
     }
 
+    /// What nodes say on ROS topics that are of no task.
+    pub fn ros_log(&self) -> PathBuf {
+        self.root.join("logs").join("ros.log")
+    }
+
     /// One task's directory.
     pub fn task(&self, name: &TaskName) -> TaskDir {
         TaskDir { root: self.tasks().join(name.as_str()) }
@@ -130,9 +136,24 @@ impl TaskDir {
         self.root.join("run")
     }
 
-    /// The task's and the build's output.
+    /// Where all its logs are.
     pub fn logs(&self) -> PathBuf {
         self.root.join("logs")
+    }
+
+    /// The task's output.
+    pub fn output_log(&self) -> PathBuf {
+        self.logs().join("task.log")
+    }
+
+    /// What its nodes say on ROS topics.
+    pub fn ros_log(&self) -> PathBuf {
+        self.logs().join("ros.log")
+    }
+
+    /// The output of its last build.
+    pub fn build_log(&self) -> PathBuf {
+        self.logs().join("build.log")
     }
 
     /// The version whose package has this manifest digest.

@@ -76,6 +76,8 @@ pub struct Talk {
     pub requests: mpsc::Sender<Request>,
     /// What is to be published.
     pub messages: mpsc::Receiver<Message>,
+    /// Log lines to be published, a batch at a time: the next is taken when the one before has arrived.
+    pub lines: mpsc::Receiver<Vec<u8>>,
 }
 
 /// Something a robot says that is neither report nor status.

@@ -2,20 +2,98 @@
 //! as it came, behind the time and a letter for where it came from (see [`record`]); what its level is and which node said
 //! it is found out on reading, where control characters end as well.
 
+pub mod archive;
 pub mod capture;
 pub mod console;
+pub mod forwarder;
+pub mod line;
 pub mod record;
 pub mod rotated;
+pub mod tail;
 
 pub use rotated::RotatedLog;
 
 use std::fs::File;
 use std::io::{self, Read as _, Seek as _, SeekFrom};
 use std::path::Path;
+use std::time::{Duration, Instant};
 
-use task_proto::log::LogSource;
+use task_proto::TaskName;
+use task_proto::log::{LogLevel, LogLine, LogSource};
+use tokio::sync::watch;
 
+use crate::clock;
+use crate::layout::DataDir;
+use archive::Wanted;
+use line::LogFile;
 use record::Record;
+
+/// The longest that lines are published for one question; who still follows asks again.
+const MAX_LEASE: Duration = Duration::from_secs(120);
+
+/// What is asked of a robot's logs.
+#[derive(Debug, Clone)]
+pub struct Logs {
+    data: DataDir,
+    following: watch::Sender<Option<Following>>,
+}
+
+/// Somebody follows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Following {
+    /// Only these lines and more serious ones.
+    pub level: LogLevel,
+    /// Until then.
+    pub until: Instant,
+}
+
+/// The task has left nothing here, or was never here.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("there is no task {0} on this robot")]
+pub struct NoSuchTask(pub TaskName);
+
+impl Logs {
+    /// The logs in `data`.
+    pub fn new(data: DataDir) -> Self {
+        Self { data, following: watch::Sender::new(None) }
+    }
+
+    /// The newest lines that are wanted and fit into an answer, the oldest first.
+    pub async fn kept(&self, wanted: Wanted) -> Result<Vec<LogLine>, NoSuchTask> {
+        if let Some(task) = wanted.task.as_ref().filter(|task| !self.data.task(task).root().exists()) {
+            return Err(NoSuchTask(task.clone()));
+        }
+        let data = self.data.clone();
+        let read = move || archive::newest(&files(&data), &wanted, clock::wall_ms());
+        Ok(tokio::task::spawn_blocking(read).await.unwrap_or_default())
+    }
+
+    /// Has lines of `level` and above published for `lease`.
+    pub fn follow(&self, level: LogLevel, lease: Duration) {
+        self.following.send_replace(Some(Following { level, until: Instant::now() + lease.min(MAX_LEASE) }));
+    }
+
+    /// Whether somebody follows.
+    pub fn following(&self) -> watch::Receiver<Option<Following>> {
+        self.following.subscribe()
+    }
+}
+
+/// Every log there may be.
+fn files(data: &DataDir) -> Vec<LogFile> {
+    let none_of_ours = LogFile { path: data.ros_log(), task: None, unmarked: LogSource::Rosout };
+    let mut files = vec![none_of_ours];
+    for name in data.task_names().unwrap_or_default() {
+        let task = data.task(&name);
+        let logs = [
+            (task.output_log(), LogSource::Stdout),
+            (task.ros_log(), LogSource::Rosout),
+            (task.build_log(), LogSource::Build),
+        ];
+        files.extend(logs.map(|(path, unmarked)| LogFile { path, task: Some(name.clone()), unmarked }));
+    }
+    files
+}
 
 /// The last lines of the last run in the log at `path`, from its last `max_bytes`, without times; empty when there is no
 /// log.

@@ -98,10 +98,11 @@ enum Published {
     Status,
     Report { seq: u64 },
     Message,
+    Lines,
 }
 
 async fn session(access: &MqttAccess, shared: &Shared, heard: &mpsc::Sender<Heard>, talk: &mut Talk) -> Ended {
-    let Talk { requests, messages } = talk;
+    let Talk { requests, messages, lines } = talk;
     let (client, mut event_loop) = AsyncClient::new(options(access), QUEUED_REQUESTS);
     event_loop.network_options.set_connection_timeout(CONNECT_TIMEOUT_S);
     let (events_in, mut events) = mpsc::channel(QUEUED_REQUESTS);
@@ -134,8 +135,12 @@ async fn session(access: &MqttAccess, shared: &Shared, heard: &mpsc::Sender<Hear
             // Cancel-safe: a watch remembers that it changed.
             Ok(()) = reports.changed() => session.publish_report(),
             // Cancel-safe: a message stays in the channel until it is received.
-            Some(Message { topic, payload }) = messages.recv(), if session.up => {
+            Some(Message { topic, payload }) = messages.recv(), if session.has_room() => {
                 session.publish(topic, payload, Published::Message);
+            }
+            // Cancel-safe, likewise.
+            Some(payload) = lines.recv(), if session.has_room() && !session.is_under_way(|it| *it == Published::Lines) => {
+                session.publish(RobotTopic::Log, payload, Published::Lines);
             }
             // Cancel-safe: a token can be awaited again.
             () = shared.shutdown.cancelled() => {
@@ -228,10 +233,18 @@ impl Session<'_> {
         }
     }
 
+    /// Whether something may be published without taking a report's place.
+    fn has_room(&self) -> bool {
+        self.up && self.unsent.len() < QUEUED_REQUESTS / 2
+    }
+
+    fn is_under_way(&self, kind: impl Fn(&Published) -> bool) -> bool {
+        self.unsent.iter().any(&kind) || self.sent.iter().any(|(_, published)| kind(published))
+    }
+
     /// Publishes the newest report, unless one is under way: its acknowledgement calls this again.
     fn publish_report(&mut self) {
-        let is_report = |published: &Published| matches!(published, Published::Report { .. });
-        let busy = self.unsent.iter().any(is_report) || self.sent.iter().any(|(_, published)| is_report(published));
+        let busy = self.is_under_way(|published| matches!(published, Published::Report { .. }));
         let Some(report) = self.shared.reports.borrow().clone() else { return };
         if !self.up || busy || report.seq <= *self.shared.confirmed.borrow() {
             return;

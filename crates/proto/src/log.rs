@@ -8,10 +8,12 @@ use serde::{Deserialize, Serialize};
 use crate::id::{GraphName, InvalidId};
 use crate::{RobotId, TaskName};
 
-/// The most lines in one batch.
+/// The most lines in one published batch.
 pub const MAX_BATCH_LINES: usize = 500;
 /// The longest text of a line, in bytes; a longer one is cut and ends in `…`.
 pub const MAX_LINE_BYTES: usize = 4096;
+/// The most lines of an answer to [`crate::request::Ask::Logs`].
+pub const MAX_KEPT_LINES: usize = 5000;
 /// The largest batch, in bytes of JSON.
 pub const MAX_BATCH_BYTES: usize = 200 * 1024;
 

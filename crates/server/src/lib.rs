@@ -20,6 +20,7 @@ pub mod package;
 pub mod presence;
 pub mod report_writer;
 pub mod requests;
+pub mod robot_logs;
 pub mod rollout;
 pub mod serve;
 pub mod store;

@@ -27,6 +27,7 @@ use crate::http::{App, listener};
 use crate::presence::Presence;
 use crate::report_writer::ReportWriter;
 use crate::requests::Requests;
+use crate::robot_logs::RobotLogs;
 use crate::store::{Store, StoreError, sqlite_url};
 use crate::uplink::Uplink;
 
@@ -98,8 +99,9 @@ impl Server {
         let presence = Arc::new(Presence::new(milliseconds(config.presence_timeout)));
         let actions = Actions::new(store.clone(), clock.clone(), changes.clone(), key, action_settings(&config));
         let (writer, reports) = ReportWriter::start(store.clone(), clock.clone(), changes.clone());
-        let requests = Requests::default();
-        let uplink = Uplink::new(writer.clone(), requests.clone(), presence.clone(), changes.clone(), clock.clone());
+        let (requests, logs) = (Requests::default(), RobotLogs::new());
+        let (heard, said) = (requests.clone(), logs.clone());
+        let uplink = Uplink::new(writer.clone(), heard, said, presence.clone(), changes.clone(), clock.clone());
         let gatekeeper = StoreGatekeeper { store: store.clone(), clock: clock.clone() };
         let broker = Broker::start(broker_config(&config), Arc::new(gatekeeper), Arc::new(uplink)).await?;
 
@@ -113,6 +115,7 @@ impl Server {
             presence,
             broker: broker.clone(),
             requests,
+            logs,
             blobs,
             sessions: Arc::default(),
             attempts: Arc::default(),

@@ -1,5 +1,5 @@
-//! What robots say over MQTT: reports go to the writer, replies to whoever asked, connections to presence. The broker has proven who speaks; what
-//! is said is checked here. It never answers by itself: robots that are behind are put on the list of those to ring.
+//! What robots say over MQTT: reports go to the writer, replies to whoever asked, log lines to memory, connections to
+//! presence. The broker has proven who speaks; what is said is checked here. It never answers by itself: robots that are behind are put on the list of those to ring.
 
 use std::collections::HashMap;
 use std::net::SocketAddr;
@@ -9,6 +9,7 @@ use futures_util::FutureExt as _;
 use futures_util::future::BoxFuture;
 use serde::de::DeserializeOwned;
 use task_proto::RobotId;
+use task_proto::log::{LogBatch, MAX_BATCH_BYTES};
 use task_proto::report::{Report, Status};
 use task_proto::request::{MAX_REPLY_BYTES, Reply};
 use task_proto::topic::RobotTopic;
@@ -19,6 +20,7 @@ use crate::clock::Clock;
 use crate::presence::Presence;
 use crate::report_writer::{ReportError, ReportWriter};
 use crate::requests::Requests;
+use crate::robot_logs::RobotLogs;
 
 /// The largest report and status that are read.
 const MAX_REPORT_BYTES: usize = 1024 * 1024;
@@ -30,6 +32,7 @@ const RING_AGAIN_MS: u64 = 5_000;
 pub struct Uplink {
     reports: ReportWriter,
     requests: Requests,
+    logs: RobotLogs,
     presence: Arc<Presence>,
     changes: Changes,
     clock: Clock,
@@ -42,11 +45,12 @@ impl Uplink {
     pub fn new(
         reports: ReportWriter,
         requests: Requests,
+        logs: RobotLogs,
         presence: Arc<Presence>,
         changes: Changes,
         clock: Clock,
     ) -> Self {
-        Self { reports, requests, presence, changes, clock, reminded_ms: Mutex::default() }
+        Self { reports, requests, logs, presence, changes, clock, reminded_ms: Mutex::default() }
     }
 
     async fn take_report(&self, message: &RobotMessage) -> Result<(), NotStored> {
@@ -81,6 +85,21 @@ impl Uplink {
         }
     }
 
+    fn take_lines(&self, message: &RobotMessage) {
+        let now_ms = self.clock.now_ms();
+        if !self.logs.admits(&message.robot, message.payload.len(), now_ms) {
+            tracing::debug!(robot = %message.robot, "it publishes more lines than a robot may; they are dropped");
+            return;
+        }
+        match parsed::<LogBatch>(message, MAX_BATCH_BYTES) {
+            Some(batch) if batch.robot_id == message.robot => self.logs.take(batch, now_ms),
+            Some(batch) => {
+                tracing::warn!(robot = %message.robot, claimed = %batch.robot_id, "lines in another robot's name are dropped");
+            }
+            None => {}
+        }
+    }
+
     fn saw_instance(&self, message: &RobotMessage, instance: &task_proto::InstanceId) {
         let now_ms = self.clock.now_ms();
         let was_duplicate = self.presence.is_duplicate(&message.robot, now_ms);
@@ -111,6 +130,7 @@ impl Inbox for Uplink {
                         self.requests.replied(&message.robot, reply);
                     }
                 }
+                RobotTopic::Log => self.take_lines(&message),
                 _ => {}
             }
             Ok(())
@@ -122,6 +142,7 @@ impl Inbox for Uplink {
         self.presence.connected(robot, peer, connection, self.clock.now_ms());
         self.changes.announce(Change::Robot(robot.clone()));
         self.changes.ring([robot.clone()]);
+        self.logs.connected(robot);
     }
 
     fn disconnected(&self, robot: &RobotId, connection: u64) {

@@ -23,7 +23,9 @@ use crate::fetch::{FetchSettings, Fetcher};
 use crate::identity::Identity;
 use crate::layout::DataDir as Layout;
 use crate::ledger::{Found, Ledger};
-use crate::link::{self, Intervals, Shared, Talk};
+use crate::link::{self, Heard, Intervals, Shared, Talk};
+use crate::logs::Logs;
+use crate::logs::forwarder::Forwarder;
 use crate::mqtt::{self, MqttAccess};
 use crate::rotation::Rotation;
 use crate::server::{self, Server};
@@ -101,17 +103,26 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
         let host = identity.mqtt.host.clone().or_else(|| base.host_str().map(str::to_owned)).unwrap_or_default();
         let (port, prefix) = (identity.mqtt.port, identity.mqtt.prefix.clone());
         let access = MqttAccess { host, port, prefix, robot: identity.robot_id, token: credential, status };
-        let answers = Answers { robot_id: access.robot.clone() };
-        let (requests, asked) = mpsc::channel(QUEUED_QUESTIONS);
-        let (messages, said) = mpsc::channel(QUEUED_MESSAGES);
-        tokio::spawn(answers.run(asked, messages));
-        tokio::spawn(mqtt::run(access, shared, heard, Talk { requests, messages: said }));
+        converse(access, shared, heard, data, &config);
     }
     let stop = tokio::spawn(cancel_on_signal(shutdown));
     driver.run(messages).await;
     stop.abort();
     tracing::info!("task-agent ends; its tasks go on running");
     Ok(())
+}
+
+/// Keeps a session up, answers what is asked in it and publishes what tasks say.
+fn converse(access: MqttAccess, shared: Shared, heard: mpsc::Sender<Heard>, data: Layout, config: &Config) {
+    let robot_id = access.robot.clone();
+    let logs = Logs::new(data.clone());
+    let forwarder = Forwarder::new(robot_id.clone(), data, config.forward, logs.following());
+    let (requests, asked) = mpsc::channel(QUEUED_QUESTIONS);
+    let (messages, said) = mpsc::channel(QUEUED_MESSAGES);
+    let (batches, lines) = mpsc::channel(1);
+    tokio::spawn(Answers { robot_id, logs }.run(asked, messages));
+    tokio::spawn(forwarder.run(shared.mqtt_up.subscribe(), batches));
+    tokio::spawn(mqtt::run(access, shared, heard, Talk { requests, messages: said, lines }));
 }
 
 fn start_logging() {

@@ -97,7 +97,7 @@ impl Robot {
     }
 
     fn log(&self, task: &TaskName) -> LogSpec {
-        let mut log = LogSpec::at(self.data.task(task).logs().join("task.log"));
+        let mut log = LogSpec::at(self.data.task(task).output_log());
         log.max_bytes = self.log_bytes.unwrap_or(log.max_bytes);
         log
     }
@@ -263,7 +263,7 @@ impl Effects for Robot {
             tool: manifest.build.tool,
             underlays: self.setup_files(&manifest)?,
             environment: self.environment.clone(),
-            log: self.data.task(&package.name).logs().join("build.log"),
+            log: self.data.task(&package.name).build_log(),
             limits: self.build_limits,
             version: version.clone(),
         };

@@ -65,14 +65,15 @@ impl<'a> Record<'a> {
     /// How serious it is: what it says itself, else what its source stands for. `unmarked` is the source of a line that
     /// names none.
     pub fn level(&self, unmarked: LogSource) -> LogLevel {
-        let by_source = match self.source.unwrap_or(unmarked) {
-            LogSource::Stderr => LogLevel::Warn,
-            _ => LogLevel::Info,
-        };
         // Most lines have no bracket near their beginning, and this is asked of each.
         let may_say = self.text.iter().take(64).any(|byte| *byte == b'[');
         let said = may_say.then(|| console::parse(&console::printable(self.text)).map(|said| said.level)).flatten();
-        said.unwrap_or(by_source)
+        said.unwrap_or_else(|| Self::level_of_source(self.source.unwrap_or(unmarked)))
+    }
+
+    /// How serious a line is that does not say it itself.
+    pub fn level_of_source(source: LogSource) -> LogLevel {
+        if source == LogSource::Stderr { LogLevel::Warn } else { LogLevel::Info }
     }
 }
 

@@ -4,7 +4,7 @@
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
 use std::os::unix::fs::OpenOptionsExt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use task_proto::log::LogSource;
 use task_proto::time::timestamp;
@@ -103,22 +103,23 @@ impl RotatedLog {
     fn rotate(&mut self) -> io::Result<()> {
         self.current = None;
         for age in (0..self.spec.files.saturating_sub(1)).rev() {
-            match std::fs::rename(self.aged(age), self.aged(age + 1)) {
+            match std::fs::rename(aged(&self.spec.path, age), aged(&self.spec.path, age + 1)) {
                 Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
                 _ => {}
             }
         }
         if self.spec.files <= 1 { std::fs::remove_file(&self.spec.path) } else { Ok(()) }
     }
+}
 
-    fn aged(&self, age: u32) -> PathBuf {
-        if age == 0 {
-            return self.spec.path.clone();
-        }
-        let mut name = self.spec.path.as_os_str().to_owned();
-        name.push(format!(".{age}"));
-        PathBuf::from(name)
+/// The file that a log at `path` was `age` rotations ago.
+pub fn aged(path: &Path, age: u32) -> PathBuf {
+    if age == 0 {
+        return path.to_owned();
     }
+    let mut name = path.as_os_str().to_owned();
+    name.push(format!(".{age}"));
+    PathBuf::from(name)
 }
 
 #[cfg(test)]
@@ -136,8 +137,8 @@ mod tests {
         let mut log = RotatedLog::new(LogSpec { path: path.clone(), max_bytes: 10, files: 3 });
         log.write(b"one\ntwo\nthree\nfour\nfive\nsix\n");
         assert_eq!(read(path.clone()), "six\n");
-        assert_eq!(read(log.aged(1)), "four\nfive\n");
-        assert_eq!(read(log.aged(2)), "three\n");
+        assert_eq!(read(aged(&path, 1)), "four\nfive\n");
+        assert_eq!(read(aged(&path, 2)), "three\n");
         assert_eq!(std::fs::read_dir(temp.path()).expect("list").count(), 3);
     }
 

@@ -71,12 +71,12 @@ pub trait Gatekeeper: Send + Sync + 'static {
     fn admit(&self, login: Login) -> BoxFuture<'_, Result<Principal, Refusal>>;
 }
 
-/// A message from a robot on its `report`, `status` or `reply` topic.
+/// A message from a robot on its `report`, `status`, `reply` or `log` topic.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RobotMessage {
     /// Who sent it; proven by the connection.
     pub robot: RobotId,
-    /// Which of the three topics.
+    /// Which of these topics.
     pub topic: RobotTopic,
     /// The bytes, unread.
     pub payload: Bytes,

@@ -143,6 +143,26 @@ impl Client {
         self.answer(|| self.request(Method::GET, &format!("{BASE}{path}")).query(query)).await
     }
 
+    /// Likewise, with a query of this type.
+    pub(crate) async fn get_by<Q: Serialize, T: DeserializeOwned>(
+        &self,
+        path: &str,
+        query: &Q,
+    ) -> Result<T, ClientError> {
+        self.answer(|| self.request(Method::GET, &format!("{BASE}{path}")).query(query)).await
+    }
+
+    /// Opens a stream, tried once. It may go on for as long as it likes.
+    pub(crate) async fn stream<Q: Serialize>(&self, path: &str, query: &Q) -> Result<Response, ClientError> {
+        const FOR_EVER: Duration = Duration::from_secs(10 * 365 * 24 * 60 * 60);
+        let request = self.request(Method::GET, &format!("{BASE}{path}")).query(query).timeout(FOR_EVER);
+        let response = request.send().await.map_err(|source| self.unreachable(source))?;
+        match response.status().is_success() {
+            true => Ok(response),
+            false => Err(self.refusal(response).await),
+        }
+    }
+
     /// Deletes; the answer's body does not matter.
     pub(crate) async fn delete(&self, path: &str) -> Result<(), ClientError> {
         let path = format!("{BASE}{path}");

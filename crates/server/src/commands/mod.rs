@@ -15,6 +15,7 @@ mod client;
 mod confirm;
 mod deploy;
 mod enroll_token;
+mod logs;
 mod output;
 mod outputs;
 mod progress;
@@ -22,6 +23,8 @@ mod push;
 mod robot;
 mod ros;
 mod server;
+mod shown;
+mod sse;
 mod task;
 mod upload;
 mod view;
@@ -70,6 +73,8 @@ pub enum Command {
         #[command(subcommand)]
         action: outputs::Action,
     },
+    /// Show what a robot's tasks and their nodes said, or follow it
+    Logs(logs::LogsOrder),
     /// Look at the nodes on a robot's ROS graph
     Node {
         /// What to do.
@@ -200,6 +205,7 @@ async fn dispatch(connection: &Connection, command: Command) -> Result<Outcome, 
         Command::Stop(order) => task::run(&connection.open()?, task::Verb::Stop, order).await,
         Command::Remove(order) => task::remove(&connection.open()?, order).await,
         Command::Output { action } => outputs::run(&connection.open()?, action).await,
+        Command::Logs(order) => logs::run(&connection.open()?, order).await,
         Command::Node { action } => ros::node(&connection.open()?, action).await,
         Command::Topic { action } => ros::topic(&connection.open()?, action).await,
         Command::Param { action } => ros::param(&connection.open()?, action).await,

@@ -27,6 +27,11 @@ impl Output {
         Self { format }
     }
 
+    /// How results are printed.
+    pub(crate) fn format(&self) -> Format {
+        self.format
+    }
+
     /// Prints `value`: as JSON, or as the table that `rows` makes of it.
     pub(crate) fn result<T: Serialize>(
         &self,
@@ -56,17 +61,29 @@ impl Output {
 }
 
 fn json<T: Serialize>(value: &T) -> Result<String, CommandError> {
-    serde_json::to_string_pretty(value)
-        .map_err(|error| CommandError::Io { what: "can't print the result".to_owned(), source: error.into() })
+    serde_json::to_string_pretty(value).map_err(unprintable)
+}
+
+fn unprintable(error: serde_json::Error) -> CommandError {
+    CommandError::Io { what: "can't print the result".to_owned(), source: error.into() }
+}
+
+/// One of many values, on one line.
+pub(crate) fn json_line<T: Serialize>(value: &T) -> Result<String, CommandError> {
+    serde_json::to_string(value).map_err(unprintable)
 }
 
 fn print(text: &str) -> Result<(), CommandError> {
+    stream_text(&format!("{}\n", text.trim_end())).map(drop)
+}
+
+/// Prints a part of what goes on; false when nobody reads it any more.
+pub(crate) fn stream_text(text: &str) -> Result<bool, CommandError> {
     let mut stdout = io::stdout().lock();
-    match writeln!(stdout, "{}", text.trim_end()).and_then(|()| stdout.flush()) {
-        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => {
-            Err(CommandError::Io { what: "can't write to stdout".to_owned(), source: error })
-        }
-        _ => Ok(()),
+    match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
+        Ok(()) => Ok(true),
+        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(false),
+        Err(error) => Err(CommandError::Io { what: "can't write to stdout".to_owned(), source: error }),
     }
 }
 

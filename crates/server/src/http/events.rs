@@ -12,7 +12,7 @@ use futures_util::{Stream, StreamExt as _};
 use http::{HeaderMap, header};
 use task_proto::RobotId;
 use task_proto::api::Event;
-use tokio::sync::{Semaphore, broadcast};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, broadcast};
 use tokio_stream::wrappers::BroadcastStream;
 use tokio_util::sync::CancellationToken;
 
@@ -60,6 +60,12 @@ impl EventFeed {
     /// A feed without listeners; [`EventFeed::run`] fills it.
     pub fn new() -> Self {
         Self { lines: broadcast::Sender::new(BACKLOG), places: Arc::new(Semaphore::new(MOST_LISTENERS)) }
+    }
+
+    /// A place among the listeners, for as long as it is held.
+    pub(super) fn place(&self) -> Result<OwnedSemaphorePermit, ApiError> {
+        let place = self.places.clone().try_acquire_owned();
+        place.map_err(|_| ApiError::unavailable("too many pages listen to events already"))
     }
 
     /// Turns notices into events until `stop`.
@@ -153,8 +159,7 @@ pub(super) async fn stream(
     State(app): State<App>,
     headers: HeaderMap,
 ) -> Result<Sse<impl Stream<Item = Result<SentEvent, Infallible>>>, ApiError> {
-    let place = app.events.places.clone().try_acquire_owned();
-    let place = place.map_err(|_| ApiError::unavailable("too many pages listen to events already"))?;
+    let place = app.events.place()?;
     let lines = BroadcastStream::new(app.events.lines.subscribe());
     let events = lines.map(move |line| {
         // The place is free again when the stream is dropped.
@@ -172,7 +177,7 @@ pub(super) async fn stream(
 }
 
 /// Resolves when whoever sent these headers may listen no longer. A session may have ended since the guard looked.
-fn end_of_stream(app: &App, headers: &HeaderMap) -> Result<impl Future<Output = ()> + use<>, ApiError> {
+pub(super) fn end_of_stream(app: &App, headers: &HeaderMap) -> Result<impl Future<Output = ()> + use<>, ApiError> {
     let now_ms = app.clock.now_ms();
     let (ended, left) = if headers.contains_key(header::AUTHORIZATION) {
         (CancellationToken::new(), Duration::MAX)

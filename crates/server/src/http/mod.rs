@@ -12,6 +12,7 @@ pub mod events;
 pub mod extract;
 mod health;
 pub mod listener;
+mod logs;
 pub mod oci;
 mod outputs;
 mod packages;
@@ -43,6 +44,7 @@ use crate::clock::Clock;
 use crate::presence::Presence;
 use crate::report_writer::ReportWriter;
 use crate::requests::Requests;
+use crate::robot_logs::RobotLogs;
 use crate::store::Store;
 use crate::web;
 use auth::{Access, Gate, guard};
@@ -67,6 +69,8 @@ pub struct App {
     pub broker: Broker,
     /// Questions to robots that are under way.
     pub requests: Requests,
+    /// What robots said last, and who follows them.
+    pub logs: RobotLogs,
     /// The packages' bytes.
     pub blobs: Blobs,
     /// Who is signed in at the page.
@@ -167,6 +171,7 @@ pub fn routes() -> Vec<Route> {
         Route::new(post.clone(), "/api/v1/robots/{robot}/report", OwnRobot, robots::report)
             .body_bytes(REPORT_BODY_BYTES),
         Route::new(post.clone(), "/api/v1/robots/{robot}/ask", Operator, ask::ask),
+        Route::new(get.clone(), "/api/v1/robots/{robot}/logs", Operator, logs::show).streaming(),
         Route::new(get.clone(), "/api/v1/packages", Operator, packages::list),
         Route::new(get.clone(), "/api/v1/outputs", Operator, outputs::list),
         Route::new(get.clone(), "/api/v1/deployments", Operator, deployments::list),

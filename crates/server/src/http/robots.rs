@@ -71,6 +71,7 @@ pub(super) async fn remove(
 ) -> Result<StatusCode, ApiError> {
     let id = find(&app, &robot).await?;
     app.actions.remove_robot(&id).await?;
+    app.logs.forget(&id);
     app.broker.disconnect(&id);
     app.presence.forget(&id);
     Ok(StatusCode::NO_CONTENT)

@@ -20,7 +20,7 @@ pub(super) enum Visitor {
 /// Where a message that may be published goes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Route {
-    /// To the inbox, to be stored before it is acknowledged, and then to whoever listens.
+    /// To the inbox before it is acknowledged, and then to whoever listens.
     Inbox(RobotTopic),
     /// To whoever listens.
     Listeners,
@@ -49,8 +49,10 @@ pub(super) fn may_publish(visitor: &Visitor, prefix: &TopicPrefix, topic: &str) 
         Visitor::Operator => None,
         Visitor::Robot { robot, .. } => match prefix.parse(topic)? {
             Topic::Robot(owner, last) if owner == *robot => match last {
-                RobotTopic::Report | RobotTopic::Status | RobotTopic::Reply => Some(Route::Inbox(last)),
-                RobotTopic::Telemetry | RobotTopic::Log => Some(Route::Listeners),
+                RobotTopic::Report | RobotTopic::Status | RobotTopic::Reply | RobotTopic::Log => {
+                    Some(Route::Inbox(last))
+                }
+                RobotTopic::Telemetry => Some(Route::Listeners),
                 RobotTopic::Desired | RobotTopic::Request => None,
             },
             Topic::Robot(..) | Topic::Package(_) => None,
@@ -103,7 +105,8 @@ mod tests {
         let prefix = TopicPrefix::default();
         let route = |topic: &str| may_publish(&robot(), &prefix, topic);
         assert_eq!(route("taskd/v1/r/r00000000000000a1/report"), Some(Route::Inbox(RobotTopic::Report)));
-        assert_eq!(route("taskd/v1/r/r00000000000000a1/log"), Some(Route::Listeners));
+        assert_eq!(route("taskd/v1/r/r00000000000000a1/log"), Some(Route::Inbox(RobotTopic::Log)));
+        assert_eq!(route("taskd/v1/r/r00000000000000a1/telemetry"), Some(Route::Listeners));
         for denied in [
             "taskd/v1/r/r00000000000000a1/desired",
             "taskd/v1/r/r00000000000000a1/request",

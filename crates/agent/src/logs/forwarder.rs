@@ -1,0 +1,368 @@
+//! Publishes lines as they come: those that matter, or more while somebody follows, never more than a link bears. What
+//! is too much is counted and stays where it is kept. The files are the queue: nothing waits in memory while the server
+//! can't be reached, and a batch is only made when the link has room for it.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use task_proto::log::{LogBatch, LogLevel, LogLine, MAX_BATCH_LINES};
+use task_proto::{RobotId, TaskName};
+use tokio::sync::{mpsc, watch};
+
+use super::line::{Entry, LogFile, Twins};
+use super::record::Record;
+use super::tail::Tail;
+use super::{Following, files};
+use crate::clock;
+use crate::layout::DataDir;
+
+/// How often the files are looked at.
+const PAUSE: Duration = Duration::from_millis(500);
+/// Likewise while somebody follows.
+const FOLLOWED_PAUSE: Duration = Duration::from_millis(200);
+/// Lines a second and task while somebody follows.
+const FOLLOWED_LINES_PER_S: u32 = 200;
+/// So many seconds' lines may come at once.
+const BURST_S: u32 = 10;
+/// A batch is not much larger: what is behind it on a slow link is a report.
+const BATCH_BYTES: usize = 32 * 1024;
+/// Bytes of all files that are looked through at one go.
+const ROOM_BYTES: usize = 4 * 1024 * 1024;
+/// How much of what was written to a log without a link is published afterwards.
+const MISSED_BYTES: u64 = 64 * 1024;
+/// How often a count is published when no line is.
+const COUNT_INTERVAL: Duration = Duration::from_secs(5);
+
+/// What is published when nobody follows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ForwardSettings {
+    /// Only these and more serious ones.
+    pub level: LogLevel,
+    /// Lines a second and task.
+    pub lines_per_s: u32,
+}
+
+/// Publishes lines until the agent ends.
+pub struct Forwarder {
+    settings: ForwardSettings,
+    following: watch::Receiver<Option<Following>>,
+    gatherer: Gatherer,
+}
+
+impl Forwarder {
+    /// A forwarder of what is added to the logs of `data` from now on.
+    pub fn new(
+        robot_id: RobotId,
+        data: DataDir,
+        settings: ForwardSettings,
+        following: watch::Receiver<Option<Following>>,
+    ) -> Self {
+        let mut gatherer = Gatherer::new(robot_id, data);
+        gatherer.skip(0);
+        Self { settings, following, gatherer }
+    }
+
+    /// Puts batches, as JSON, into `batches` while a session is up and takes them.
+    pub async fn run(mut self, mut mqtt_up: watch::Receiver<bool>, batches: mpsc::Sender<Vec<u8>>) {
+        loop {
+            let was_up = *mqtt_up.borrow();
+            if mqtt_up.wait_for(|up| *up).await.is_err() {
+                return;
+            }
+            let Ok(room) = batches.reserve().await else { return };
+            let wanted = Wanted::new(self.settings, *self.following.borrow_and_update(), Instant::now());
+            let mut gatherer = self.gatherer;
+            let gathered = tokio::task::spawn_blocking(move || {
+                if !was_up {
+                    gatherer.skip(MISSED_BYTES);
+                }
+                let batch = gatherer.gather(&wanted, Instant::now());
+                (gatherer, batch)
+            });
+            let Ok((gatherer, batch)) = gathered.await else { return };
+            self.gatherer = gatherer;
+            match batch.as_ref().map(serde_json::to_vec) {
+                Some(Ok(payload)) => room.send(payload),
+                Some(Err(error)) => tracing::error!(%error, "log lines can't be written as JSON"),
+                None => drop(room),
+            }
+            let pause = if self.gatherer.has_more { Duration::ZERO } else { wanted.pause };
+            tokio::select! {
+                // Cancel-safe: a timer that is made anew each time.
+                () = tokio::time::sleep(pause) => {}
+                // Cancel-safe: a watch remembers that it changed. Without a sender nobody will follow.
+                Ok(()) = self.following.changed() => {}
+            }
+        }
+    }
+}
+
+/// What is published now.
+#[derive(Debug, Clone, Copy)]
+struct Wanted {
+    level: LogLevel,
+    lines_per_s: u32,
+    /// Also lines that are of none of our tasks.
+    others: bool,
+    pause: Duration,
+}
+
+impl Wanted {
+    fn new(settings: ForwardSettings, following: Option<Following>, now: Instant) -> Self {
+        let ForwardSettings { level, lines_per_s } = settings;
+        match following.filter(|following| now < following.until) {
+            None => Self { level, lines_per_s, others: false, pause: PAUSE },
+            Some(following) => Self {
+                level: level.min(following.level),
+                lines_per_s: lines_per_s.max(FOLLOWED_LINES_PER_S),
+                others: true,
+                pause: FOLLOWED_PAUSE,
+            },
+        }
+    }
+}
+
+/// Where each log was read to, and what was left out.
+struct Gatherer {
+    robot_id: RobotId,
+    data: DataDir,
+    tails: BTreeMap<PathBuf, Tail>,
+    budgets: BTreeMap<Option<TaskName>, Budget>,
+    twins: Twins,
+    suppressed: u64,
+    counted_at: Option<Instant>,
+    has_more: bool,
+}
+
+/// Lines a task may still say now.
+#[derive(Debug)]
+struct Budget {
+    lines: f64,
+    at: Instant,
+}
+
+impl Gatherer {
+    fn new(robot_id: RobotId, data: DataDir) -> Self {
+        Self {
+            robot_id,
+            data,
+            tails: BTreeMap::new(),
+            budgets: BTreeMap::new(),
+            twins: Twins::default(),
+            suppressed: 0,
+            counted_at: None,
+            has_more: false,
+        }
+    }
+
+    /// Goes on at most `bytes` before the end of each log.
+    fn skip(&mut self, bytes: u64) {
+        for file in files(&self.data) {
+            self.tails.entry(file.path.clone()).or_default().skip(&file.path, bytes);
+        }
+    }
+
+    /// The next batch, if there is something to say.
+    fn gather(&mut self, wanted: &Wanted, now: Instant) -> Option<LogBatch> {
+        let files = files(&self.data);
+        self.tails.retain(|path, _| files.iter().any(|file| file.path == *path));
+        self.budgets.retain(|task, _| files.iter().any(|file| file.task == *task));
+        let (mut batch, mut room) = (Gathered::default(), ROOM_BYTES);
+        for file in &files {
+            if file.task.is_none() && !wanted.others {
+                self.tails.entry(file.path.clone()).or_default().skip(&file.path, 0);
+            } else if !batch.is_full() {
+                self.read(file, wanted, now, &mut batch, &mut room);
+            }
+        }
+        self.has_more = batch.is_full() || room == 0;
+        let is_due = || self.counted_at.is_none_or(|at| now.duration_since(at) >= COUNT_INTERVAL);
+        if batch.lines.is_empty() && (self.suppressed == 0 || !is_due()) {
+            return None;
+        }
+        self.counted_at = Some(now);
+        batch.lines.sort_by_key(|line| line.at_ms);
+        let suppressed = std::mem::take(&mut self.suppressed);
+        Some(LogBatch { robot_id: self.robot_id.clone(), now_ms: clock::wall_ms(), lines: batch.lines, suppressed })
+    }
+
+    fn read(&mut self, file: &LogFile, wanted: &Wanted, now: Instant, batch: &mut Gathered, room: &mut usize) {
+        let Self { tails, budgets, twins, suppressed, .. } = self;
+        let burst = wanted.lines_per_s.saturating_mul(BURST_S);
+        let budget = budgets.entry(file.task.clone()).or_insert(Budget { lines: f64::from(burst), at: now });
+        budget.refill(wanted.lines_per_s, now);
+        let each = |line: &[u8]| {
+            let record = Record::parse(line);
+            if record.level(file.unmarked) < wanted.level {
+                return true;
+            }
+            if budget.lines < 1.0 {
+                // Whether it is the second of two is not worth finding out.
+                *suppressed += 1;
+                return true;
+            }
+            let Some(entry) = Entry::of(&record, file, clock::wall_ms()) else { return true };
+            if twins.knows(&entry) {
+                return true;
+            }
+            budget.lines -= 1.0;
+            batch.add(entry.line);
+            !batch.is_full()
+        };
+        if let Err(error) = tails.entry(file.path.clone()).or_default().read(&file.path, room, each) {
+            tracing::debug!(path = %file.path.display(), %error, "a log can't be read");
+        }
+    }
+}
+
+impl Budget {
+    fn refill(&mut self, lines_per_s: u32, now: Instant) {
+        let earned = now.duration_since(self.at).as_secs_f64() * f64::from(lines_per_s);
+        self.lines = (self.lines + earned).min(f64::from(lines_per_s.saturating_mul(BURST_S)));
+        self.at = now;
+    }
+}
+
+/// A batch as it grows.
+#[derive(Default)]
+struct Gathered {
+    lines: Vec<LogLine>,
+    bytes: usize,
+}
+
+impl Gathered {
+    fn add(&mut self, line: LogLine) {
+        self.bytes += serde_json::to_vec(&line).map_or(0, |json| json.len() + 1);
+        self.lines.push(line);
+    }
+
+    fn is_full(&self) -> bool {
+        self.lines.len() >= MAX_BATCH_LINES || self.bytes >= BATCH_BYTES
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write as _;
+
+    use task_proto::log::LogSource;
+    use task_proto::time::timestamp;
+
+    use super::*;
+    use crate::logs::record;
+
+    const QUIET: ForwardSettings = ForwardSettings { level: LogLevel::Warn, lines_per_s: 10 };
+
+    struct Bench {
+        _temp: tempfile::TempDir,
+        data: DataDir,
+        gatherer: Gatherer,
+        now: Instant,
+    }
+
+    impl Bench {
+        fn new() -> Self {
+            let temp = tempfile::tempdir().unwrap();
+            let data = DataDir::new(temp.path()).unwrap();
+            let gatherer = Gatherer::new("r00000000000000a1".parse().unwrap(), data.clone());
+            Self { _temp: temp, data, gatherer, now: Instant::now() }
+        }
+
+        fn say(&self, task: &str, source: LogSource, lines: impl IntoIterator<Item = String>) {
+            let task = self.data.task(&task.parse().unwrap());
+            std::fs::create_dir_all(task.logs()).unwrap();
+            let mut log = Vec::new();
+            for line in lines {
+                record::write(&mut log, &timestamp(clock::wall_ms()), source, false, line.as_bytes());
+            }
+            let path = if source == LogSource::Rosout { task.ros_log() } else { task.output_log() };
+            std::fs::OpenOptions::new().append(true).create(true).open(path).unwrap().write_all(&log).unwrap();
+        }
+
+        /// What is published `later` than the last time: the texts, and the number of those left out.
+        fn gather(&mut self, later: Duration, following: Option<LogLevel>) -> (Vec<String>, u64) {
+            self.now += later;
+            let following = following.map(|level| Following { level, until: self.now + Duration::from_secs(1) });
+            let wanted = Wanted::new(QUIET, following, self.now);
+            let batch = self.gatherer.gather(&wanted, self.now);
+            batch.map_or_else(Default::default, |batch| {
+                (batch.lines.into_iter().map(|line| line.text).collect(), batch.suppressed)
+            })
+        }
+    }
+
+    const SECOND: Duration = Duration::from_secs(1);
+
+    #[test]
+    fn what_matters_is_published_and_more_while_somebody_follows() {
+        let mut bench = Bench::new();
+        bench.say("one", LogSource::Stdout, ["info".to_owned()]);
+        bench.say("one", LogSource::Stderr, ["warn".to_owned(), "[DEBUG] [1.0] [n]: debug".to_owned()]);
+        assert_eq!(bench.gather(SECOND, None), (vec!["warn".to_owned()], 0));
+        assert_eq!(bench.gather(SECOND, Some(LogLevel::Debug)), (vec![], 0), "what was passed over is kept, not sent");
+        bench.say("one", LogSource::Stdout, ["more".to_owned()]);
+        assert_eq!(bench.gather(SECOND, Some(LogLevel::Info)), (vec!["more".to_owned()], 0));
+    }
+
+    #[test]
+    fn a_flood_is_counted_and_drowns_no_other_task() {
+        let mut bench = Bench::new();
+        bench.say("loud", LogSource::Stderr, (0..100_000).map(|number| format!("line {number}")));
+        bench.say("quiet", LogSource::Stderr, ["help".to_owned()]);
+        let (mut sent, mut left_out) = (Vec::new(), 0);
+        loop {
+            let (lines, suppressed) = bench.gather(Duration::ZERO, None);
+            sent.extend(lines);
+            left_out += suppressed;
+            if !bench.gatherer.has_more {
+                break;
+            }
+        }
+        assert_eq!(sent.len(), 101, "a burst of one task, and the other's line");
+        assert!(sent.contains(&"help".to_owned()));
+        let (lines, suppressed) = bench.gather(COUNT_INTERVAL, None);
+        assert_eq!((lines, left_out + suppressed), (vec![], 99_900));
+        bench.say("loud", LogSource::Stderr, (0..100).map(|number| format!("later {number}")));
+        let (lines, suppressed) = bench.gather(Duration::ZERO, None);
+        assert_eq!((lines.len(), suppressed), (50, 50), "ten lines for each second that passed");
+    }
+
+    #[test]
+    fn batches_are_small_and_the_rest_comes_in_the_next() {
+        let mut bench = Bench::new();
+        let long = "x".repeat(3000);
+        bench.say("one", LogSource::Stderr, (0..60).map(|number| format!("{number} {long}")));
+        let (first, _) = bench.gather(Duration::ZERO, None);
+        assert!(bench.gatherer.has_more && first.len() < 15, "{}", first.len());
+        let mut all = first;
+        while bench.gatherer.has_more {
+            all.extend(bench.gather(Duration::ZERO, None).0);
+        }
+        assert_eq!(all.len(), 60);
+        assert!(all.iter().enumerate().all(|(number, line)| line.starts_with(&format!("{number} "))));
+    }
+
+    #[test]
+    fn what_a_node_says_on_both_ways_is_published_once() {
+        let mut bench = Bench::new();
+        bench.say("one", LogSource::Stderr, ["[WARN] [1.123456789] [n]: low".to_owned()]);
+        bench.say(
+            "one",
+            LogSource::Rosout,
+            ["[WARN] [1.123] [n]: low".to_owned(), "[WARN] [2.000] [n]: only here".to_owned()],
+        );
+        assert_eq!(bench.gather(SECOND, None), (vec!["low".to_owned(), "only here".to_owned()], 0));
+    }
+
+    #[test]
+    fn after_a_time_without_link_only_the_last_of_it_is_published() {
+        let mut bench = Bench::new();
+        bench.gatherer.skip(0);
+        bench.say("one", LogSource::Stderr, (0..10_000).map(|number| format!("line {number}")));
+        bench.gatherer.skip(MISSED_BYTES);
+        let (lines, suppressed) = bench.gather(Duration::ZERO, None);
+        assert_eq!(lines.len(), 100);
+        assert!((1000..3000).contains(&suppressed), "{suppressed}");
+    }
+}

@@ -1,0 +1,159 @@
+//! What a stored line says: its level, its node, its text. Nodes say most things twice, on `/rosout` and on their
+//! standard error; the second is known by the node's own time. It reads no file.
+
+use std::collections::{HashSet, VecDeque};
+use std::path::PathBuf;
+
+use task_proto::TaskName;
+use task_proto::log::{LogLine, LogSource};
+
+use super::console;
+use super::record::Record;
+
+/// Lines among which the second of two is looked for.
+const TWIN_WINDOW: usize = 4096;
+/// A node's time is believed if the robot's is not further away: it may be a simulated one.
+const MAX_SKEW_MS: u64 = 5 * 60 * 1000;
+
+/// A file of stored lines; older ones of it may be beside it with `.1`, `.2`, … added.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct LogFile {
+    /// The newest.
+    pub path: PathBuf,
+    /// The task it belongs to; `None`: none of ours.
+    pub task: Option<TaskName>,
+    /// Where lines are from that do not say it themselves.
+    pub unmarked: LogSource,
+}
+
+/// A line as it is shown, and what its twin would have.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Entry {
+    /// The line.
+    pub line: LogLine,
+    mark: Option<Mark>,
+}
+
+/// What both forms of a node's message have: who said it, and in which millisecond by the node's clock.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+struct Mark {
+    logger: String,
+    stamp: String,
+}
+
+/// The messages of nodes that were seen lately.
+#[derive(Debug, Default)]
+pub struct Twins {
+    known: HashSet<(Mark, LogSource)>,
+    order: VecDeque<(Mark, LogSource)>,
+}
+
+impl Entry {
+    /// What `record` of `file` says; `None` if it says nothing. `at_ms` is for a record without a time.
+    pub fn of(record: &Record, file: &LogFile, at_ms: u64) -> Option<Self> {
+        let at_ms = record.at_ms.unwrap_or(at_ms);
+        let source = record.source.unwrap_or(file.unmarked);
+        let text = console::printable(record.text);
+        let said = console::parse(&text);
+        let level = said.map_or_else(|| Record::level_of_source(source), |said| said.level);
+        let logger = said.and_then(|said| said.logger);
+        let node = logger.and_then(console::node_of);
+        let stamp = said.and_then(|said| said.stamp);
+        let mark = logger.zip(stamp).map(|(logger, stamp)| Mark::new(logger, stamp));
+        let shown = match said {
+            // A logger whose name is no node's stays in the text.
+            Some(said) if logger.is_some() == node.is_some() => said.text,
+            _ => &text,
+        };
+        let line = LogLine {
+            at_ms: stamp.and_then(millis).filter(|ms| ms.abs_diff(at_ms) < MAX_SKEW_MS).unwrap_or(at_ms),
+            level,
+            source,
+            task: file.task.clone(),
+            node,
+            text: shown.to_owned(),
+        };
+        (!line.text.is_empty()).then_some(Self { line, mark })
+    }
+}
+
+impl Mark {
+    fn new(logger: &str, stamp: &str) -> Self {
+        // The console shows nanoseconds, what is kept of the topic milliseconds.
+        let (seconds, fraction) = stamp.split_once('.').unwrap_or((stamp, ""));
+        let stamp = format!("{seconds}.{:0<3.3}", fraction);
+        Self { logger: logger.to_owned(), stamp }
+    }
+}
+
+/// The milliseconds since the Unix epoch that a node wrote as `1700000000.123456789`, the first of several.
+fn millis(stamp: &str) -> Option<u64> {
+    let (seconds, fraction) = stamp.split(',').next()?.trim().split_once('.')?;
+    let fraction: u64 = format!("{fraction:0<3.3}").parse().ok()?;
+    seconds.parse::<u64>().ok()?.checked_mul(1000)?.checked_add(fraction)
+}
+
+impl Twins {
+    /// Whether the same was said before by another way.
+    pub fn knows(&mut self, entry: &Entry) -> bool {
+        let Some(mark) = &entry.mark else { return false };
+        let others = [LogSource::Stdout, LogSource::Stderr, LogSource::Rosout].into_iter();
+        let mut others = others.filter(|source| *source != entry.line.source);
+        if others.any(|source| self.known.contains(&(mark.clone(), source))) {
+            return true;
+        }
+        let seen = (mark.clone(), entry.line.source);
+        if self.known.insert(seen.clone()) {
+            self.order.push_back(seen);
+        }
+        if self.order.len() > TWIN_WINDOW
+            && let Some(oldest) = self.order.pop_front()
+        {
+            self.known.remove(&oldest);
+        }
+        false
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use task_proto::log::LogLevel;
+
+    fn entry(line: &str) -> Option<Entry> {
+        let file = LogFile { path: PathBuf::new(), task: Some("talker".parse().unwrap()), unmarked: LogSource::Stdout };
+        Entry::of(&Record::parse(line.as_bytes()), &file, 7)
+    }
+
+    #[test]
+    fn a_line_is_shown_without_what_is_known_of_it_otherwise() {
+        let line = entry("2026-11-21T10:00:00.123Z E [ERROR] [1.5] [robot.talker]: no \x1b[31mway").unwrap().line;
+        assert_eq!((line.level, line.source, line.text.as_str()), (LogLevel::Error, LogSource::Stderr, "no way"));
+        assert_eq!(line.node.unwrap().as_str(), "/robot/talker");
+        let at_ms = |line: &str| entry(line).unwrap().line.at_ms;
+        assert_eq!(at_ms("1970-01-01T00:00:07.500Z O [INFO] [7.123456789] [n]: x"), 7123, "by the node's own clock");
+        assert_eq!(at_ms("1970-01-01T01:00:00.000Z O [INFO] [7.1, 3.0]: x"), 3_600_000, "but not by a simulated one");
+        let line = entry("[INFO] [1.5] [talker-1]: up").unwrap().line;
+        assert_eq!((line.at_ms, line.source, line.node), (7, LogSource::Stdout, None));
+        assert_eq!(line.text, "[INFO] [1.5] [talker-1]: up");
+        assert_eq!(entry(""), None);
+        assert_eq!(entry("2026-11-21T10:00:00.123Z O \x1b[0m"), None);
+    }
+
+    #[test]
+    fn what_is_said_twice_is_shown_once_but_not_what_is_repeated() {
+        let console = entry("2026-11-21T10:00:00.123Z E [INFO] [1.5] [talker]: tick").unwrap();
+        let rosout = entry("2026-11-21T10:00:00.120Z R [INFO] [1.5] [talker]: tick").unwrap();
+        let other = entry("2026-11-21T10:00:00.120Z R [INFO] [1.6] [talker]: tick").unwrap();
+        for (first, second) in [(&console, &rosout), (&rosout, &console)] {
+            let mut twins = Twins::default();
+            assert!(!twins.knows(first) && !twins.knows(first), "two messages in one nanosecond");
+            assert!(twins.knows(second) && !twins.knows(&other));
+        }
+        let mut twins = Twins::default();
+        for number in 0..2 * TWIN_WINDOW {
+            assert!(!twins.knows(&entry(&format!("[INFO] [{number}.0] [talker]: tick")).unwrap()));
+        }
+        assert_eq!((twins.known.len(), twins.order.len()), (TWIN_WINDOW, TWIN_WINDOW));
+    }
+}

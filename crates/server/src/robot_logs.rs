@@ -1,0 +1,336 @@
+//! The last log lines of each robot, and who follows them. Only memory: what a robot published by itself is here until
+//! newer lines take its place, all of it is on the robot. It never asks a robot.
+
+use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use task_proto::RobotId;
+use task_proto::log::{LogBatch, LogLevel, LogLine, MAX_BATCH_LINES, MAX_LINE_BYTES};
+use tokio::sync::{Notify, broadcast};
+
+/// Lines kept of one robot.
+const MAX_ROBOT_LINES: usize = 200;
+/// Bytes kept of all robots; each has an equal share, if it needs it.
+const MAX_BYTES: usize = 64 * 1024 * 1024;
+/// What a line takes beside its text.
+const LINE_OVERHEAD_BYTES: usize = 160;
+/// What a robot may publish a second, and at once.
+const BYTES_PER_S: u64 = 256 * 1024;
+const BURST_BYTES: u64 = 1024 * 1024;
+/// Batches a slow follower may fall behind before it misses some.
+const BACKLOG: usize = 64;
+
+/// The lines of all robots; clones share them.
+#[derive(Clone)]
+pub struct RobotLogs {
+    state: Arc<Mutex<State>>,
+    max_bytes: usize,
+}
+
+#[derive(Default)]
+struct State {
+    robots: HashMap<RobotId, Kept>,
+    bytes: usize,
+    followed: HashMap<RobotId, Followed>,
+    followers: u64,
+}
+
+/// One robot's last lines.
+#[derive(Default)]
+struct Kept {
+    lines: VecDeque<LogLine>,
+    bytes: usize,
+    /// The robot's clock and ours when the last batch came.
+    robot_ms: u64,
+    received_ms: u64,
+    suppressed: u64,
+    /// Bytes it may still publish, and since when that holds.
+    budget_bytes: u64,
+    budget_ms: u64,
+}
+
+/// What the server remembers of a robot.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Remembered {
+    /// The oldest first.
+    pub lines: Vec<LogLine>,
+    /// The robot's clock when they came.
+    pub robot_ms: u64,
+    /// Ours.
+    pub received_ms: u64,
+    /// Lines that were left out, as long as these are remembered.
+    pub suppressed: u64,
+}
+
+/// What followers are told.
+#[derive(Debug, Clone)]
+pub enum Told {
+    /// The robot has said that it publishes.
+    Following {
+        /// After it did not for a while, so that lines may be missing.
+        again: bool,
+    },
+    /// It can't be reached.
+    Away(Arc<str>),
+    /// Lines came.
+    Lines(Arc<LogBatch>),
+}
+
+struct Followed {
+    told: broadcast::Sender<Told>,
+    levels: BTreeMap<u64, LogLevel>,
+    changed: Arc<Notify>,
+}
+
+/// One follower's place; it follows until this is dropped.
+pub struct Follower {
+    logs: RobotLogs,
+    robot: RobotId,
+    number: u64,
+}
+
+/// A place that was taken, and what is to be done for it.
+pub struct Joined {
+    /// The place.
+    pub follower: Follower,
+    /// What it is told.
+    pub told: broadcast::Receiver<Told>,
+    /// Whether it is the first: then somebody has to ask the robot, for as long as there are followers.
+    pub is_first: bool,
+}
+
+impl RobotLogs {
+    /// Nothing remembered, nobody following.
+    pub fn new() -> Self {
+        Self { state: Arc::default(), max_bytes: MAX_BYTES }
+    }
+
+    /// Whether `robot` may publish so many bytes now. Ask before reading them.
+    pub fn admits(&self, robot: &RobotId, bytes: usize, now_ms: u64) -> bool {
+        let mut state = self.state();
+        let kept = state.robots.entry(robot.clone()).or_insert_with(|| Kept {
+            budget_bytes: BURST_BYTES,
+            budget_ms: now_ms,
+            ..Kept::default()
+        });
+        let earned = now_ms.saturating_sub(kept.budget_ms).saturating_mul(BYTES_PER_S) / 1000;
+        kept.budget_bytes = kept.budget_bytes.saturating_add(earned).min(BURST_BYTES);
+        kept.budget_ms = now_ms;
+        let left = kept.budget_bytes.checked_sub(bytes as u64);
+        kept.budget_bytes = left.unwrap_or(kept.budget_bytes);
+        left.is_some()
+    }
+
+    /// Takes what a robot published, and hands it to its followers.
+    pub fn take(&self, mut batch: LogBatch, now_ms: u64) {
+        batch.lines.truncate(MAX_BATCH_LINES);
+        batch.lines.iter_mut().for_each(|line| line.text = one_line(&line.text));
+        let mut state = self.state();
+        let share = self.max_bytes / state.robots.len().max(1);
+        let kept = state.robots.entry(batch.robot_id.clone()).or_default();
+        let before = kept.bytes;
+        (kept.robot_ms, kept.received_ms) = (batch.now_ms, now_ms);
+        kept.suppressed = kept.suppressed.saturating_add(batch.suppressed);
+        for line in &batch.lines {
+            kept.bytes += size(line);
+            kept.lines.push_back(line.clone());
+        }
+        kept.shrink(share);
+        let after = kept.bytes;
+        state.bytes = state.bytes + after - before;
+        if state.bytes > self.max_bytes {
+            // A little more than needed, or it would be done again for the next line.
+            state.shrink(share / 4 * 3);
+        }
+        if let Some(followed) = state.followed.get(&batch.robot_id) {
+            // They may just have gone.
+            let _ = followed.told.send(Told::Lines(Arc::new(batch)));
+        }
+    }
+
+    /// What is remembered of `robot`.
+    pub fn remembered(&self, robot: &RobotId) -> Option<Remembered> {
+        let state = self.state();
+        let kept = state.robots.get(robot).filter(|kept| kept.received_ms > 0)?;
+        let Kept { robot_ms, received_ms, suppressed, .. } = *kept;
+        Some(Remembered { lines: kept.lines.iter().cloned().collect(), robot_ms, received_ms, suppressed })
+    }
+
+    /// Forgets a robot that was removed.
+    pub fn forget(&self, robot: &RobotId) {
+        let mut state = self.state();
+        let bytes = state.robots.remove(robot).map_or(0, |kept| kept.bytes);
+        state.bytes -= bytes;
+    }
+
+    /// Follows `robot`: lines of `level` and above.
+    pub fn follow(&self, robot: &RobotId, level: LogLevel) -> Joined {
+        let mut state = self.state();
+        state.followers += 1;
+        let number = state.followers;
+        let is_first = !state.followed.contains_key(robot);
+        let followed = state.followed.entry(robot.clone()).or_insert_with(|| Followed {
+            told: broadcast::Sender::new(BACKLOG),
+            levels: BTreeMap::new(),
+            changed: Arc::default(),
+        });
+        followed.levels.insert(number, level);
+        followed.changed.notify_one();
+        let told = followed.told.subscribe();
+        Joined { follower: Follower { logs: self.clone(), robot: robot.clone(), number }, told, is_first }
+    }
+
+    /// The level that the followers of `robot` together want; `None` when nobody follows any more: whoever asks the
+    /// robot then ends, and the next follower is a first one.
+    pub fn wanted(&self, robot: &RobotId) -> Option<LogLevel> {
+        let mut state = self.state();
+        let level = state.followed.get(robot)?.levels.values().min().copied();
+        if level.is_none() {
+            state.followed.remove(robot);
+        }
+        level
+    }
+
+    /// Wakes when the followers of `robot` are others, or it has connected anew.
+    pub fn changed(&self, robot: &RobotId) -> Option<Arc<Notify>> {
+        Some(self.state().followed.get(robot)?.changed.clone())
+    }
+
+    /// The robot has connected anew: it may not know any more that it is followed.
+    pub fn connected(&self, robot: &RobotId) {
+        if let Some(followed) = self.state().followed.get(robot) {
+            followed.changed.notify_one();
+        }
+    }
+
+    /// Tells the followers of `robot`.
+    pub fn tell(&self, robot: &RobotId, told: Told) {
+        if let Some(followed) = self.state().followed.get(robot) {
+            // They may just have gone.
+            let _ = followed.told.send(told);
+        }
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing half-done.
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Default for RobotLogs {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl State {
+    fn shrink(&mut self, share: usize) {
+        self.robots.values_mut().for_each(|kept| kept.shrink(share));
+        self.bytes = self.robots.values().map(|kept| kept.bytes).sum();
+    }
+}
+
+impl Kept {
+    fn shrink(&mut self, share: usize) {
+        while self.lines.len() > MAX_ROBOT_LINES || self.bytes > share {
+            let Some(oldest) = self.lines.pop_front() else { return };
+            self.bytes -= size(&oldest);
+        }
+    }
+}
+
+impl Drop for Follower {
+    fn drop(&mut self) {
+        if let Some(followed) = self.logs.state().followed.get_mut(&self.robot) {
+            followed.levels.remove(&self.number);
+            followed.changed.notify_one();
+        }
+    }
+}
+
+fn size(line: &LogLine) -> usize {
+    line.text.len() + LINE_OVERHEAD_BYTES
+}
+
+/// A text as it should have come: on one line, of a bounded length.
+fn one_line(text: &str) -> String {
+    let cut = &text[..text.floor_char_boundary(MAX_LINE_BYTES)];
+    cut.chars().map(|c| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c }).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use task_proto::log::LogSource;
+
+    fn batch(robot: &RobotId, texts: impl IntoIterator<Item = String>) -> LogBatch {
+        let line =
+            |text| LogLine { at_ms: 1, level: LogLevel::Warn, source: LogSource::Stderr, task: None, node: None, text };
+        LogBatch { robot_id: robot.clone(), now_ms: 5, lines: texts.into_iter().map(line).collect(), suppressed: 1 }
+    }
+
+    fn texts(logs: &RobotLogs, robot: &RobotId) -> Vec<String> {
+        logs.remembered(robot).map_or_else(Vec::new, |kept| kept.lines.into_iter().map(|line| line.text).collect())
+    }
+
+    #[test]
+    fn the_newest_lines_of_each_robot_are_remembered() {
+        let (logs, robot) = (RobotLogs::new(), RobotId::random());
+        assert_eq!(logs.remembered(&robot), None);
+        for number in 0..3 {
+            logs.take(batch(&robot, (0..100).map(|line| format!("{number} {line}"))), 9);
+        }
+        let kept = logs.remembered(&robot).expect("remembered");
+        assert_eq!((kept.robot_ms, kept.received_ms, kept.suppressed), (5, 9, 3));
+        assert_eq!((kept.lines.len(), kept.lines[0].text.as_str()), (MAX_ROBOT_LINES, "1 0"));
+        logs.forget(&robot);
+        assert_eq!((texts(&logs, &robot).len(), logs.state().bytes), (0, 0));
+    }
+
+    #[test]
+    fn all_robots_together_have_a_bound_and_each_its_share() {
+        let logs = RobotLogs { max_bytes: 100_000, ..RobotLogs::new() };
+        let robots: Vec<RobotId> = (0..50).map(|_| RobotId::random()).collect();
+        for robot in &robots {
+            logs.take(batch(robot, (0..100).map(|line| format!("line {line}"))), 9);
+            assert!(logs.state().bytes <= 100_000);
+        }
+        for robot in &robots {
+            logs.take(batch(robot, ["the last".to_owned()]), 9);
+        }
+        let bytes: usize = logs.state().robots.values().map(|kept| kept.bytes).sum();
+        assert_eq!(bytes, logs.state().bytes);
+        assert!(robots.iter().all(|robot| texts(&logs, robot).last().is_some_and(|text| text == "the last")));
+        assert!(robots.iter().all(|robot| texts(&logs, robot).len() > 1), "nobody is left with nothing");
+    }
+
+    #[test]
+    fn what_a_robot_publishes_is_bounded_and_made_harmless() {
+        let (logs, robot) = (RobotLogs::new(), RobotId::random());
+        let burst = (0..).take_while(|_| logs.admits(&robot, 100 * 1024, 1000)).count();
+        assert_eq!(burst as u64, BURST_BYTES / (100 * 1024));
+        assert!(!logs.admits(&robot, 100 * 1024, 1100) && logs.admits(&robot, 100 * 1024, 1500));
+        assert_eq!(logs.remembered(&robot), None, "nothing was published yet");
+        logs.take(batch(&robot, ["a\u{1b}[31mb\nc".to_owned(), "é".repeat(MAX_LINE_BYTES)]), 9);
+        let shown = texts(&logs, &robot);
+        assert_eq!(shown[0], "a\u{fffd}[31mb\u{fffd}c");
+        assert!(shown[1].len() <= MAX_LINE_BYTES);
+    }
+
+    #[test]
+    fn one_follower_asks_the_robot_for_all() {
+        let (logs, robot) = (RobotLogs::new(), RobotId::random());
+        let mut first = logs.follow(&robot, LogLevel::Warn);
+        let second = logs.follow(&robot, LogLevel::Debug);
+        assert!(first.is_first && !second.is_first);
+        assert_eq!(logs.wanted(&robot), Some(LogLevel::Debug));
+        drop(second);
+        assert_eq!(logs.wanted(&robot), Some(LogLevel::Warn));
+        logs.take(batch(&robot, ["x".to_owned()]), 9);
+        assert!(matches!(first.told.try_recv(), Ok(Told::Lines(batch)) if batch.lines[0].text == "x"));
+        drop(first.follower);
+        assert!(!logs.follow(&robot, LogLevel::Info).is_first, "whoever asks has not noticed yet");
+        assert_eq!(logs.wanted(&robot), None);
+        assert!(logs.follow(&robot, LogLevel::Info).is_first);
+    }
+}

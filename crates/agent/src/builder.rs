@@ -1,10 +1,11 @@
 //! Builds a package with the build tool its manifest names: in a bash of its own, out of the way of everything else,
-//! within limits of time, memory and output, and gone without a trace of processes when it is cancelled. A build begins
+//! within limits of time, memory, processes and output, and gone without a trace of processes when it ends. A build begins
 //! with empty `build` and `install` directories, so one that was interrupted is simply done again.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fs::{self, File};
 use std::io::{self, PipeReader, Read, Write};
+use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -12,12 +13,14 @@ use task_proto::manifest::BuildTool;
 use task_proto::report::FailureCode;
 use tokio_util::sync::CancellationToken;
 
+use crate::cgroup::{Cgroups, RunLimits};
+use crate::confinement::Confinement;
 use crate::containment::{Containment, ContainmentError, KillOnDrop, RUN_DIR_VARIABLE};
 use crate::durable;
 use crate::layout::VersionDir;
-use crate::process::ExitStatus;
-use crate::process::{self, BuildPriority};
+use crate::process::{self, ExitStatus};
 use crate::script;
+use crate::task_user::TaskUser;
 
 /// How long the processes of a build may take to be gone.
 const KILL_TIMEOUT: Duration = Duration::from_secs(10);
@@ -25,6 +28,10 @@ const KILL_TIMEOUT: Duration = Duration::from_secs(10);
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(5);
 /// The end of the output that goes into a failure's text, which a report cuts at 4096 characters.
 const TAIL_BYTES: usize = 3500;
+/// Added to the agent's niceness.
+const NICE: i32 = 10;
+/// The longest `package.xml` that is looked at.
+const MAX_PACKAGE_XML_BYTES: u64 = 1024 * 1024;
 
 /// What to build, and with what.
 #[derive(Debug, Clone)]
@@ -41,6 +48,10 @@ pub struct BuildOrder {
     pub log: PathBuf,
     /// What it may use.
     pub limits: BuildLimits,
+    /// Whom it runs as; `None`: whoever the agent is.
+    pub user: Option<TaskUser>,
+    /// Where it gets its control group.
+    pub cgroups: Option<Cgroups>,
 }
 
 /// What a build may use.
@@ -48,8 +59,11 @@ pub struct BuildOrder {
 pub struct BuildLimits {
     /// The time it may take.
     pub timeout: Duration,
-    /// The address space each of its processes may have; `None` does not limit it.
+    /// The memory all of it may have; without a control group the address space that each of its processes may have.
+    /// `None` does not limit it.
     pub memory_bytes: Option<u64>,
+    /// The processes and threads it may have.
+    pub pids: Option<u64>,
     /// The output that is kept.
     pub log_bytes: u64,
 }
@@ -85,6 +99,14 @@ pub enum BuildError {
         /// What it said.
         output: Output,
     },
+    /// It used more memory than it may.
+    #[error("the build used more than the {limit_mb} MiB of memory it may; {output}")]
+    OutOfMemory {
+        /// What it may use.
+        limit_mb: u64,
+        /// What it said.
+        output: Output,
+    },
     /// The build tool was content, but the package is not there.
     #[error("the build tool succeeded without installing {missing}; {output}")]
     NotInstalled {
@@ -113,6 +135,7 @@ impl BuildError {
             Self::Cancelled => None,
             Self::TimedOut { .. } => Some(FailureCode::DEADLINE_EXCEEDED),
             Self::Failed { .. } | Self::NotInstalled { .. } => Some(FailureCode::BUILD_FAILED),
+            Self::OutOfMemory { .. } => Some(FailureCode::OUT_OF_MEMORY),
             Self::Containment(_) | Self::Io { .. } => Some(FailureCode::IO_ERROR),
         }
     }
@@ -123,7 +146,7 @@ impl BuildLimits {
     /// out-of-memory killer.
     pub fn of_this_machine() -> Self {
         let memory_bytes = process::total_memory_bytes().ok().map(|total| total / 4 * 3);
-        Self { timeout: Duration::from_secs(30 * 60), memory_bytes, log_bytes: 8 * 1024 * 1024 }
+        Self { timeout: Duration::from_secs(30 * 60), memory_bytes, pids: None, log_bytes: 8 * 1024 * 1024 }
     }
 }
 
@@ -138,17 +161,19 @@ impl std::fmt::Display for Output {
 pub async fn build(order: &BuildOrder, cancel: &CancellationToken) -> Result<(), BuildError> {
     let Some(text) = script::build_script(order.tool, &order.version, &order.underlays) else { return Ok(()) };
     let root = order.version.root();
-    let guard = KillOnDrop::new(Containment::new(root, None));
+    let cgroup = order.cgroups.as_ref().map(|cgroups| cgroups.group(root).path().to_owned());
+    let guard = KillOnDrop::new(Containment::new(root, None, cgroup));
     // An agent that was killed leaves its build running.
     guard.end(KILL_TIMEOUT).await?;
     prepare(order, &text)?;
-    let (status, tail) = run(order, &guard, cancel).await?;
+    let Ran { status, tail, out_of_memory } = run(order, &guard, cancel).await?;
     let output = Output { log: order.log.clone(), tail: String::from_utf8_lossy(&tail).trim().to_owned() };
-    match status {
-        Some(ExitStatus::Code(0)) => {}
-        Some(status) => return Err(BuildError::Failed { status, output }),
-        None if cancel.is_cancelled() => return Err(BuildError::Cancelled),
-        None => return Err(BuildError::TimedOut { timeout: order.limits.timeout, output }),
+    match (status, order.limits.memory_bytes.filter(|_| out_of_memory)) {
+        (Some(ExitStatus::Code(0)), _) => {}
+        (Some(_), Some(limit)) => return Err(BuildError::OutOfMemory { limit_mb: limit >> 20, output }),
+        (Some(status), None) => return Err(BuildError::Failed { status, output }),
+        (None, _) if cancel.is_cancelled() => return Err(BuildError::Cancelled),
+        (None, _) => return Err(BuildError::TimedOut { timeout: order.limits.timeout, output }),
     }
     if let Some(missing) = missing_package(&order.version) {
         return Err(BuildError::NotInstalled { missing, output });
@@ -167,26 +192,36 @@ fn prepare(order: &BuildOrder, script: &str) -> Result<(), BuildError> {
         durable::create_dir_all(logs).map_err(failed(logs))?;
     }
     let path = script_path(order);
-    durable::write(&path, script.as_bytes(), 0o700).map_err(failed(&path))
+    durable::write(&path, script.as_bytes(), 0o755).map_err(failed(&path))?;
+    order.user.as_ref().map_or(Ok(()), |user| user.hand_over(root)).map_err(failed(root))
 }
 
 fn script_path(order: &BuildOrder) -> PathBuf {
     order.version.root().join("build.sh")
 }
 
-/// How the build ended, or `None` when it was ended here, and the end of its output.
-async fn run(
-    order: &BuildOrder,
-    containment: &Containment,
-    cancel: &CancellationToken,
-) -> Result<(Option<ExitStatus>, Vec<u8>), BuildError> {
+/// What became of a build.
+struct Ran {
+    /// How it ended, or `None` when it was ended here.
+    status: Option<ExitStatus>,
+    /// The end of its output.
+    tail: Vec<u8>,
+    out_of_memory: bool,
+}
+
+async fn run(order: &BuildOrder, containment: &Containment, cancel: &CancellationToken) -> Result<Ran, BuildError> {
     let (root, script) = (order.version.root(), script_path(order));
     let mut environment = order.environment.clone();
     environment.insert(RUN_DIR_VARIABLE.to_owned(), root.display().to_string());
     let log = File::create(&order.log).map_err(failed(&order.log))?;
     let (reader, writer) = io::pipe().map_err(failed(&script))?;
-    let priority = BuildPriority { nice: 10, memory_bytes: order.limits.memory_bytes };
-    let mut child = process::spawn_build(&script, root, &environment, priority, writer).map_err(failed(&script))?;
+    let limits = RunLimits { memory_bytes: order.limits.memory_bytes, cpu_weight: None, pids: order.limits.pids };
+    let cgroup = order.cgroups.as_ref().map(|cgroups| cgroups.create(root, &limits)).transpose();
+    let cgroup = cgroup.map_err(failed(root))?;
+    let confined = Confinement::new(&script, cgroup.as_ref(), &limits, order.user.as_ref()).map_err(failed(&script))?;
+    order.user.as_ref().map_or(Ok(()), |user| user.own(&writer)).map_err(failed(&script))?;
+    let mut child =
+        process::spawn_build(&script, root, &environment, NICE, confined, writer).map_err(failed(&script))?;
     let log_bytes = order.limits.log_bytes;
     let copying = tokio::task::spawn_blocking(move || copy_output(reader, log, log_bytes));
     let status = tokio::select! {
@@ -194,14 +229,15 @@ async fn run(
         () = cancel.cancelled() => None,
         () = tokio::time::sleep(order.limits.timeout) => None,
     };
+    let (status, out_of_memory) = (status.map(ExitStatus::from), containment.is_out_of_memory());
     // The output ends when the last process that could write any has.
     containment.end(KILL_TIMEOUT).await?;
     let Ok(copied) = tokio::time::timeout(DRAIN_TIMEOUT, copying).await else {
         // One that cleared its environment got away and holds the output open.
-        return Ok((status.map(ExitStatus::from), b"a process of the build got away and still writes".to_vec()));
+        return Ok(Ran { status, tail: b"a process of the build got away and still writes".to_vec(), out_of_memory });
     };
     let tail = copied.map_err(|error| failed(&order.log)(error.into()))?;
-    Ok((status.map(ExitStatus::from), tail))
+    Ok(Ran { status, tail, out_of_memory })
 }
 
 /// Copies the first `limit` bytes of `output` into `log`, reads on to its end, and returns its last bytes.
@@ -235,9 +271,13 @@ fn missing_package(version: &VersionDir) -> Option<String> {
     (!any).then(|| "anything: there is no package.xml in the package, or none the build tool accepts".to_owned())
 }
 
-/// The name in a `package.xml`. It was checked when the package was pushed, so looking for the element is enough.
+/// The name in a `package.xml`. It was checked when the package was pushed, so looking for the element is enough. The build
+/// may have put anything in its place: what is no plain file is not read.
 fn package_name(path: &Path) -> Option<String> {
-    let text = fs::read_to_string(path).ok()?;
+    let file = File::options().read(true).custom_flags(libc::O_NOFOLLOW | libc::O_NONBLOCK).open(path).ok()?;
+    let mut text = String::new();
+    file.metadata().ok().filter(fs::Metadata::is_file)?;
+    file.take(MAX_PACKAGE_XML_BYTES).read_to_string(&mut text).ok()?;
     let (_, rest) = text.split_once("<name>")?;
     let (name, _) = rest.split_once("</name>")?;
     let name = name.trim();

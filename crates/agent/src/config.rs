@@ -52,6 +52,9 @@ pub struct Settings {
     /// Seconds after which the robot asks for a new token.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub token_lifetime_s: Option<u64>,
+    /// Whom an agent that is root builds and runs tasks as, by name or number; absent: `taskd-task`. `root` must be said.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub task_user: Option<String>,
     /// The labels the robot gives itself; the server's win.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub labels: Option<Labels>,
@@ -120,7 +123,7 @@ pub struct LimitSettings {
     /// Bytes of a task's log file before it is rotated.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub log_bytes: Option<u64>,
-    /// Memory that each process of a build may have.
+    /// Memory that a build may have; each of its processes, where there are no control groups.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub build_memory_bytes: Option<u64>,
     /// Seconds a build may take.
@@ -129,6 +132,12 @@ pub struct LimitSettings {
     /// Versions that are prepared at the same time.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub parallel_tasks: Option<usize>,
+    /// Memory of a task whose package says nothing of it, in MiB; absent: all there is.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub task_memory_mb: Option<u64>,
+    /// Processes and threads of such a task, and of a build.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub task_pids: Option<u64>,
 }
 
 /// The gate's settings that hold.
@@ -163,10 +172,14 @@ pub struct Config {
     pub poll_interval_without_mqtt: Duration,
     /// The age at which the robot asks for a new token.
     pub token_lifetime: Duration,
+    /// Whom tasks run as, if the settings say.
+    pub task_user: Option<String>,
     /// What tasks may use.
     pub limits: LimitSettings,
     /// Which log lines go to the server by themselves.
     pub forward: ForwardSettings,
+    /// Processes and threads of a task whose package says nothing of them, and of a build.
+    pub task_pids: u64,
     /// Versions that are prepared at the same time.
     pub parallel_tasks: usize,
     /// Who is asked before a task is started, stopped or switched; nobody unless a program is named.
@@ -250,6 +263,8 @@ impl Config {
             poll_interval_without_mqtt: Duration::from_secs(settings.poll_interval_without_mqtt_s.unwrap_or(10)),
             token_lifetime: Duration::from_secs(settings.token_lifetime_s.unwrap_or(30 * 86_400)),
             parallel_tasks: limits.parallel_tasks.unwrap_or(2),
+            task_user: settings.task_user,
+            task_pids: limits.task_pids.unwrap_or(4096),
             limits,
             gate: settings.gate.map(gate).transpose()?,
             forward,
@@ -262,6 +277,8 @@ impl Config {
             ("limits.parallel_tasks", config.parallel_tasks as u64, 1, 64),
             ("gate.timeout_s", config.gate.as_ref().map_or(1, |gate| gate.timeout.as_secs()), 1, MAX_GATE_TIMEOUT_S),
             ("logs.forward_lines_per_s", u64::from(config.forward.lines_per_s), 0, 1000),
+            ("limits.task_memory_mb", config.limits.task_memory_mb.unwrap_or(1), 1, 1 << 24),
+            ("limits.task_pids", config.task_pids, 1, 1 << 22),
             ("limits.build_timeout_s", config.limits.build_timeout_s.unwrap_or(60), 1, 86_400),
         ];
         for (key, value, least, most) in bounds {
@@ -298,7 +315,7 @@ pub fn parse_server(text: &str) -> Result<reqwest::Url, ConfigError> {
 fn override_by(table: &mut Table, name: &str, text: &str) -> Result<(), ConfigError> {
     let key = name[VARIABLE_PREFIX.len()..].to_ascii_lowercase();
     let value = match key.as_str() {
-        "server" | "name" => Value::String(text.to_owned()),
+        "server" | "name" | "task_user" => Value::String(text.to_owned()),
         "gate_command" => Value::Array(vec![Value::String(text.to_owned())]),
         "underlays" => {
             let paths = text.split(':').filter(|path| !path.is_empty());

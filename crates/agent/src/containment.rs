@@ -1,16 +1,18 @@
-//! Everything a run has started, whatever it did to get away: all that carry the run directory in their environment
-//! (it survives `fork`, `setsid` and the shim's death) and all that descend from the shim, which is their subreaper
-//! (that survives a cleared environment). It signals them and proves that none is left; it never signals the shim.
-//! Out of reach is only a process that clears its environment, leaves its parent and then sees its shim killed.
+//! Everything a run has started, whatever it did to get away: all in its control group (which nothing leaves that is not
+//! root), all that carry the run directory in their environment (it survives `fork`, `setsid` and the shim's death) and
+//! all that descend from the shim, which is their subreaper (that survives a cleared environment). It signals them and
+//! proves that none is left; it never signals the shim. Out of reach, where there are no control groups, is only a process
+//! that clears its environment, leaves its parent and then sees its shim killed.
 
 use std::collections::HashSet;
 use std::io;
 use std::ops::Deref;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use nix::sys::signal::Signal;
 
+use crate::cgroup::Cgroup;
 use crate::process::{ProcessEntry, ProcessIdentity, boot_id};
 
 /// The variable by which a run's processes are found: the path of its run directory, which no other run shares, not
@@ -26,6 +28,7 @@ const MAX_ROUNDS: usize = 100;
 pub struct Containment {
     marker: String,
     shim: Option<ProcessIdentity>,
+    cgroup: Option<Cgroup>,
 }
 
 /// Processes that SIGKILL did not end in time: they hang in the kernel.
@@ -47,9 +50,11 @@ pub enum ContainmentError {
 pub struct KillOnDrop(Containment);
 
 impl Containment {
-    /// The processes that were started for the directory `dir`, and those below `shim`.
-    pub fn new(dir: &Path, shim: Option<ProcessIdentity>) -> Self {
-        Self { marker: format!("{RUN_DIR_VARIABLE}={}", dir.display()), shim }
+    /// The processes that were started for the directory `dir`, those below `shim`, and those in the control group with
+    /// the directory `cgroup`.
+    pub fn new(dir: &Path, shim: Option<ProcessIdentity>, cgroup: Option<PathBuf>) -> Self {
+        let marker = format!("{RUN_DIR_VARIABLE}={}", dir.display());
+        Self { marker, shim, cgroup: cgroup.map(Cgroup::at) }
     }
 
     /// Those that live now.
@@ -69,9 +74,22 @@ impl Containment {
         signal_each(&self.members()?, signal)
     }
 
-    /// Kills all members. They are stopped first, until a look finds no new one, so that none forks away between the
+    /// Whether the kernel killed members because they had used up their memory.
+    pub fn is_out_of_memory(&self) -> bool {
+        self.cgroup.as_ref().is_some_and(Cgroup::is_out_of_memory)
+    }
+
+    /// Removes the control group. Only once no member is left.
+    pub fn remove(&self) -> io::Result<()> {
+        self.cgroup.as_ref().map_or(Ok(()), Cgroup::remove)
+    }
+
+    /// Kills all members: at one stroke those in the control group, then those found otherwise. They are stopped first, until a look finds no new one, so that none forks away between the
     /// look and the kill. Returns those that were killed; they may take a moment to be gone.
     pub fn kill(&self) -> io::Result<Vec<ProcessIdentity>> {
+        if let Some(cgroup) = &self.cgroup {
+            cgroup.kill()?;
+        }
         let mut stopped = HashSet::new();
         for _ in 0..MAX_ROUNDS {
             let new: Vec<_> = self.members()?.into_iter().filter(|member| !stopped.contains(member)).collect();
@@ -87,7 +105,7 @@ impl Containment {
         Ok(killed)
     }
 
-    /// Kills all members and waits until they are gone. Afterwards none is left.
+    /// Kills all members and waits until they are gone. Afterwards none is left, nor is the control group.
     pub async fn end(&self, timeout: Duration) -> Result<(), ContainmentError> {
         let ended = tokio::time::timeout(timeout, async {
             loop {
@@ -103,7 +121,12 @@ impl Containment {
             }
         });
         match ended.await {
-            Ok(result) => result,
+            Ok(Ok(())) => {
+                let ended = self.clone();
+                let removing = tokio::task::spawn_blocking(move || ended.remove());
+                Ok(removing.await.unwrap_or_else(|error| Err(error.into()))?)
+            }
+            Ok(failed) => failed,
             Err(_) => {
                 let pids = self.members()?.into_iter().map(|member| member.pid).collect();
                 Err(ContainmentError::Survivors { pids })
@@ -113,7 +136,7 @@ impl Containment {
 
     fn entries(&self) -> io::Result<(Vec<ProcessEntry>, Vec<ProcessIdentity>)> {
         let boot_id = boot_id()?;
-        let table = ProcessEntry::all()?;
+        let mut table = ProcessEntry::all()?;
         let below = match &self.shim {
             Some(shim) if shim.is_alive() => descendants(&table, shim.pid),
             _ => HashSet::new(),
@@ -121,7 +144,14 @@ impl Containment {
         let is_member = |entry: &&ProcessEntry| {
             !entry.is_zombie && (below.contains(&entry.pid) || entry.was_started_with(&self.marker))
         };
-        let members = table.iter().filter(is_member).map(|entry| entry.identity(&boot_id)).collect();
+        let mut members: Vec<_> = table.iter().filter(is_member).map(|entry| entry.identity(&boot_id)).collect();
+        let known: HashSet<u32> = members.iter().map(|member| member.pid).collect();
+        for entry in self.cgroup.as_ref().map_or(Ok(Vec::new()), grouped)? {
+            if !entry.is_zombie && !known.contains(&entry.pid) {
+                members.push(entry.identity(&boot_id));
+                table.push(entry);
+            }
+        }
         Ok((table, members))
     }
 }
@@ -145,7 +175,24 @@ impl Drop for KillOnDrop {
     fn drop(&mut self) {
         // Who starts the same again looks again.
         let _ = self.0.kill();
+        let killed = self.0.clone();
+        std::thread::spawn(move || killed.remove());
     }
+}
+
+/// The processes in a control group, none of them mistaken for a later one with its pid: a pid counts that is in the group
+/// before and after its entry is read.
+fn grouped(cgroup: &Cgroup) -> io::Result<Vec<ProcessEntry>> {
+    for _ in 0..MAX_ROUNDS {
+        let before = cgroup.pids()?;
+        let read: Vec<_> = before.iter().filter_map(|pid| ProcessEntry::of(*pid).ok().flatten()).collect();
+        let after: HashSet<u32> = cgroup.pids()?.into_iter().collect();
+        let sure: Vec<_> = read.into_iter().filter(|entry| after.contains(&entry.pid)).collect();
+        if !sure.is_empty() || after.is_empty() {
+            return Ok(sure);
+        }
+    }
+    Err(io::Error::other(format!("the processes in {} change too fast", cgroup.path().display())))
 }
 
 /// Signals all of them, also when one can't be, and then gives the last error.
@@ -182,7 +229,7 @@ mod tests {
 
     #[test]
     fn nothing_belongs_to_a_directory_nobody_was_started_for() {
-        let containment = Containment::new(Path::new("/nonexistent/run"), None);
+        let containment = Containment::new(Path::new("/nonexistent/run"), None, Some("/nonexistent/cgroup".into()));
         assert_eq!(containment.members().expect("table"), []);
     }
 }

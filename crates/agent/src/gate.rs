@@ -93,7 +93,7 @@ impl Gate {
         let failed = |source| GateError::Run { program: program(), source };
         // The path need not exist: by it the gate's processes are found again.
         let mark = self.directory.join("gate").join(task.as_str());
-        let processes = KillOnDrop::new(Containment::new(&mark, None));
+        let processes = KillOnDrop::new(Containment::new(&mark, None, None));
         // An agent that was killed may have left one that hangs.
         processes.end(KILL_TIMEOUT).await?;
         let (reader, writer) = io::pipe().map_err(failed)?;

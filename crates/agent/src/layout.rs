@@ -10,6 +10,7 @@
 //! tasks/<name>/current              link to the active version
 //! tasks/<name>/run/                 the shim's files: pid, exit status
 //! tasks/<name>/logs/                the task's and the build's output, and what its nodes say on ROS topics
+//! tasks/<name>/home/                the task's home directory, where it runs as a user of its own
 //! tasks/<name>/<hex>/               one version, by the digest of its OCI manifest
 //!   task.json                       the task manifest, byte for byte as it was pulled
 //!   src/  build/  install/  run.sh
@@ -88,6 +89,11 @@ impl DataDir {
         TaskDir { root: self.tasks().join(name.as_str()) }
     }
 
+    /// The directories on the way to what belongs to a task.
+    pub fn way_to(&self, name: &TaskName) -> [PathBuf; 3] {
+        [self.root.clone(), self.tasks(), self.task(name).root]
+    }
+
     /// Removes what an agent that died left half done: trees half unpacked or half removed. Only at start: a pull in
     /// progress would lose its tree.
     pub fn clean_leftovers(&self) -> io::Result<()> {
@@ -154,6 +160,11 @@ impl TaskDir {
     /// The output of its last build.
     pub fn build_log(&self) -> PathBuf {
         self.logs().join("build.log")
+    }
+
+    /// The home directory of the user that the task runs as.
+    pub fn home(&self) -> PathBuf {
+        self.root.join("home")
     }
 
     /// The version whose package has this manifest digest.

@@ -3,9 +3,11 @@
 pub mod admission;
 pub mod answers;
 pub mod builder;
+pub mod cgroup;
 pub mod clock;
 pub mod commands;
 pub mod config;
+pub mod confinement;
 pub mod containment;
 pub mod credential;
 pub mod disk;
@@ -36,5 +38,6 @@ pub mod server;
 pub mod shim;
 pub mod supervisor;
 pub mod survey;
+pub mod task_user;
 pub mod underlay;
 pub mod unpack;

@@ -48,6 +48,8 @@ pub enum ProcessState {
 pub struct Exit {
     /// With which code or signal; `None` when the process and its shim were gone without a word.
     pub status: Option<ExitStatus>,
+    /// The memory it was limited to, if it was killed for using more.
+    pub out_of_memory_bytes: Option<u64>,
     /// The last lines of its output.
     pub last_lines: String,
 }
@@ -92,6 +94,8 @@ pub struct RobotFacts {
     pub labels: Option<Labels>,
     /// The ROS installations, the best last; `None` while they have to be looked at.
     pub installations: Option<Vec<Installation>>,
+    /// Why there is no user to run tasks as, if there is none.
+    pub no_task_user: Option<String>,
 }
 
 impl RobotFacts {
@@ -154,12 +158,20 @@ impl Exit {
         self.status == Some(ExitStatus::Code(0))
     }
 
-    /// The end in words, with the last lines of output.
-    pub fn text(&self) -> String {
-        let end = match self.status {
-            Some(status) => status.to_string(),
-            None => "gone without an exit status".to_owned(),
+    /// The failure that this end is, in words and with the last lines of output.
+    pub fn failure(&self) -> Failure {
+        let (code, end) = match (self.out_of_memory_bytes, self.status) {
+            (Some(limit), _) => {
+                let end = format!("killed: it used more than the {} MiB of memory it may", limit >> 20);
+                (FailureCode::OUT_OF_MEMORY, end)
+            }
+            (None, Some(status)) => (FailureCode::PROCESS_EXITED, status.to_string()),
+            (None, None) => (FailureCode::PROCESS_EXITED, "gone without an exit status".to_owned()),
         };
+        Failure::new(code, self.text(&end))
+    }
+
+    fn text(&self, end: &str) -> String {
         if self.last_lines.trim().is_empty() {
             format!("the process ended ({end}) and wrote nothing")
         } else {
@@ -185,7 +197,8 @@ mod tests {
     }
 
     fn robot(installations: Vec<Installation>) -> RobotFacts {
-        RobotFacts { arch: "x86_64".to_owned(), labels: Some(Labels::new()), installations: Some(installations) }
+        let installations = Some(installations);
+        RobotFacts { arch: "x86_64".to_owned(), labels: Some(Labels::new()), installations, no_task_user: None }
     }
 
     fn jazzy() -> Installation {

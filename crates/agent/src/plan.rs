@@ -234,6 +234,10 @@ pub fn prepare(s: &Situation<'_>) -> Next {
     if s.robot.labels.is_none() && !manifest.requires.labels.is_empty() {
         return NOTHING;
     }
+    if let Some(text) = &s.robot.no_task_user {
+        let failure = Failure::new(FailureCode::NO_TASK_USER, text);
+        return record(transition::prepared_to(s, Phase::Unmet, Some(failure)));
+    }
     if s.robot.installations.is_none() && RobotFacts::must_know_ros(manifest) {
         return Next::Act(Step::LookForRos(order.package.clone()));
     }

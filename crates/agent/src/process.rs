@@ -15,13 +15,14 @@ use std::time::Duration;
 
 use nix::errno::Errno;
 use nix::sys::prctl;
-use nix::sys::resource::{Resource, setrlimit};
 use nix::sys::signal::{SigHandler, SigSet, SigmaskHow, Signal};
 use nix::sys::wait::{WaitPidFlag, WaitStatus, waitpid};
 use nix::unistd::Pid;
 use serde::{Deserialize, Serialize};
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
+
+use crate::confinement::Confinement;
 
 /// Kernel ticks per second in `/proc/<pid>/stat`: USER_HZ, 100 on every architecture that Linux runs ROS on.
 const TICKS_PER_SECOND: u64 = 100;
@@ -75,15 +76,6 @@ pub enum ChildEvent {
     NoChildren,
     /// None ended in time.
     TimedOut,
-}
-
-/// What a build is allowed to use.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct BuildPriority {
-    /// Added to the agent's niceness.
-    pub nice: i32,
-    /// The address space each of its processes may have.
-    pub memory_bytes: Option<u64>,
 }
 
 impl ProcessIdentity {
@@ -248,12 +240,13 @@ pub fn spawn_shim(program: &Path, dir: &Path, lock: File) -> io::Result<PipeRead
     Ok(reader)
 }
 
-/// Starts a task's script under bash, in its own process group, with exactly `environment`. When the calling thread
+/// Starts a task's script under bash, confined, in its own process group, with exactly `environment`. When the calling thread
 /// dies, and with it the reader of the task's output, the task gets the signal that stops a ROS node in good order.
 pub fn spawn_task(
     script: &Path,
     directory: &Path,
     environment: &BTreeMap<String, String>,
+    confinement: Confinement,
     output: PipeWriter,
     errors: PipeWriter,
 ) -> io::Result<u32> {
@@ -263,6 +256,8 @@ pub fn spawn_task(
     let parent = nix::unistd::getpid();
     let prepare = move || {
         reset_for_exec()?;
+        confinement.enter()?;
+        // A change of user takes the wish back, so it comes after.
         prctl::set_pdeathsig(Signal::SIGINT)?;
         // It died before the line above: nobody would send the signal any more.
         if nix::unistd::getppid() == parent { Ok(()) } else { Err(Errno::ESRCH.into()) }
@@ -272,12 +267,13 @@ pub fn spawn_task(
     Ok(command.spawn()?.id())
 }
 
-/// Starts a build script under bash, in its own process group, out of the way of everything that matters more.
+/// Starts a build script under bash, confined, in its own process group, `nice`, out of the way of everything that matters more.
 pub fn spawn_build(
     script: &Path,
     directory: &Path,
     environment: &BTreeMap<String, String>,
-    priority: BuildPriority,
+    nice: i32,
+    confinement: Confinement,
     output: PipeWriter,
 ) -> io::Result<tokio::process::Child> {
     let mut command = command(Path::new("/bin/bash"), environment);
@@ -288,13 +284,10 @@ pub fn spawn_build(
         // Being nice is a courtesy: where it is refused the build still runs.
         // SAFETY: both calls take integers only. The second is ioprio_set(this process, best effort, last).
         let _ = unsafe {
-            libc::setpriority(libc::PRIO_PROCESS, 0, priority.nice)
+            libc::setpriority(libc::PRIO_PROCESS, 0, nice)
                 | libc::syscall(libc::SYS_ioprio_set, 1, 0, (2 << 13) | 7) as libc::c_int
         };
-        if let Some(bytes) = priority.memory_bytes {
-            setrlimit(Resource::RLIMIT_AS, bytes, bytes)?;
-        }
-        Ok(())
+        confinement.enter()
     };
     // SAFETY: `prepare` only makes async-signal-safe system calls and allocates nothing.
     unsafe { command.pre_exec(prepare) };

@@ -12,9 +12,11 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use task_proto::DeploymentId;
 
+use crate::cgroup::RunLimits;
 use crate::durable;
 use crate::launch::Interrupt;
 use crate::process::{ExitStatus, ProcessIdentity};
+use crate::task_user::TaskUser;
 
 /// One start of a task, by its directory.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -36,6 +38,15 @@ pub struct RunSpec {
     pub interrupt: Interrupt,
     /// Where the task's output goes.
     pub log: LogSpec,
+    /// What it may use.
+    #[serde(default)]
+    pub limits: RunLimits,
+    /// Whom it runs as; absent: whoever the agent is.
+    #[serde(default)]
+    pub user: Option<TaskUser>,
+    /// The directory of its control group, if it has one. The supervisor makes it.
+    #[serde(default)]
+    pub cgroup: Option<PathBuf>,
 }
 
 /// Where a task's output goes and how much of it is kept.
@@ -66,6 +77,9 @@ pub struct Ended {
     pub status: ExitStatus,
     /// When: milliseconds since the machine booted, because a robot's clock may lie.
     pub at_uptime_ms: u64,
+    /// The memory it was limited to, if it was killed for using more.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub out_of_memory_bytes: Option<u64>,
 }
 
 /// A file of the run directory that could not be used.
@@ -180,7 +194,7 @@ mod tests {
         let temp = tempfile::tempdir().expect("temp dir");
         let dir = RunDir::create(&temp.path().join("run")).expect("create");
         assert_eq!(dir.ended().expect("read"), None);
-        let ended = Ended { status: ExitStatus::Signal(9), at_uptime_ms: 77 };
+        let ended = Ended { status: ExitStatus::Signal(9), at_uptime_ms: 77, out_of_memory_bytes: None };
         dir.write_ended(&ended).expect("write");
         assert_eq!(dir.ended().expect("read"), Some(ended));
         let text = std::fs::read_to_string(dir.path().join("exit.json")).expect("read");

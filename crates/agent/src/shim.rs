@@ -4,7 +4,7 @@
 //!
 //! It has no async runtime: two threads copy the output, the main thread waits for children.
 
-use std::io::{self, Write};
+use std::io::{self, PipeWriter, Write};
 use std::path::Path;
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
@@ -12,11 +12,13 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::Signal;
 use serde::{Deserialize, Serialize};
 
+use crate::cgroup::Cgroup;
+use crate::confinement::{self, Confinement};
 use crate::containment::Containment;
 use crate::logs::capture;
 use crate::process::ExitStatus;
 use crate::process::{self, ChildEvent, ProcessIdentity};
-use crate::run_dir::{Ended, RunDir, RunDirError, Started};
+use crate::run_dir::{Ended, RunDir, RunDirError, RunSpec, Started};
 
 /// How long what a task leaves behind may take to end after SIGTERM.
 const LEFTOVER_GRACE: Duration = Duration::from_secs(2);
@@ -62,11 +64,14 @@ pub enum ShimError {
 /// A started task and the end of its output.
 struct Task {
     started: Started,
+    containment: Containment,
+    memory_bytes: Option<u64>,
     drained: mpsc::Receiver<()>,
 }
 
 /// Runs the task of the run directory at `path` to its end. Call it before any other thread exists.
 pub fn run(path: &Path) -> Result<(), ShimError> {
+    confinement::protect_this_process();
     let dir = RunDir::create(path)?;
     let begun = process::become_shim().map_err(ShimError::Io).and_then(|()| begin(&dir));
     let answer = match &begun {
@@ -76,22 +81,25 @@ pub fn run(path: &Path) -> Result<(), ShimError> {
     tell(&answer);
     process::close_standard_streams()?;
     let task = begun?;
-    let own = &task.started.shim;
     let status = wait_for_task(task.started.task.pid)?;
-    end_leftovers(&Containment::new(dir.path(), Some(own.clone())))?;
+    end_leftovers(&task.containment)?;
     // What is still unread after this is in the hands of a process that hangs in the kernel.
     let _ = task.drained.recv_timeout(DRAIN_TIMEOUT);
     let at_uptime_ms = u64::try_from(process::uptime()?.as_millis()).unwrap_or(u64::MAX);
-    Ok(dir.write_ended(&Ended { status, at_uptime_ms })?)
+    let out_of_memory_bytes = task.memory_bytes.filter(|_| task.containment.is_out_of_memory());
+    dir.write_ended(&Ended { status, at_uptime_ms, out_of_memory_bytes })?;
+    // The next stop of this run or the next boot removes what is left here.
+    let _ = task.containment.remove();
+    Ok(())
 }
 
 fn begin(dir: &RunDir) -> Result<Task, ShimError> {
     let spec = dir.spec()?.ok_or_else(|| ShimError::NoSpec(dir.path().display().to_string()))?;
     let own = identity(std::process::id())?;
+    let containment = Containment::new(dir.path(), Some(own.clone()), spec.cgroup.clone());
     let (output, writer) = io::pipe()?;
     let (errors, error_writer) = io::pipe()?;
-    let spawned = process::spawn_task(&spec.script, &spec.directory, &spec.environment, writer, error_writer);
-    let pid = spawned.map_err(|source| {
+    let pid = start(&spec, writer, error_writer).map_err(|source| {
         let (script, directory) = (spec.script.display().to_string(), spec.directory.display().to_string());
         ShimError::Start { script, directory, source }
     })?;
@@ -106,13 +114,28 @@ fn begin(dir: &RunDir) -> Result<Task, ShimError> {
         dir.write_started(&started).map_err(ShimError::RunDir).map(|()| started)
     });
     match written {
-        Ok(started) => Ok(Task { started, drained }),
+        Ok(started) => Ok(Task { started, containment, memory_bytes: spec.limits.memory_bytes, drained }),
         Err(error) => {
             // A task that nobody could find again must not run.
-            end_leftovers(&Containment::new(dir.path(), Some(own)))?;
+            end_leftovers(&containment)?;
             Err(error)
         }
     }
+}
+
+fn start(spec: &RunSpec, output: PipeWriter, errors: PipeWriter) -> io::Result<u32> {
+    let cgroup = spec.cgroup.clone().map(Cgroup::at);
+    if let Some(cgroup) = &cgroup {
+        // Where it can't be, the shim stays with the agent and ends with all of its group, should that be ended.
+        let _ = cgroup.enter_shims();
+    }
+    let confinement = Confinement::new(&spec.script, cgroup.as_ref(), &spec.limits, spec.user.as_ref())?;
+    if let Some(user) = &spec.user {
+        // A task may open its output by name, as `/dev/stdout`.
+        user.own(&output)?;
+        user.own(&errors)?;
+    }
+    process::spawn_task(&spec.script, &spec.directory, &spec.environment, confinement, output, errors)
 }
 
 fn identity(pid: u32) -> Result<ProcessIdentity, ShimError> {

@@ -13,6 +13,7 @@ use std::time::Duration;
 
 use nix::sys::signal::Signal;
 
+use crate::cgroup::Cgroups;
 use crate::containment::{ASSIGNMENT_VARIABLE, Containment, ContainmentError, RUN_DIR_VARIABLE};
 use crate::launch::Interrupt;
 use crate::process;
@@ -31,6 +32,7 @@ const MAX_ANSWER_BYTES: u64 = 64 * 1024;
 #[derive(Debug, Clone)]
 pub struct Supervisor {
     program: PathBuf,
+    cgroups: Option<Cgroups>,
 }
 
 /// What a run directory and the process table say together.
@@ -47,6 +49,11 @@ pub enum Observed {
     },
     /// The task ended and the shim wrote down how.
     Exited(ExitStatus),
+    /// The kernel killed it because it used more memory than its limit.
+    OutOfMemory {
+        /// The limit.
+        limit_bytes: u64,
+    },
     /// It was started, but how it ended is not known: its shim was killed, or the machine went down. None of its
     /// processes is left.
     Gone,
@@ -81,20 +88,21 @@ pub enum SupervisorError {
 }
 
 impl Supervisor {
-    /// A supervisor whose shims are `program shim`.
-    pub fn new(program: impl Into<PathBuf>) -> Self {
-        Self { program: program.into() }
+    /// A supervisor whose shims are `program shim`, and whose runs get their control groups from `cgroups`.
+    pub fn new(program: impl Into<PathBuf>, cgroups: Option<Cgroups>) -> Self {
+        Self { program: program.into(), cgroups }
     }
 
     /// A supervisor whose shims are this very program, also after its file was replaced by a newer version.
-    pub fn of_this_program() -> Self {
-        Self::new("/proc/self/exe")
+    pub fn of_this_program(cgroups: Option<Cgroups>) -> Self {
+        Self::new("/proc/self/exe", cgroups)
     }
 
     /// Starts `spec` in the run directory at `path`; a run that already runs there is left as it is. The run survives
     /// the caller from the moment the shim exists: dropping this future does not take it back.
     pub async fn start(&self, path: &Path, spec: &RunSpec) -> Result<Started, SupervisorError> {
-        let (program, path, mut spec) = (self.program.clone(), path.to_owned(), spec.clone());
+        let (program, cgroups) = (self.program.clone(), self.cgroups.clone());
+        let (path, mut spec) = (path.to_owned(), spec.clone());
         let begun = tokio::task::spawn_blocking(move || {
             let dir = RunDir::create(&path)?;
             let lock = dir.lock()?;
@@ -104,7 +112,11 @@ impl Supervisor {
             }
             spec.environment.insert(ASSIGNMENT_VARIABLE.to_owned(), spec.assignment.to_string());
             spec.environment.insert(RUN_DIR_VARIABLE.to_owned(), dir.path().display().to_string());
+            spec.cgroup = cgroups.as_ref().map(|cgroups| cgroups.group(dir.path()).path().to_owned());
             dir.write_spec(&spec)?;
+            if let Some(cgroups) = cgroups {
+                cgroups.create(dir.path(), &spec.limits).map_err(failed("make the task's control group"))?;
+            }
             let answer = process::spawn_shim(&program, dir.path(), lock).map_err(failed("start the shim"))?;
             let mut line = Vec::new();
             answer.take(MAX_ANSWER_BYTES).read_to_end(&mut line).map_err(failed("read the shim's answer"))?;
@@ -126,22 +138,23 @@ impl Supervisor {
         if !path.join("spec.json").exists() {
             return Ok(Observed::NeverStarted);
         }
-        let (dir, started) = read(path).await?;
+        let (dir, started, cgroup) = read(path).await?;
         let Some(started) = started else {
             // The shim died before it wrote who it had started.
-            Containment::new(dir.path(), None).end(KILL_TIMEOUT).await?;
+            Containment::new(dir.path(), None, cgroup).end(KILL_TIMEOUT).await?;
             return Ok(Observed::NeverStarted);
         };
         // The order matters: a shim that is gone has written `exit.json` before, if it could.
         let shim_lives = started.shim.is_alive();
         if let Some(ended) = dir.ended()? {
-            return Ok(Observed::Exited(ended.status));
+            let killed = ended.out_of_memory_bytes.map(|limit_bytes| Observed::OutOfMemory { limit_bytes });
+            return Ok(killed.unwrap_or(Observed::Exited(ended.status)));
         }
         if shim_lives {
             let age = started.task.age().map_err(failed("read the machine's uptime"))?;
             return Ok(Observed::Running { pid: started.task.pid, age });
         }
-        Containment::new(dir.path(), None).end(KILL_TIMEOUT).await?;
+        Containment::new(dir.path(), None, cgroup).end(KILL_TIMEOUT).await?;
         Ok(Observed::Gone)
     }
 
@@ -168,8 +181,8 @@ impl Supervisor {
         if observed == Observed::NeverStarted && !path.exists() {
             return Ok(observed);
         }
-        let (dir, started) = read(path).await?;
-        let containment = Containment::new(dir.path(), started.as_ref().map(|started| started.shim.clone()));
+        let (dir, started, cgroup) = read(path).await?;
+        let containment = Containment::new(dir.path(), started.as_ref().map(|started| started.shim.clone()), cgroup);
         if let (Observed::Running { .. }, Some(started)) = (&observed, &started) {
             observed = self.end_run(&dir, &containment, &started.task, grace).await?;
         }
@@ -204,14 +217,14 @@ impl Supervisor {
     }
 }
 
-/// The run directory and who runs it, once no start is in progress; an error where one never ends.
-async fn read(path: &Path) -> Result<(RunDir, Option<Started>), SupervisorError> {
+/// The run directory, who runs it and in which control group, once no start is in progress; an error where one never ends.
+async fn read(path: &Path) -> Result<(RunDir, Option<Started>, Option<PathBuf>), SupervisorError> {
     let path = path.to_owned();
     let reading = tokio::task::spawn_blocking(move || {
         let dir = RunDir::create(&path)?;
         let _no_start_in_progress = dir.lock()?;
-        let started = dir.started()?;
-        Ok((dir, started))
+        let (started, spec) = (dir.started()?, dir.spec()?);
+        Ok((dir, started, spec.and_then(|spec| spec.cgroup)))
     });
     let read = tokio::time::timeout(START_TIMEOUT, reading).await.map_err(|_| SupervisorError::NoAnswer)?;
     read.map_err(|error| failed("read the run directory")(error.into()))?

@@ -7,12 +7,16 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use crate::cgroup::RunLimits;
+use crate::confinement::Confinement;
 use crate::containment::{Containment, RUN_DIR_VARIABLE};
 use crate::durable;
 use crate::installation::{Installation, RosVersion};
-use crate::process::{self, BuildPriority, ExitStatus};
+use crate::process::{self, ExitStatus};
 use crate::script;
 
+/// Added to the agent's niceness.
+const NICE: i32 = 10;
 /// How long setup files may take; those of a large workspace on a slow card take seconds.
 const SOURCING_TIMEOUT: Duration = Duration::from_secs(30);
 /// How long their processes may take to be gone.
@@ -67,12 +71,12 @@ async fn source(setups: &[PathBuf], environment: &BTreeMap<String, String>, dir:
     durable::write(&path, text.as_bytes(), 0o700)?;
     let mut environment = environment.clone();
     environment.insert(RUN_DIR_VARIABLE.to_owned(), dir.display().to_string());
-    let containment = Containment::new(&dir, None);
+    let containment = Containment::new(&dir, None, None);
     // An agent that was killed leaves its survey running.
     containment.end(KILL_TIMEOUT).await.map_err(io::Error::other)?;
     let (reader, writer) = io::pipe()?;
-    let priority = BuildPriority { nice: 10, memory_bytes: None };
-    let mut child = process::spawn_build(&path, &dir, &environment, priority, writer)?;
+    let confinement = Confinement::new(&path, None, &RunLimits::default(), None)?;
+    let mut child = process::spawn_build(&path, &dir, &environment, NICE, confinement, writer)?;
     // What setup files print is of no interest, but they must not wait for a reader.
     let draining = tokio::task::spawn_blocking(move || io::copy(&mut { reader }, &mut io::sink()));
     let ended = tokio::time::timeout(SOURCING_TIMEOUT, child.wait()).await;

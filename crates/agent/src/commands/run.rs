@@ -29,7 +29,7 @@ use crate::logs::forwarder::Forwarder;
 use crate::mqtt::{self, MqttAccess};
 use crate::rotation::Rotation;
 use crate::server::{self, Server};
-use crate::{clock, process};
+use crate::{clock, confinement, process};
 
 /// Messages from the link that the driver has not taken yet.
 const QUEUED_MESSAGES: usize = 16;
@@ -48,6 +48,7 @@ pub struct Arguments {
 /// Runs the agent until SIGINT or SIGTERM.
 pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     start_logging();
+    confinement::protect_this_process();
     // Two, also on one core: writing the ledger to a slow card must not keep the link from being served.
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
     let outcome = runtime.block_on(drive(arguments));

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use task_proto::report::{ActiveVersion, Condition, Failure, Phase, Report, TaskReport};
+use task_proto::report::{ActiveVersion, Condition, Failure, FailureCode, Phase, Report, TaskReport};
 use task_proto::{Generation, TaskName};
 
 use super::{Driver, View};
@@ -50,6 +50,9 @@ impl<E: Effects> Driver<E> {
         if self.ledger.removed {
             conditions
                 .push(condition("removed", "the server does not accept this robot's token: nothing new is begun"));
+        }
+        if let Some(text) = &self.robot.no_task_user {
+            conditions.push(condition(FailureCode::NO_TASK_USER.as_str(), text));
         }
         let wall_ms = self.effects.now().wall_ms;
         if self.desired.as_ref().is_some_and(|state| admission::is_expired(state, wall_ms)) {

@@ -16,6 +16,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::{Effects, Now};
 use crate::builder::{self, BuildError, BuildLimits, BuildOrder};
+use crate::cgroup::{Cgroups, RunLimits};
 use crate::config::Config;
 use crate::fetch::{self, FetchError, Fetcher};
 use crate::gate::Gate;
@@ -24,8 +25,10 @@ use crate::layout::{DataDir, VersionDir};
 use crate::ledger::{ActiveRun, GateQuestion, Ledger, LedgerError, ProcessRecord};
 use crate::observed::{Exit, Health, Prepared, ProcessState, RobotFacts};
 use crate::plan::StepFailure;
+use crate::process::ExitStatus;
 use crate::run_dir::{LogSpec, RunSpec};
 use crate::supervisor::{Observed, Supervisor, SupervisorError};
+use crate::task_user::{TaskUser, TaskUserError};
 use crate::underlay::{self, Places};
 use crate::{clock, disk, durable, environment, installation, launch, logs, script, survey};
 
@@ -50,6 +53,9 @@ pub struct Robot {
     ros: RwLock<Vec<Installation>>,
     environment: BTreeMap<String, String>,
     build_limits: BuildLimits,
+    cgroups: Option<Cgroups>,
+    task_user: Result<Option<TaskUser>, TaskUserError>,
+    task_limits: RunLimits,
     log_bytes: Option<u64>,
     mac: MacAddress,
 }
@@ -67,13 +73,19 @@ impl Robot {
             build_limits.timeout = Duration::from_secs(timeout_s);
         }
         build_limits.memory_bytes = config.limits.build_memory_bytes.or(build_limits.memory_bytes);
+        build_limits.pids = Some(config.task_pids);
+        let memory_bytes = config.limits.task_memory_mb.map(|megabytes| megabytes << 20);
+        let cgroups = Cgroups::find();
         let environment = environment::of_this_robot(&settings);
         let gate = config.gate.clone().map(|gate| Gate::new(gate, robot.clone(), environment.clone(), data.root()));
         Self {
             data,
             fetcher,
             gate,
-            supervisor: Supervisor::of_this_program(),
+            supervisor: Supervisor::of_this_program(cgroups.clone()),
+            cgroups,
+            task_user: TaskUser::find(config.task_user.as_deref()),
+            task_limits: RunLimits { memory_bytes, cpu_weight: None, pids: Some(config.task_pids) },
             ros: RwLock::new(underlay::find(&config.underlays, &Places::of_this_machine())),
             underlays: config.underlays.clone(),
             environment,
@@ -111,6 +123,30 @@ impl Robot {
         let found = underlay::setup_files(&self.installations(), version, &manifest.requires.ros_distro);
         found.map_err(|error| finally(FailureCode::REQUIREMENTS_UNMET, &error))
     }
+
+    /// Whom the task and its builds run as, once the way to its directories is open, and the environment they have.
+    fn account(&self, task: &TaskName) -> Result<(Option<TaskUser>, BTreeMap<String, String>), StepFailure> {
+        let user = self.task_user.clone().map_err(|error| later(FailureCode::NO_TASK_USER, &error, 0))?;
+        let mut environment = self.environment.clone();
+        if let Some(user) = &user {
+            let home = self.data.task(task).home();
+            let opened = user.make_home(&home).and_then(|()| user.let_through(&self.data.way_to(task)));
+            opened.map_err(|error| later(FailureCode::IO_ERROR, &error, 0))?;
+            environment.insert("HOME".to_owned(), home.display().to_string());
+            environment.extend(["USER", "LOGNAME"].map(|name| (name.to_owned(), user.name.clone())));
+        }
+        Ok((user, environment))
+    }
+
+    /// What the task may use: what its package says, else what this robot's settings say.
+    fn limits(&self, manifest: &TaskManifest) -> RunLimits {
+        let (limits, settings) = (&manifest.limits, self.task_limits);
+        RunLimits {
+            memory_bytes: limits.memory_mb.map(|megabytes| megabytes << 20).or(settings.memory_bytes),
+            cpu_weight: limits.cpu_weight,
+            pids: limits.pids.map(u64::from).or(settings.pids),
+        }
+    }
 }
 
 impl Robot {
@@ -147,7 +183,8 @@ impl Effects for Robot {
 
     fn robot_facts(&self) -> RobotFacts {
         let installations = Some(self.installations());
-        RobotFacts { arch: std::env::consts::ARCH.to_owned(), labels: None, installations }
+        let no_task_user = self.task_user.as_ref().err().map(TaskUserError::to_string);
+        RobotFacts { arch: std::env::consts::ARCH.to_owned(), labels: None, installations, no_task_user }
     }
 
     async fn look_for_ros(&self) {
@@ -158,6 +195,7 @@ impl Effects for Robot {
 
     fn host_facts(&self) -> HostFacts {
         let installations = self.installations();
+        let isolates = self.cgroups.as_ref().is_some_and(Cgroups::isolates);
         HostFacts {
             agent_version: env!("CARGO_PKG_VERSION").to_owned(),
             hostname: std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default().trim().to_owned(),
@@ -166,7 +204,7 @@ impl Effects for Robot {
             ros_distros: installation::all_distros(&installations),
             disk_free_bytes: disk::room(self.data.root()).map_or(0, |room| room.free),
             ros: environment::ros_facts(&installations, &self.environment),
-            isolation: Isolation::None,
+            isolation: if isolates { Isolation::Cgroup } else { Isolation::None },
         }
     }
 
@@ -181,7 +219,9 @@ impl Effects for Robot {
                 };
                 match self.supervisor.observe(&entry.path()).await {
                     Ok(Observed::Running { .. }) => last = Some((true, run)),
-                    Ok(Observed::Exited(_) | Observed::Gone) if !matches!(last, Some((true, _))) => {
+                    Ok(Observed::Exited(_) | Observed::OutOfMemory { .. } | Observed::Gone)
+                        if !matches!(last, Some((true, _))) =>
+                    {
                         last = Some((false, run));
                     }
                     _ => {}
@@ -207,14 +247,16 @@ impl Effects for Robot {
     }
 
     async fn process(&self, task: &TaskName, process: &ProcessRecord) -> ProcessState {
-        let exit = |status| {
-            ProcessState::Ended(Exit { status, last_lines: logs::last_lines(&self.log(task).path, TAIL_BYTES) })
+        let exit = |status, out_of_memory_bytes| {
+            let last_lines = logs::last_lines(&self.log(task).path, TAIL_BYTES);
+            ProcessState::Ended(Exit { status, out_of_memory_bytes, last_lines })
         };
         match self.supervisor.observe(&self.run_dir(task, process)).await {
             Ok(Observed::NeverStarted) => ProcessState::NeverStarted,
             Ok(Observed::Running { pid, .. }) => ProcessState::Alive { pid },
-            Ok(Observed::Exited(status)) => exit(Some(status)),
-            Ok(Observed::Gone) => exit(None),
+            Ok(Observed::Exited(status)) => exit(Some(status), None),
+            Ok(Observed::OutOfMemory { limit_bytes }) => exit(Some(ExitStatus::Signal(9)), Some(limit_bytes)),
+            Ok(Observed::Gone) => exit(None, None),
             Err(error) => {
                 tracing::error!(%task, error = %chain(&error), "cannot tell what became of the process");
                 ProcessState::Unknown
@@ -259,13 +301,16 @@ impl Effects for Robot {
     async fn build(&self, package: &PackageRef, cancel: &CancellationToken) -> Result<(), StepFailure> {
         let manifest = self.manifest(package).await?;
         let version = self.version(package);
+        let (user, environment) = self.account(&package.name)?;
         let order = BuildOrder {
             tool: manifest.build.tool,
             underlays: self.setup_files(&manifest)?,
-            environment: self.environment.clone(),
+            environment,
             log: self.data.task(&package.name).build_log(),
             limits: self.build_limits,
             version: version.clone(),
+            user,
+            cgroups: self.cgroups.clone(),
         };
         builder::build(&order, cancel).await.map_err(|error| self.build_failure(error))?;
         let marker = version.root().join(BUILT_MARKER);
@@ -285,7 +330,9 @@ impl Effects for Robot {
         let manifest = self.manifest(&run.package).await?;
         let version = self.version(&run.package);
         let text = script::run_script(&manifest, &version, &self.setup_files(&manifest)?);
-        durable::write(&version.run_script(), text.as_bytes(), 0o700).map_err(|error| failed(&error))?;
+        let (user, environment) = self.account(task)?;
+        durable::write(&version.run_script(), text.as_bytes(), 0o755).map_err(|error| failed(&error))?;
+        user.as_ref().map_or(Ok(()), |user| user.hand_over(version.root())).map_err(|error| failed(&error))?;
         let task_dir = self.data.task(task);
         task_dir.set_current(&run.package.manifest.digest).map_err(|error| failed(&error))?;
         durable::create_dir_all(&task_dir.logs()).map_err(|error| failed(&error))?;
@@ -293,9 +340,12 @@ impl Effects for Robot {
             assignment: run.deployment.clone(),
             script: version.run_script(),
             directory: script::run_directory(manifest.build.tool, &version),
-            environment: self.environment.clone(),
+            environment,
             interrupt: launch::of(&manifest).interrupt,
             log: self.log(task),
+            limits: self.limits(&manifest),
+            user,
+            cgroup: None,
         };
         let run_dir = self.run_dir(task, process);
         let record = serde_json::to_vec(run).map_err(|error| failed(&error))?;

@@ -273,7 +273,9 @@ impl World {
             None => ProcessState::None,
             Some(process) if self.alive.contains(&process.dir) => ProcessState::Alive { pid: 7 },
             Some(process) => match self.ended.iter().find(|(dir, _)| *dir == process.dir) {
-                Some((_, status)) => ProcessState::Ended(Exit { status: *status, last_lines: String::new() }),
+                Some((_, status)) => {
+                    ProcessState::Ended(Exit { status: *status, out_of_memory_bytes: None, last_lines: String::new() })
+                }
                 None => ProcessState::NeverStarted,
             },
         };

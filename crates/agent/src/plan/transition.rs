@@ -256,7 +256,7 @@ pub(super) fn ended(s: &Situation<'_>, exit: &Exit) -> TaskRecord {
             Restart::OnFailure => !exit.is_success(),
             Restart::Always => true,
         };
-        give_up_or_retry(&mut record, s, Failure::new(FailureCode::PROCESS_EXITED, exit.text()), again);
+        give_up_or_retry(&mut record, s, exit.failure(), again);
     }
     record.settle_phase(s.now_ms);
     record
@@ -326,7 +326,7 @@ fn came_back_in_vain(record: &mut TaskRecord, phase: Phase, what: &str) {
 }
 
 fn exited(exit: &Exit) -> End {
-    End { phase: Phase::Failed, failure: Some(Failure::new(FailureCode::PROCESS_EXITED, exit.text())) }
+    End { phase: Phase::Failed, failure: Some(exit.failure()) }
 }
 
 fn interrupted(text: &str) -> End {

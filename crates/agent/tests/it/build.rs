@@ -1,11 +1,12 @@
 //! Packages are built: by the real colcon where that matters, by stand-ins where it is about limits.
 
 use std::collections::BTreeMap;
-use std::os::unix::fs::PermissionsExt;
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::PathBuf;
 use std::time::Duration;
 
 use task_agent::builder::{self, BuildError, BuildLimits, BuildOrder};
+use task_agent::cgroup::{Cgroups, RunLimits};
 use task_agent::installation::RosVersion;
 use task_agent::launch::Interrupt;
 use task_agent::layout::DataDir;
@@ -19,7 +20,7 @@ use task_proto::manifest::{BuildTool, TaskManifest};
 use task_proto::report::FailureCode;
 use tokio_util::sync::CancellationToken;
 
-use crate::harness::{eventually, supervisor, within, write};
+use crate::harness::{eventually, lives, other_user, supervisor, within, write};
 
 /// A version directory with an order to build it.
 struct TestBuild {
@@ -40,6 +41,8 @@ impl TestBuild {
             environment: environment::of_this_robot(&BTreeMap::new()),
             log: dir.path().join("build.log"),
             limits: BuildLimits::of_this_machine(),
+            user: None,
+            cgroups: None,
         };
         Self { dir, order }
     }
@@ -151,6 +154,9 @@ async fn a_real_ros_package_is_built_and_runs_under_its_shim() {
         environment: build.order.environment.clone(),
         interrupt: Interrupt::Group,
         log: LogSpec::at(build.dir.path().join("task.log")),
+        limits: RunLimits::default(),
+        user: None,
+        cgroup: None,
     };
     supervisor().start(&run_dir, &spec).await.expect("started");
     let ended = within("the node", supervisor().wait(&run_dir)).await.expect("observed");
@@ -260,12 +266,47 @@ async fn a_build_that_is_dropped_or_takes_too_long_leaves_nothing() {
     assert_eq!(build.processes(), 0);
 }
 
+/// Starts a process that leaves the build's session and environment.
+const ESCAPE: &str = "env -i setsid bash -c 'echo $$ > escaped.tmp; mv escaped.tmp escaped; exec sleep 1000' & \
+                      until [ -e escaped ]; do :; done; exit 3";
+
+#[tokio::test]
+async fn nothing_gets_away_from_a_build_in_a_control_group() {
+    let mut build = TestBuild::with_colcon(ESCAPE);
+    build.order.cgroups = Cgroups::find();
+    let Some(cgroups) = &build.order.cgroups else {
+        eprintln!("unavailable: this machine has no control groups that may be written to");
+        return;
+    };
+    let error = build.run().await.expect_err("colcon failed");
+    assert!(matches!(error, BuildError::Failed { status: ExitStatus::Code(3), .. }), "{error:?}");
+    let pid = std::fs::read_to_string(build.order.version.root().join("escaped")).expect("its pid");
+    assert!(!lives(pid.trim().parse().expect("a pid")));
+    assert!(!cgroups.group(build.order.version.root()).path().exists());
+}
+
+#[tokio::test]
+async fn a_build_of_the_task_user_owns_what_it_makes_and_has_no_powers() {
+    let Some(user) = other_user() else { return };
+    let mut build =
+        TestBuild::with_colcon("mkdir -p install/talker; id -u; grep -E 'NoNewPrivs|CapBnd' /proc/self/status");
+    user.let_through(&[
+        build.dir.path().to_owned(),
+        build.dir.path().join("tasks"),
+        build.dir.path().join("tasks/talker"),
+    ])
+    .expect("let through");
+    build.order.user = Some(user.clone());
+    build.run().await.unwrap_or_else(|error| panic!("{error}: {}", build.log()));
+    let log = build.log().replace('\t', "");
+    assert!(log.contains(&format!("{}\nCapBnd:0000000000000000\nNoNewPrivs:1\n", user.uid)), "{log}");
+    let owner = |name: &str| std::fs::metadata(build.order.version.root().join(name)).expect("there").uid();
+    assert_eq!((owner("src"), owner("install/talker")), (user.uid, user.uid));
+}
+
 #[tokio::test]
 async fn a_process_that_got_away_from_a_build_holds_nobody_up() {
-    let build = TestBuild::with_colcon(
-        "env -i setsid bash -c 'echo $$ > escaped.tmp; mv escaped.tmp escaped; exec sleep 1000' & \
-         until [ -e escaped ]; do :; done; exit 3",
-    );
+    let build = TestBuild::with_colcon(ESCAPE);
     let error = build.run().await.expect_err("colcon failed");
     let pid = std::fs::read_to_string(build.order.version.root().join("escaped")).expect("its pid");
     let escaped = process::ProcessIdentity::of(pid.trim().parse().expect("a pid")).expect("process table");

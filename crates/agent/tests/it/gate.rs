@@ -66,7 +66,7 @@ async fn without_an_answer_the_setting_decides_and_nothing_is_left_of_it() {
     let failure = ask(dir.path(), hang, short, GateDefault::Deny).await.expect_err("no");
     assert!(failure.to_string().starts_with("gate_failed: the gate "), "{failure}");
     assert!(failure.text.contains("did not answer"), "{failure}");
-    let left = Containment::new(&dir.path().join("gate/talker"), None).members().expect("the process table");
+    let left = Containment::new(&dir.path().join("gate/talker"), None, None).members().expect("the process table");
     assert_eq!(left, []);
     let crash = ask(dir.path(), "kill -SEGV $$", LONG, GateDefault::Deny).await.expect_err("no");
     assert!(crash.text.contains("crashed: killed by SIGSEGV"), "{crash}");
@@ -83,7 +83,7 @@ async fn one_that_is_no_longer_waited_for_is_ended() {
         answer = ask(dir.path(), &script, LONG, GateDefault::Deny) => panic!("it answered: {answer:?}"),
         () = eventually("it runs", || started.exists().then_some(())) => {}
     }
-    let marked = Containment::new(&dir.path().join("gate/talker"), None);
+    let marked = Containment::new(&dir.path().join("gate/talker"), None, None);
     let is_empty = || marked.members().expect("the process table").is_empty().then_some(());
     eventually("it is gone", is_empty).await;
 }

@@ -2,15 +2,20 @@
 
 use std::collections::BTreeMap;
 use std::future::Future;
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
+use task_agent::cgroup::{Cgroups, RunLimits};
+use task_agent::containment::Containment;
 use task_agent::environment;
 use task_agent::launch::Interrupt;
 use task_agent::logs::record::Record;
 use task_agent::process::ProcessEntry;
-use task_agent::run_dir::{LogSpec, RunSpec};
+use task_agent::run_dir::{LogSpec, RunDir, RunSpec};
 use task_agent::supervisor::Supervisor;
+use task_agent::task_user::TaskUser;
 
 /// Longer than anything here takes on a loaded machine.
 const DEADLINE: Duration = Duration::from_secs(60);
@@ -54,8 +59,36 @@ impl TestRun {
             environment: environment::of_this_robot(&BTreeMap::new()),
             interrupt: Interrupt::Group,
             log: LogSpec::at(dir.path().join("task.log")),
+            limits: RunLimits::default(),
+            user: None,
+            cgroup: None,
         };
         Self { dir, supervisor: supervisor(), spec }
+    }
+
+    /// The same with the machine's control groups, where there are any.
+    pub fn grouped(script: &str) -> Self {
+        let mut run = Self::of(script);
+        run.supervisor = grouped_supervisor();
+        run
+    }
+
+    /// Makes it run as `user`, in a directory of that user's own, below one that it can only pass through.
+    pub fn run_as(&mut self, user: &TaskUser) {
+        self.spec.directory = self.path("work");
+        user.make_home(&self.spec.directory).expect("handed over");
+        std::fs::set_permissions(self.path("."), std::fs::Permissions::from_mode(0o700)).expect("closed");
+        user.let_through(&[self.path(".")]).expect("let through");
+        self.spec.user = Some(user.clone());
+    }
+
+    fn cgroup_if_any(&self) -> Option<PathBuf> {
+        RunDir::create(&self.run_dir()).ok()?.spec().ok()??.cgroup
+    }
+
+    /// The run's control group, as a new agent finds it.
+    pub fn cgroup(&self) -> Option<PathBuf> {
+        RunDir::create(&self.run_dir()).expect("run dir").spec().expect("spec").expect("written").cgroup
     }
 
     /// Where the script runs.
@@ -91,13 +124,31 @@ impl TestRun {
 /// No test leaves a process behind, whatever it died of.
 impl Drop for TestRun {
     fn drop(&mut self) {
-        let _ = task_agent::containment::Containment::new(&self.run_dir(), None).kill();
+        let containment = Containment::new(&self.run_dir(), None, self.cgroup_if_any());
+        let _ = containment.kill().and_then(|_| containment.remove());
     }
 }
 
-/// A supervisor whose shims are the binary under test.
+/// A supervisor whose shims are the binary under test, and that uses the machine's control groups, if it may.
+pub fn grouped_supervisor() -> Supervisor {
+    Supervisor::new(env!("CARGO_BIN_EXE_task-agent"), Cgroups::find())
+}
+
+/// A user id that no other test uses; `None`, said aloud, for tests that do not run as root.
+#[expect(clippy::print_stderr, reason = "what is not tested is said aloud")]
+pub fn other_user() -> Option<TaskUser> {
+    static USED: AtomicU32 = AtomicU32::new(0);
+    if !nix::unistd::geteuid().is_root() {
+        eprintln!("unavailable: only root can start something as another user");
+        return None;
+    }
+    let uid = 1_000_000 + std::process::id() % 100_000 * 100 + USED.fetch_add(1, Ordering::Relaxed);
+    Some(TaskUser { name: uid.to_string(), uid, gid: uid, groups: vec![uid + 50] })
+}
+
+/// A supervisor whose shims are the binary under test, and that has no control groups.
 pub fn supervisor() -> Supervisor {
-    Supervisor::new(env!("CARGO_BIN_EXE_task-agent"))
+    Supervisor::new(env!("CARGO_BIN_EXE_task-agent"), None)
 }
 
 /// Whether `pid` is there and no zombie.

@@ -5,6 +5,7 @@
 mod agent;
 mod archive;
 mod build;
+mod contain;
 mod fetch;
 mod gate;
 mod graph;

@@ -7,7 +7,7 @@ use rand::SeedableRng as _;
 use task_proto::api::RobotView;
 use task_proto::report::Phase;
 
-use crate::harness::{Fleet, Robot, Server, eventually, write_package};
+use crate::harness::{Fleet, Robot, Server, eventually, open_directory, write_package};
 use crate::proxy::Proxy;
 
 fn pid_of(robot: &RobotView, task: &str) -> Option<u32> {
@@ -92,7 +92,7 @@ async fn nothing_is_stuck_or_lost_after_a_hundred_power_cuts() {
     let mut fleet = Fleet::start(2).await;
     // Each job leaves a line per start, so that a second start of one run would show.
     let starts = fleet.dir.path().join("starts");
-    std::fs::create_dir(&starts).expect("directory");
+    open_directory(&starts);
     let mut newest = String::new();
     let mut jobs = Vec::new();
     for cut in 0..100 {

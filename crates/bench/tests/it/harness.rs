@@ -5,6 +5,7 @@
 use std::ffi::OsStr;
 use std::fs::File;
 use std::net::SocketAddr;
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -17,6 +18,9 @@ use tempfile::TempDir;
 
 /// How long anything that should happen may take on a busy machine.
 pub const PATIENCE: Duration = Duration::from_secs(90);
+
+/// Whom the robots' tasks run as where the tests run as root, as agents on real robots do: nobody who owns anything.
+pub const TASK_USER: &str = "65534";
 
 /// The path of one of the workspace's programs.
 pub fn program(name: &str) -> PathBuf {
@@ -258,6 +262,10 @@ impl Robot {
         let log = log_file(&self.data.with_extension("agent.log"));
         let mut command = Command::new(program("task-agent"));
         command.arg("run").arg("--data").arg(&self.data);
+        if nix::unistd::geteuid().is_root() {
+            let ros = self.environment.iter().any(|(name, _)| name == "TASK_AGENT_UNDERLAYS");
+            command.env("TASK_AGENT_TASK_USER", if ros && !ros_is_for_all() { "root" } else { TASK_USER });
+        }
         command.envs(self.environment.iter().map(|(k, v)| (k, v)));
         command.stdout(log.try_clone().expect("log")).stderr(log);
         self.process = Some(Process::spawn(&mut command));
@@ -347,6 +355,19 @@ pub fn write_package(dir: &Path, name: &str, version: &str, kind: &str, script: 
     );
     std::fs::write(dir.join("task.toml"), toml).expect("task.toml");
     std::fs::write(dir.join("main.sh"), script).expect("main.sh");
+}
+
+/// Whether any user may run the Python of the ROS that the tests use; a Python in root's home is for root only.
+fn ros_is_for_all() -> bool {
+    let python = Path::new(&required("TASKD_TEST_ROS")).join("bin/python3");
+    let open = |path: &Path| path.metadata().is_ok_and(|data| data.permissions().mode() & 0o001 != 0);
+    [python.canonicalize().expect("python3"), python].iter().all(|path| path.ancestors().all(open))
+}
+
+/// A directory that tasks may write to, whoever they run as.
+pub fn open_directory(path: &Path) {
+    std::fs::create_dir(path).expect("directory");
+    std::fs::set_permissions(path, std::fs::Permissions::from_mode(0o1777)).expect("open to all");
 }
 
 fn log_file(path: &Path) -> File {

@@ -1,0 +1,200 @@
+//! The account that builds and tasks run as where the agent is root: found by name or number, and given what it needs of
+//! the agent's directories, which is its tasks' own files and the way to them. It reads `/etc/passwd` and `/etc/group`
+//! itself, because a static program can't load the system's name services. It never creates an account.
+
+use std::fs;
+use std::io;
+use std::os::fd::{AsFd, AsRawFd as _, OwnedFd};
+use std::os::unix::fs::PermissionsExt as _;
+use std::path::{Path, PathBuf};
+
+use nix::fcntl::{AtFlags, OFlag, openat};
+use nix::sys::stat::{FileStat, Mode, SFlag, fstat, fstatat};
+use nix::unistd::{Gid, Uid, fchown, fchownat};
+use serde::{Deserialize, Serialize};
+
+/// The account that is used when the settings name none.
+pub const DEFAULT_NAME: &str = "taskd-task";
+/// How deep a tree may be that is handed over.
+const MAX_DEPTH: usize = 256;
+
+/// An account.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct TaskUser {
+    /// Its name, or its number where it has no name.
+    pub name: String,
+    /// Its user id.
+    pub uid: u32,
+    /// Its group.
+    pub gid: u32,
+    /// The other groups it is in: `dialout`, `video`, …
+    pub groups: Vec<u32>,
+}
+
+/// Why tasks can't run on this robot.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum TaskUserError {
+    /// There is no such account.
+    #[error(
+        "the agent runs as root, and there is no user {name:?} that tasks could run as: make one (`useradd --system \
+         {DEFAULT_NAME}`), or name another by `task_user` in agent.toml (\"root\" if tasks are to have the whole \
+         machine), and restart the agent"
+    )]
+    Missing {
+        /// The name.
+        name: String,
+    },
+    /// Only root may run things as somebody else.
+    #[error("task_user is {name:?}, but the agent does not run as root and can't start anything as another user")]
+    NotRoot {
+        /// The name.
+        name: String,
+    },
+}
+
+impl TaskUser {
+    /// The account that `setting` means; `None`: builds and tasks run as whoever the agent is.
+    pub fn find(setting: Option<&str>) -> Result<Option<Self>, TaskUserError> {
+        let text = |path: &str| fs::read(path).map(|bytes| String::from_utf8_lossy(&bytes).into_owned());
+        let (passwd, group) = (text("/etc/passwd").unwrap_or_default(), text("/etc/group").unwrap_or_default());
+        Self::choose(setting, nix::unistd::geteuid().as_raw(), &passwd, &group)
+    }
+
+    fn choose(setting: Option<&str>, own: u32, passwd: &str, group: &str) -> Result<Option<Self>, TaskUserError> {
+        if setting.is_none() && own != 0 {
+            return Ok(None);
+        }
+        let name = setting.unwrap_or(DEFAULT_NAME);
+        let user =
+            Self::look_up(name, passwd, group).ok_or_else(|| TaskUserError::Missing { name: name.to_owned() })?;
+        if user.uid == own {
+            return Ok(None);
+        }
+        if own == 0 { Ok(Some(user)) } else { Err(TaskUserError::NotRoot { name: name.to_owned() }) }
+    }
+
+    fn look_up(name: &str, passwd: &str, group: &str) -> Option<Self> {
+        let number: Option<u32> = name.parse().ok();
+        let listed = passwd.lines().find_map(|line| {
+            let mut fields = line.split(':');
+            let (listed, _) = (fields.next()?, fields.next()?);
+            let (uid, gid): (u32, u32) = (fields.next()?.parse().ok()?, fields.next()?.parse().ok()?);
+            (listed == name || Some(uid) == number).then(|| (listed.to_owned(), uid, gid))
+        });
+        let (name, uid, gid) = listed.or_else(|| Some((name.to_owned(), number?, number?)))?;
+        let is_member = |members: &str| members.split(',').any(|member| member == name);
+        let in_groups = group.lines().filter_map(|line| {
+            let mut fields = line.split(':').skip(2);
+            let (gid, members) = (fields.next()?.parse().ok()?, fields.next()?);
+            is_member(members).then_some(gid)
+        });
+        let groups = in_groups.filter(|other| *other != gid).collect();
+        Some(Self { name, uid, gid, groups })
+    }
+
+    /// Lets the account pass through `dirs`, without seeing what is in them.
+    pub fn let_through(&self, dirs: &[PathBuf]) -> io::Result<()> {
+        for dir in dirs {
+            let mode = fs::metadata(dir)?.permissions().mode();
+            if mode & 0o001 == 0 {
+                fs::set_permissions(dir, fs::Permissions::from_mode(mode & 0o7777 | 0o001))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Makes an open file the account's.
+    pub fn own(&self, file: impl AsFd) -> io::Result<()> {
+        Ok(fchown(file, Some(self.user()), Some(self.group()))?)
+    }
+
+    /// Makes a directory of the account's own, for nobody else.
+    pub fn make_home(&self, dir: &Path) -> io::Result<()> {
+        crate::durable::create_dir_all(dir)?;
+        self.hand_over(dir)
+    }
+
+    /// Makes the tree at `dir` the account's, for nobody else. `dir` itself comes last, so that a tree that was handed
+    /// over in part is done again, and a tree that is the account's is not touched: what a task made of it is its own
+    /// affair, and nothing that it put there is followed.
+    pub fn hand_over(&self, dir: &Path) -> io::Result<()> {
+        let flags = OFlag::O_RDONLY | OFlag::O_DIRECTORY | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
+        let opened = nix::fcntl::open(dir, flags, Mode::empty())?;
+        if fstat(&opened)?.st_uid == self.uid {
+            return Ok(());
+        }
+        self.hand_over_below(&opened, 0)?;
+        nix::sys::stat::fchmod(&opened, Mode::S_IRWXU)?;
+        Ok(fchown(&opened, Some(self.user()), Some(self.group()))?)
+    }
+
+    fn hand_over_below(&self, dir: &OwnedFd, depth: usize) -> io::Result<()> {
+        if depth > MAX_DEPTH {
+            return Err(io::Error::other(format!("a directory lies more than {MAX_DEPTH} levels deep")));
+        }
+        for entry in fs::read_dir(format!("/proc/self/fd/{}", dir.as_raw_fd()))? {
+            let name = entry?.file_name();
+            let flags = OFlag::O_RDONLY | OFlag::O_DIRECTORY | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
+            let stat = fstatat(dir, name.as_os_str(), AtFlags::AT_SYMLINK_NOFOLLOW)?;
+            if is_kind(&stat, SFlag::S_IFDIR) {
+                let below = openat(dir, name.as_os_str(), flags, Mode::empty())?;
+                self.hand_over_below(&below, depth + 1)?;
+                fchown(&below, Some(self.user()), Some(self.group()))?;
+            } else if !is_kind(&stat, SFlag::S_IFREG) || stat.st_nlink == 1 {
+                // A file with a second name may be anybody's; packages have none.
+                let (user, group) = (Some(self.user()), Some(self.group()));
+                fchownat(dir, name.as_os_str(), user, group, AtFlags::AT_SYMLINK_NOFOLLOW)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn user(&self) -> Uid {
+        Uid::from_raw(self.uid)
+    }
+
+    fn group(&self) -> Gid {
+        Gid::from_raw(self.gid)
+    }
+}
+
+fn is_kind(stat: &FileStat, kind: SFlag) -> bool {
+    stat.st_mode & SFlag::S_IFMT.bits() == kind.bits()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PASSWD: &str = "root:x:0:0:root:/root:/bin/bash\nbroken line\ntaskd-task:x:997:995::/:/bin/false\n";
+    const GROUP: &str = "dialout:x:20:alice,taskd-task\nvideo:x:44:taskd-task\nsudo:x:27:alice\ntaskd-task:x:995:\n";
+
+    fn choose(setting: Option<&str>, own: u32) -> Result<Option<TaskUser>, TaskUserError> {
+        TaskUser::choose(setting, own, PASSWD, GROUP)
+    }
+
+    #[test]
+    fn root_uses_the_task_account_with_its_groups() {
+        let user = TaskUser { name: DEFAULT_NAME.to_owned(), uid: 997, gid: 995, groups: vec![20, 44] };
+        assert_eq!(choose(None, 0), Ok(Some(user.clone())));
+        assert_eq!(choose(Some("997"), 0), Ok(Some(user)));
+        let by_number = TaskUser { name: "4711".to_owned(), uid: 4711, gid: 4711, groups: Vec::new() };
+        assert_eq!(choose(Some("4711"), 0), Ok(Some(by_number)));
+    }
+
+    #[test]
+    fn root_must_be_said_and_a_missing_account_is_never_replaced_by_it() {
+        assert_eq!(choose(Some("root"), 0), Ok(None));
+        assert_eq!(choose(Some("0"), 0), Ok(None));
+        let missing = TaskUser::choose(None, 0, "root:x:0:0::/:/bin/sh\n", "").expect_err("refused").to_string();
+        assert!(missing.contains("useradd --system taskd-task") && missing.contains("task_user"), "{missing}");
+        assert!(choose(Some("tasks"), 0).expect_err("refused").to_string().contains("\"tasks\""));
+    }
+
+    #[test]
+    fn an_agent_that_is_not_root_runs_tasks_as_itself() {
+        assert_eq!(choose(None, 1000), Ok(None));
+        assert_eq!(choose(Some("1000"), 1000), Ok(None));
+        assert!(matches!(choose(Some("root"), 1000), Err(TaskUserError::NotRoot { .. })));
+    }
+}

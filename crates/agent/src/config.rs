@@ -13,7 +13,6 @@ use task_proto::log::LogLevel;
 use toml::{Table, Value};
 
 use crate::durable;
-use crate::logs::forwarder::ForwardSettings;
 
 /// The file's name.
 pub const FILE_NAME: &str = "agent.toml";
@@ -149,6 +148,15 @@ pub struct GateConfig {
     pub timeout: Duration,
     /// What it means when there is no answer.
     pub default: GateDefault,
+}
+
+/// Which log lines go to the server while nobody follows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ForwardSettings {
+    /// Only these and more serious ones.
+    pub level: LogLevel,
+    /// Lines a second and task.
+    pub lines_per_s: u32,
 }
 
 /// The settings that hold, defaults filled in.

@@ -15,6 +15,7 @@ use super::record::Record;
 use super::tail::Tail;
 use super::{Following, files};
 use crate::clock;
+use crate::config::ForwardSettings;
 use crate::layout::DataDir;
 
 /// How often the files are looked at.
@@ -33,15 +34,6 @@ const ROOM_BYTES: usize = 4 * 1024 * 1024;
 const MISSED_BYTES: u64 = 64 * 1024;
 /// How often a count is published when no line is.
 const COUNT_INTERVAL: Duration = Duration::from_secs(5);
-
-/// What is published when nobody follows.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct ForwardSettings {
-    /// Only these and more serious ones.
-    pub level: LogLevel,
-    /// Lines a second and task.
-    pub lines_per_s: u32,
-}
 
 /// Publishes lines until the agent ends.
 pub struct Forwarder {

@@ -5,6 +5,7 @@ mod crash;
 mod harness;
 mod hostile;
 mod load;
+mod logs;
 mod orders;
 mod proxy;
 mod registry;

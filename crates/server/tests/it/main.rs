@@ -9,6 +9,7 @@ mod cli;
 mod database;
 mod fleet;
 mod harness;
+mod logs;
 mod mqtt;
 mod mqtt_harness;
 mod mqtt_hostile;

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use reqwest::Method;
 use rumqttc::{AsyncClient, Event, EventLoop, MqttOptions, Packet, QoS};
-use serde_json::json;
+use serde_json::{Value, json};
 use task_proto::api::{RobotToken, ServerInfo};
 use task_proto::desired::{DesiredState, Doorbell};
 use task_proto::report::Phase;
@@ -16,14 +16,14 @@ use crate::harness::{TestRobot, TestServer, answer, opened, refusal};
 const PATIENCE: Duration = Duration::from_secs(10);
 
 /// A robot's MQTT session.
-struct Session {
+pub struct Session {
     client: AsyncClient,
     packets: EventLoop,
     topics: String,
 }
 
 impl Session {
-    async fn open(server: &TestServer, robot: &TestRobot) -> Self {
+    pub async fn open(server: &TestServer, robot: &TestRobot) -> Self {
         let mut session = Self::dial(server, robot.id.as_str(), &robot.token);
         session.until(|packet| matches!(packet, Packet::ConnAck(_))).await;
         session.client.subscribe(format!("{}/desired", session.topics), QoS::AtLeastOnce).await.expect("queued");
@@ -60,6 +60,22 @@ impl Session {
         })
         .await
         .expect("the packet comes")
+    }
+
+    /// Publishes on one of its topics, and waits for the acknowledgement.
+    pub async fn publish(&mut self, topic: &str, payload: Vec<u8>) {
+        let topic = format!("{}/{topic}", self.topics);
+        self.client.publish(topic, QoS::AtLeastOnce, false, payload).await.expect("queued");
+        self.until(|packet| matches!(packet, Packet::PubAck(_))).await;
+    }
+
+    /// The next question it is asked.
+    pub async fn asked(&mut self) -> Value {
+        let topic = format!("{}/request", self.topics);
+        self.client.subscribe(&topic, QoS::AtLeastOnce).await.expect("queued");
+        let question = self.until(|packet| matches!(packet, Packet::Publish(publish) if publish.topic == topic)).await;
+        let Packet::Publish(question) = question else { panic!("a question is published") };
+        serde_json::from_slice(&question.payload).expect("json")
     }
 
     /// The next state it is told of, from `generation` on.

@@ -1,0 +1,169 @@
+//! What a task says reaches the operator: asked for, followed over breaks, and within bounds when it is a flood.
+
+use std::io::{BufRead as _, BufReader, Read};
+use std::path::PathBuf;
+use std::process::{Child, Stdio};
+use std::sync::mpsc::{Receiver, channel};
+
+use task_proto::api::{LogsFrom, LogsView};
+use task_proto::log::{LogLevel, LogLine};
+use task_proto::report::Phase;
+
+use crate::harness::{Fleet, PATIENCE, eventually};
+
+/// A robot with a task that does what it is told.
+struct Bench {
+    fleet: Fleet,
+    orders: PathBuf,
+}
+
+impl Bench {
+    async fn start(first: &str) -> Self {
+        let fleet = Fleet::start(1).await;
+        let orders = fleet.dir.path().join("orders");
+        let path = orders.display();
+        let script = format!("mkfifo {path}\n{first}\nwhile :; do . {path}; done\n");
+        fleet.server.push(&fleet.package("speaker", "1.0.0", "service", &script), "*").await;
+        fleet.server.wait_phase("robot-1", "speaker", Phase::Running).await;
+        Self { fleet, orders }
+    }
+
+    /// Has the task run a line of shell.
+    async fn order(&self, line: String) {
+        let orders = self.orders.clone();
+        // Opening it waits for the task.
+        tokio::task::spawn_blocking(move || std::fs::write(orders, line).expect("ordered")).await.expect("no panic");
+    }
+
+    async fn logs(&self, arguments: &[&str]) -> LogsView {
+        let out = self.fleet.server.operate([&["logs", "robot-1", "-o", "json"], arguments].concat()).await;
+        serde_json::from_str(&out).unwrap_or_else(|error| panic!("{error}: {out}"))
+    }
+
+    fn follow(&self, arguments: &[&str]) -> Follower {
+        let mut command = self.fleet.server.command([&["logs", "-f", "robot-1", "-o", "json"], arguments].concat());
+        let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("taskd runs");
+        let (lines, remarks) = (lines_of(child.stdout.take()), lines_of(child.stderr.take()));
+        Follower { child, lines, remarks }
+    }
+}
+
+fn lines_of(stream: Option<impl Read + Send + 'static>) -> Receiver<String> {
+    let (sender, receiver) = channel();
+    let stream = BufReader::new(stream.expect("piped"));
+    std::thread::spawn(move || stream.lines().map_while(Result::ok).try_for_each(|line| sender.send(line)));
+    receiver
+}
+
+/// `taskd logs -f`; it ends with the test.
+struct Follower {
+    child: Child,
+    lines: Receiver<String>,
+    remarks: Receiver<String>,
+}
+
+impl Follower {
+    fn next(&self) -> LogLine {
+        let line = self.lines.recv_timeout(PATIENCE).expect("a line in time");
+        serde_json::from_str(&line).unwrap_or_else(|error| panic!("{error}: {line}"))
+    }
+
+    fn remark(&self, text: &str) -> String {
+        loop {
+            let remark = self.remarks.recv_timeout(PATIENCE).unwrap_or_else(|_| panic!("nothing says {text:?}"));
+            if remark.contains(text) {
+                return remark;
+            }
+        }
+    }
+}
+
+impl Drop for Follower {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+fn texts(view: &LogsView) -> Vec<&str> {
+    view.lines.iter().map(|line| line.text.as_str()).collect()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn lines_are_fetched_with_their_levels_and_remembered_when_the_robot_is_away() {
+    let first = "echo hello; echo oops >&2; echo '[ERROR] [1.5] [arm.driver]: broken' >&2";
+    let mut bench = Bench::start(first).await;
+    let view = eventually("all three lines", async || {
+        let view = bench.logs(&["speaker"]).await;
+        (view.lines.len() == 4).then_some(view)
+    })
+    .await;
+    assert_eq!((view.from, view.age_ms), (LogsFrom::Robot, 0));
+    let shown: Vec<_> = view.lines.iter().map(|line| (line.level, line.text.as_str())).collect();
+    for expected in [(LogLevel::Info, "hello"), (LogLevel::Warn, "oops"), (LogLevel::Error, "broken")] {
+        assert!(shown.contains(&expected), "{shown:?}");
+    }
+    assert!(view.lines.iter().any(|line| line.node.as_ref().is_some_and(|node| node.as_str() == "/arm/driver")));
+    assert_eq!(texts(&bench.logs(&["--level", "error"]).await), ["broken"]);
+    let none = bench.fleet.server.try_operate(["logs", "robot-1", "nothing"]).await;
+    assert_eq!(none.status.code(), Some(1));
+    assert!(String::from_utf8_lossy(&none.stderr).contains("no_such_task"));
+
+    let remembers = async || bench.fleet.server.get("/api/v1/robots/robot-1/logs?level=warn").await;
+    eventually("the warnings on the server", remembers).await;
+    bench.order("echo the last >&2\n".to_owned()).await;
+    let follower = bench.follow(&["--level", "warn"]);
+    while follower.next().text != "the last" {}
+    bench.fleet.robots[0].kill();
+    let view = eventually("the server's memory", async || {
+        let view = bench.logs(&["--level", "warn"]).await;
+        (view.from == LogsFrom::Server).then_some(view)
+    })
+    .await;
+    assert!(view.reason.is_some_and(|reason| reason.contains("not connected")));
+    assert!(view.lines.iter().all(|line| line.level >= LogLevel::Warn));
+    follower.remark("not connected");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn following_shows_each_line_once_also_over_a_restart_of_the_server() {
+    let mut bench = Bench::start("echo before").await;
+    eventually("the past", async || texts(&bench.logs(&[]).await).contains(&"before").then_some(())).await;
+    let follower = bench.follow(&["speaker"]);
+    while follower.next().text != "before" {}
+    for number in 0..30 {
+        if number == 10 {
+            bench.fleet.server.kill();
+        }
+        bench.order(format!("echo line {number}\n")).await;
+        if number == 15 {
+            bench.fleet.server.restart().await;
+        }
+    }
+    let seen: Vec<String> = (0..30).map(|_| follower.next().text).collect();
+    let expected: Vec<String> = (0..30).map(|number| format!("line {number}")).collect();
+    assert_eq!(seen, expected);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_flood_is_counted_and_stays_within_its_bounds() {
+    let bench = Bench::start("echo up").await;
+    let follower = bench.follow(&["--level", "warn"]);
+    bench.order("echo ready >&2\n".to_owned()).await;
+    while follower.next().text != "ready" {}
+    bench.order("seq 100000 >&2\n".to_owned()).await;
+    follower.remark("more lines were left out");
+    let view = eventually("the end of the flood", async || {
+        let view = bench.logs(&["-n", "10"]).await;
+        texts(&view).last().is_some_and(|last| *last == "100000").then_some(view)
+    })
+    .await;
+    assert_eq!(texts(&view), (99_991..=100_000).map(|number| number.to_string()).collect::<Vec<_>>());
+    let published = follower.lines.try_iter().count();
+    assert!(published < 10_000, "{published} lines were published");
+    bench.order("echo after >&2\n".to_owned()).await;
+    eventually("the line after the flood", async || {
+        texts(&bench.logs(&["-n", "1"]).await).contains(&"after").then_some(())
+    })
+    .await;
+}

@@ -25,6 +25,8 @@ export const signIn = (token) => ask('POST', '/session', { token });
 export const signOut = () => ask('DELETE', '/session');
 export const server = () => ask('GET', '/server');
 
+export const robotOutputs = async (robot) => ask('GET', `/outputs?robot=${robot}`);
+
 /** Everything the page shows, as it is now. */
 export async function lists() {
   const [robots, deployments, packages] = await Promise.all(['/robots', '/deployments', '/packages'].map((path) => ask('GET', path)));

@@ -7,6 +7,7 @@ import { deploymentList } from './deployments.js';
 import { Fleet } from './fleet.js';
 import { ago, number, plural } from './format.js';
 import { listen } from './live.js';
+import { drawMaps, Outputs } from './outputs.js';
 import { robotDialog } from './robot.js';
 import { Layout, robotTable, sign } from './robots.js';
 
@@ -31,6 +32,7 @@ const page = {
 };
 
 let live = null;
+const outputs = new Outputs(() => change(() => {}));
 
 const actions = {
   sortBy: (column) => rearrange(() => page.fleet.sortBy(column)),
@@ -171,7 +173,12 @@ function paint(frame) {
   if (scrolled) scrollBy(0, scrolled);
   const dialog = document.querySelector('dialog');
   if (page.robot && !dialog.open) dialog.showModal();
+  outputs.show(page.robot, momentOf(page.fleet.robots.get(page.robot)));
+  drawMaps();
 }
+
+/** Changes whenever a robot may have brought something back: each time one of its tasks stands elsewhere. */
+const momentOf = (robot) => robot?.tasks.map(({ task, run, phase }) => `${task} ${run} ${phase}`).join();
 
 /** How far to scroll so that the row at the table's upper edge stays where it is, though rows above it grow or shrink. */
 function keepInPlace(layout) {
@@ -223,7 +230,7 @@ function fleetView(sight) {
         ${fleet.robots.size && !fleet.shown.length ? html`<p class="empty quiet">No robot has “${fleet.filter}”.</p>` : nothing}
       </section>
     </main>
-    ${robotDialog(fleet.robots.get(page.robot), now, () => actions.show(null))}`;
+    ${robotDialog(fleet.robots.get(page.robot), outputs, now, () => actions.show(null))}`;
 }
 
 function robotCount({ robots, online, shown, filter, isLoaded }) {

@@ -18,6 +18,12 @@ export const plural = (count, noun) => `${number(count)} ${noun}${count === 1 ? 
 /** `rolled_back` as `rolled back`. */
 export const words = (code) => code.replaceAll('_', ' ');
 
+/** `12.4 MB`. */
+export function size(bytes) {
+  const [unit, length] = [['GB', 1e9], ['MB', 1e6], ['kB', 1e3]].find(([, length]) => bytes >= length) ?? ['B', 1];
+  return `${(bytes / length).toFixed(length > 1 ? 1 : 0)} ${unit}`;
+}
+
 /** `12.4 of 48.0 MB`, both in the unit of the whole, so that the text keeps its width. */
 export function bytes({ done, total }) {
   const [unit, size] = [['GB', 1e9], ['MB', 1e6], ['kB', 1e3]].find(([, size]) => total >= size) ?? ['B', 1];

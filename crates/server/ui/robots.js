@@ -106,8 +106,9 @@ const failure = ({ code, text }) => html`
   <span class="failure" title=${`${code}: ${text}`}>${words(code)}<span class="quiet">: ${text}</span></span>`;
 
 /** What else is worth knowing of a task that has not failed. */
-export function remarks({ active, version, restarts, wanted, phase }) {
+export function remarks({ active, version, restarts, wanted, phase, degraded }) {
   const said = [];
+  if (degraded) said.push(`▲ degraded: ${words(degraded.code)}`);
   if (active && active.version !== version) said.push(`${active.version} still runs`);
   if (restarts) said.push(`restarted ${restarts}×`);
   if (wanted === 'stopped' && phase === 'running') said.push('stop ordered');

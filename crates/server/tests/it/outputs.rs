@@ -10,14 +10,14 @@ use task_proto::output::{OutputFile, OutputSet};
 use crate::harness::{TestRobot, TestServer, refusal};
 
 /// A push in the robot's name, blob by blob.
-struct Push<'a> {
+pub struct Push<'a> {
     server: &'a TestServer,
     robot: &'a TestRobot,
     repository: String,
 }
 
 impl<'a> Push<'a> {
-    fn new(server: &'a TestServer, robot: &'a TestRobot, repository: String) -> Self {
+    pub fn new(server: &'a TestServer, robot: &'a TestRobot, repository: String) -> Self {
         Self { server, robot, repository }
     }
 
@@ -25,14 +25,14 @@ impl<'a> Push<'a> {
         self.server.bare(method, &format!("/v2/{}/{rest}", self.repository)).bearer_auth(&self.robot.token)
     }
 
-    async fn blob(&self, bytes: &[u8]) -> BlobRef {
+    pub async fn blob(&self, bytes: &[u8]) -> BlobRef {
         let digest = Digest::of(bytes);
         let request = self.ask(Method::POST, &format!("blobs/uploads/?digest={digest}")).body(bytes.to_vec());
         assert_eq!(request.send().await.expect("an answer").status(), StatusCode::CREATED);
         BlobRef { digest, size: bytes.len() as u64 }
     }
 
-    async fn output(&self, output: &OutputSet) -> StatusCode {
+    pub async fn output(&self, output: &OutputSet) -> StatusCode {
         let config = self.blob(&serde_json::to_vec(output).expect("json")).await;
         let manifest = serde_json::to_vec(&output.manifest(config)).expect("json");
         let tag = output.tag().expect("a tag");
@@ -41,7 +41,7 @@ impl<'a> Push<'a> {
     }
 }
 
-fn output(robot: &TestRobot, run: u64, files: Vec<OutputFile>) -> OutputSet {
+pub fn output(robot: &TestRobot, run: u64, files: Vec<OutputFile>) -> OutputSet {
     OutputSet {
         robot_id: robot.id.clone(),
         task: "mapping".parse().expect("valid"),
@@ -52,7 +52,7 @@ fn output(robot: &TestRobot, run: u64, files: Vec<OutputFile>) -> OutputSet {
     }
 }
 
-fn file(path: &str, blob: BlobRef) -> OutputFile {
+pub fn file(path: &str, blob: BlobRef) -> OutputFile {
     OutputFile { path: path.parse().expect("valid"), blob }
 }
 

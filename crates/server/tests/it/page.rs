@@ -8,6 +8,7 @@ use task_proto::report::{Condition, Failure, FailureCode, Phase, Progress, Repor
 
 use crate::browser::Browser;
 use crate::harness::{TestRobot, TestServer};
+use crate::outputs::{Push, file, output};
 
 const HOSTILE: &str = "<img src=x onerror=\"document.title='owned'\"><script>document.title='owned'</script>";
 
@@ -105,4 +106,29 @@ async fn a_wrong_token_is_refused_in_words_and_a_restarted_server_is_found_again
     browser.run(&sign_in).await;
     browser.wait("document.querySelector('.stream')?.innerText.includes('Live')").await;
     server.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_map_that_came_back_is_shown_as_a_picture() {
+    let server = TestServer::start().await;
+    let robot = server.enroll("atlas").await;
+    let push = Push::new(&server, &robot, format!("outputs/{}/mapping", robot.id));
+    let map = push.blob(b"P5\n# drawn by a test\n3 2\n255\n\x00\xcd\xfe\xfe\xcd\x00").await;
+    let broken = push.blob(b"P5 999 999 255 ").await;
+    let files = vec![file("maps/broken.pgm", broken), file("maps/corridor.pgm", map)];
+    assert_eq!(push.output(&output(&robot, 1, files)).await, StatusCode::CREATED);
+
+    let browser = Browser::start().await;
+    browser.open(&server.url(&format!("/#token={}", server.operator.reveal()))).await;
+    browser.wait("document.querySelector('[data-robot] .name button')?.innerText === 'atlas'").await;
+    browser.run("document.querySelector('[data-robot] .name button').click()").await;
+    browser.wait("document.querySelector('dialog .outputs canvas')?.width === 3").await;
+    let grays = "const { data } = document.querySelector('.outputs canvas').getContext('2d').getImageData(0, 0, 3, 2);
+        return [0, 4, 8, 12, 16, 20].map((at) => data[at])";
+    assert_eq!(browser.run(grays).await, json!([0, 205, 254, 254, 205, 0]));
+    browser.wait("document.querySelector('dialog .outputs').innerText.includes('it ends before its last row')").await;
+    let link = "return document.querySelector('.outputs a[download=\"corridor.pgm\"]').getAttribute('href')";
+    let expected = format!("/v2/outputs/{}/mapping/blobs/{}", robot.id, map.digest);
+    assert_eq!(browser.run(link).await, json!(expected));
+    assert_eq!(browser.console().await, Vec::<Value>::new(), "no error, no warning, no violated policy");
 }

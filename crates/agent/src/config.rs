@@ -122,6 +122,9 @@ pub struct LimitSettings {
     /// Bytes of a task's log file before it is rotated.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub log_bytes: Option<u64>,
+    /// Bytes of files that a run may bring back.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub output_bytes: Option<u64>,
     /// Memory that a build may have; each of its processes, where there are no control groups.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub build_memory_bytes: Option<u64>,

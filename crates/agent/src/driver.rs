@@ -73,10 +73,10 @@ struct View {
     watched: Option<Watched>,
     /// What ROS says of it.
     health: Health,
-    /// How far the pull under way has come.
-    pull: Option<watch::Receiver<Progress>>,
+    /// How far the transfers under way have come, by lane.
+    transfers: BTreeMap<Lane, watch::Receiver<Progress>>,
     /// The same, as it is reported.
-    progress: Option<Progress>,
+    progress: BTreeMap<Lane, Progress>,
 }
 
 /// The watchers of one process. Dropping it ends the one that asks ROS.
@@ -333,6 +333,7 @@ impl<E: Effects> Driver<E> {
             Lane::Run => plan::supervise(&situation),
             Lane::Prepare => plan::prepare(&situation),
             Lane::Gate => plan::consult(&situation),
+            Lane::Collect => plan::collect(&situation),
         })
     }
 
@@ -353,6 +354,7 @@ impl<E: Effects> Driver<E> {
             health: &view.health,
             preparing: steps.iter().any(|step| step.lane() == Lane::Prepare),
             acting: steps.iter().any(|step| step.lane() == Lane::Run),
+            collecting: steps.iter().any(|step| step.lane() == Lane::Collect),
             deleting: steps.iter().any(|step| step.deletes()),
             robot: &self.robot,
             may_begin: self.may_begin(now),
@@ -422,7 +424,8 @@ impl<E: Effects> Driver<E> {
 
     fn tick(&mut self) {
         for view in self.views.values_mut() {
-            view.progress = view.pull.as_ref().map(|pull| *pull.borrow()).filter(|progress| progress.total > 0);
+            let known = view.transfers.iter().map(|(lane, transfer)| (*lane, *transfer.borrow()));
+            view.progress = known.filter(|(_, progress)| progress.total > 0).collect();
         }
     }
 

@@ -9,7 +9,7 @@ use task_proto::{Digest, TaskName};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
-use crate::ledger::{ActiveRun, GateQuestion, Ledger, LedgerError, ProcessRecord};
+use crate::ledger::{ActiveRun, Collection, GateQuestion, Ledger, LedgerError, ProcessRecord};
 use crate::observed::{Health, Prepared, ProcessState, RobotFacts};
 use crate::plan::StepFailure;
 
@@ -110,6 +110,15 @@ pub trait Effects: Send + Sync + 'static {
     /// Stops the run's process and all it started, in good order: its lifecycle nodes first. Afterwards none of it is
     /// left on the graph.
     fn stop(&self, task: &TaskName, run: &ActiveRun) -> impl Future<Output = Result<(), StepFailure>> + Send;
+
+    /// Brings the files of an ended run to the server.
+    fn collect(
+        &self,
+        task: &TaskName,
+        files: &Collection,
+        progress: &watch::Sender<Progress>,
+        cancel: &CancellationToken,
+    ) -> impl Future<Output = Result<(), StepFailure>> + Send;
 
     /// Deletes the versions that are not in `kept`, and what ended runs left.
     fn prune(

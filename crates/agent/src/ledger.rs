@@ -12,9 +12,13 @@ use task_proto::desired::{Delivery, DesiredTask, PackageRef, Wanted};
 use task_proto::envelope::Envelope;
 use task_proto::manifest::{OnBoot, Restart, TaskKind, TaskManifest};
 use task_proto::report::{Failure, Phase};
-use task_proto::{DeploymentId, Digest, Generation, TaskName, Version};
+use task_proto::{DeploymentId, Digest, Generation, TaskName};
 
 use crate::durable;
+
+mod asked;
+
+pub use asked::{GateAnswer, GateQuestion, GateRecord, GateStep};
 
 /// The version of the file's format that this agent reads and writes.
 pub const FORMAT: u32 = 1;
@@ -65,6 +69,12 @@ pub struct TaskRecord {
     pub previous: Option<PackageRef>,
     /// Runs that have ended for good, the oldest first. An order that comes back is not done twice.
     pub finished: Vec<FinishedRun>,
+    /// Ended runs whose files are still to be brought back, the oldest first.
+    #[serde(default)]
+    pub collections: Vec<Collection>,
+    /// The last run whose files did not come back.
+    #[serde(default)]
+    pub lost: Option<LostFiles>,
     /// What the robot's gate was asked about this task, while that matters.
     #[serde(default)]
     pub gate: Option<GateRecord>,
@@ -169,6 +179,9 @@ pub struct RunRules {
     /// Seconds a job may run.
     #[serde(default)]
     pub deadline_s: Option<u32>,
+    /// Whether files are to be brought back once it is over.
+    #[serde(default)]
+    pub has_outputs: bool,
 }
 
 /// A run that is over.
@@ -191,52 +204,36 @@ pub struct End {
     pub failure: Option<Failure>,
 }
 
-/// What the robot's gate was asked, and what it said.
+/// An ended run whose files are to be brought back.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct GateRecord {
-    /// The question.
-    pub question: GateQuestion,
-    /// The last answer to it.
-    pub answer: Option<GateAnswer>,
-    /// How often the answer was no.
-    pub refusals: u32,
-    /// It is not asked again before this time.
-    pub retry_at_ms: u64,
-}
-
-/// A question to the robot's gate.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct GateQuestion {
-    /// What is about to be done.
-    pub step: GateStep,
-    /// With which order's run.
+pub struct Collection {
+    /// The order.
     pub deployment: DeploymentId,
     /// Which of its runs.
     pub run: u64,
-    /// Of which version.
-    pub version: Version,
+    /// What ran.
+    pub package: PackageRef,
+    /// Service or job.
+    pub kind: TaskKind,
+    /// When it ended, or when this boot began.
+    pub since_ms: u64,
+    /// Tries that failed.
+    pub attempts: u32,
+    /// Not before this time.
+    pub retry_at_ms: u64,
+    /// Why the last try failed.
+    pub failure: Option<Failure>,
 }
 
-/// What the robot's gate may forbid.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum GateStep {
-    /// To start a task that does not run.
-    Start,
-    /// To stop one that runs.
-    Stop,
-    /// To replace one version by another.
-    Switch,
-}
-
-/// What the robot's gate said.
+/// A run whose files did not come back.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum GateAnswer {
-    /// Yes.
-    Allowed,
-    /// Not now, and why.
-    Refused(Failure),
+pub struct LostFiles {
+    /// The order.
+    pub deployment: DeploymentId,
+    /// Which of its runs.
+    pub run: u64,
+    /// Why.
+    pub failure: Failure,
 }
 
 /// The ledger could not be written or read.
@@ -316,6 +313,9 @@ impl Ledger {
             if let Some(gate) = &mut record.gate {
                 gate.retry_at_ms = 0;
             }
+            for collection in &mut record.collections {
+                (collection.since_ms, collection.retry_at_ms) = (now_ms, 0);
+            }
             for run in [&mut record.active, &mut record.fallback].into_iter().flatten() {
                 (run.retry_at_ms, run.first_start_ms, run.admitted) = (0, now_ms, false);
             }
@@ -346,6 +346,8 @@ impl TaskRecord {
             fallback: None,
             previous: None,
             finished: Vec::new(),
+            collections: Vec::new(),
+            lost: None,
             gate: None,
             starts: 0,
             phase: Phase::Assigned,
@@ -389,6 +391,9 @@ impl TaskRecord {
         }
         if let Some((_, refusal)) = self.refusal().filter(|(question, _)| self.concerns_order(question)) {
             return (Phase::Deferred, Some(refusal));
+        }
+        if self.collections.iter().any(|files| files.kind == TaskKind::Job && files.is_for(&self.order)) {
+            return (Phase::Running, None);
         }
         if let Some(end) = self.end_of_order() {
             return (end.phase, end.failure.as_ref());
@@ -471,7 +476,9 @@ impl TaskRecord {
     /// The versions that must stay on disk: ordered, active, the one before and the one that may come back.
     pub fn kept_versions(&self) -> Vec<Digest> {
         let runs = [&self.active, &self.fallback].into_iter().flatten().map(|run| &run.package);
-        let mut kept: Vec<Digest> = runs.chain([&self.order.package]).chain(&self.previous).map(digest_of).collect();
+        let files = self.collections.iter().map(|files| &files.package);
+        let mut kept: Vec<Digest> =
+            runs.chain(files).chain([&self.order.package]).chain(&self.previous).map(digest_of).collect();
         kept.sort();
         kept.dedup();
         kept
@@ -486,6 +493,13 @@ impl ActiveRun {
     /// Whether this is the run that `order` asks for.
     pub fn is_for(&self, order: &DesiredTask) -> bool {
         self.deployment == order.deployment && self.run == order.run && self.package == order.package
+    }
+}
+
+impl Collection {
+    /// Whether it is of the run that `order` asks for.
+    pub fn is_for(&self, order: &DesiredTask) -> bool {
+        self.deployment == order.deployment && self.run == order.run
     }
 }
 
@@ -506,6 +520,7 @@ impl From<&TaskManifest> for RunRules {
             hold_s: manifest.ready.hold_s,
             ready_timeout_s: manifest.ready.timeout_s,
             deadline_s: manifest.run.deadline_s,
+            has_outputs: !manifest.outputs.paths.is_empty(),
         }
     }
 }
@@ -590,10 +605,10 @@ mod tests {
             let table = task.pointer_mut(at).and_then(serde_json::Value::as_object_mut).expect("a table");
             keys.iter().for_each(|key| assert!(table.remove(*key).is_some(), "{at} has no {key}"));
         };
-        drop("", &["fallback", "gate", "starts"]);
+        drop("", &["fallback", "gate", "starts", "collections", "lost"]);
         drop("/active", &["admitted"]);
         drop("/active/process", &["condemned"]);
-        drop("/active/rules", &["deadline_s"]);
+        drop("/active/rules", &["deadline_s", "has_outputs"]);
         assert_eq!(serde_json::from_value::<Ledger>(old).expect("read"), ledger);
     }
 

@@ -104,6 +104,8 @@ impl OutputError {
             // What can't be read now may be readable once a file system is back.
             Self::Read { .. } => Some(Duration::from_secs(30)),
             Self::Busy { retry_after, .. } => Some(retry_after.unwrap_or_default()),
+            // A robot that is enrolled anew, or replaces its token, is known again.
+            Self::Refused { status: 401, .. } => Some(Duration::from_secs(30)),
             Self::Pattern { .. } | Self::TooMuch(_) | Self::Refused { .. } => None,
         }
     }

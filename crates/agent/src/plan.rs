@@ -30,16 +30,18 @@ use task_proto::desired::{DesiredTask, PackageRef, Wanted};
 use task_proto::report::{Failure, FailureCode, Phase};
 use task_proto::{Digest, TaskName};
 
-use crate::ledger::{ActiveRun, GateQuestion, ProcessRecord, RunRules, TaskRecord};
+use crate::ledger::{ActiveRun, Collection, GateQuestion, ProcessRecord, RunRules, TaskRecord};
 use crate::observed::{Health, Prepared, ProcessState, RobotFacts};
 use gate::Verdict;
 
 mod alive;
+mod collect;
 mod gate;
 #[cfg(test)]
 mod tests;
 mod transition;
 
+pub use collect::collect;
 pub use gate::consult;
 pub use transition::{StepFailure, adopted, backoff_ms, begun, finished};
 
@@ -60,6 +62,8 @@ pub struct Situation<'a> {
     pub preparing: bool,
     /// Whether a step of [`Lane::Run`] is under way.
     pub acting: bool,
+    /// Whether a step of [`Lane::Collect`] is under way.
+    pub collecting: bool,
     /// Whether a step that deletes versions is under way.
     pub deleting: bool,
     /// What packages may require.
@@ -109,6 +113,8 @@ pub enum Step {
     Start(Box<ActiveRun>),
     /// Stop this run's process; it is the active one.
     Stop(Box<ActiveRun>),
+    /// Bring the files of an ended run to the server.
+    Collect(Box<Collection>),
     /// Delete the versions that are not in `kept`.
     Prune {
         /// The versions that stay.
@@ -127,11 +133,13 @@ pub enum Lane {
     Run,
     /// Asks the robot's gate. Meanwhile the run that lives is looked after.
     Gate,
+    /// Brings the files of ended runs to the server.
+    Collect,
 }
 
 impl Lane {
     /// All of them.
-    pub const ALL: [Self; 3] = [Self::Run, Self::Prepare, Self::Gate];
+    pub const ALL: [Self; 4] = [Self::Run, Self::Prepare, Self::Gate, Self::Collect];
 }
 
 impl Step {
@@ -141,14 +149,15 @@ impl Step {
             Self::PullManifest(_) | Self::LookForRos(_) | Self::PullContent(_) | Self::Build(_) => Lane::Prepare,
             Self::Start(_) | Self::Stop(_) | Self::Prune { .. } | Self::Remove => Lane::Run,
             Self::Ask(_) => Lane::Gate,
+            Self::Collect(_) => Lane::Collect,
         }
     }
 
-    /// How long it may take. A pull of a content watches over the flow of its bytes instead, since a large package on a
-    /// bad link takes its time, and a build over its own limits.
+    /// How long it may take. What moves many bytes watches over their flow instead, since a large package on a bad link
+    /// takes its time, and a build over its own limits.
     pub fn deadline(&self) -> Option<Duration> {
         let seconds = match self {
-            Self::PullContent(_) | Self::Build(_) => return None,
+            Self::PullContent(_) | Self::Build(_) | Self::Collect(_) => return None,
             Self::PullManifest(_) | Self::LookForRos(_) | Self::Start(_) => STEP_DEADLINE_S,
             // Its own, shorter limit is a setting.
             Self::Ask(_) => STEP_DEADLINE_S + crate::config::MAX_GATE_TIMEOUT_S,
@@ -176,6 +185,7 @@ impl Step {
             | Self::Build(package) => {
                 desired.is_some_and(|task| task.wanted == Wanted::Running && task.package == *package)
             }
+            Self::Collect(_) => desired.is_some(),
             Self::Start(_) | Self::Stop(_) | Self::Prune { .. } | Self::Remove => true,
         }
     }
@@ -286,7 +296,7 @@ fn without_process(s: &Situation<'_>, active: Option<&ActiveRun>) -> Next {
     let order = &s.record.order;
     if s.desired.is_none() {
         let retry_at_ms = s.record.preparation.retry_at_ms;
-        return match s.preparing {
+        return match s.preparing || s.collecting {
             true => Next::Rest { until_ms: None },
             false if s.now_ms < retry_at_ms => Next::Rest { until_ms: Some(retry_at_ms) },
             false => Next::Act(Step::Remove),
@@ -307,7 +317,7 @@ fn without_process(s: &Situation<'_>, active: Option<&ActiveRun>) -> Next {
         // A run that was replaced and is ordered again goes on as the good one it was.
         let before = s.record.fallback.as_ref().filter(|run| run.is_for(order)).cloned();
         let run = before.unwrap_or_else(|| ActiveRun::of(order, RunRules::from(manifest), s.now_ms));
-        return Next::Act(Step::Start(Box::new(run)));
+        return start(s, &run);
     }
     let Some(active) = active.filter(|active| active.end.is_none()) else { return tidy(s, None) };
     if s.held || (verdict == Verdict::NotNow && !active.admitted) {
@@ -316,7 +326,15 @@ fn without_process(s: &Situation<'_>, active: Option<&ActiveRun>) -> Next {
     if s.now_ms < active.retry_at_ms {
         return Next::Rest { until_ms: Some(active.retry_at_ms) };
     }
-    Next::Act(Step::Start(Box::new(active.clone())))
+    start(s, active)
+}
+
+/// Starts a process of `run`, unless it would write over files that are still to be brought back.
+fn start(s: &Situation<'_>, run: &ActiveRun) -> Next {
+    if collect::occupies(s.record, run) {
+        return Next::Rest { until_ms: None };
+    }
+    Next::Act(Step::Start(Box::new(run.clone())))
 }
 
 /// Deletes versions that nothing needs any more, once nothing else is to be done.
@@ -346,6 +364,7 @@ pub fn describe(task: &TaskName, step: &Step) -> String {
         Step::Ask(question) => format!("ask the gate about {task} {}", question.version),
         Step::Start(run) => format!("start {task} {} (run {})", run.package.version, run.run),
         Step::Stop(_) => format!("stop {task}"),
+        Step::Collect(files) => format!("bring back the files of {task} {} (run {})", files.package.version, files.run),
         Step::Prune { .. } => format!("delete old versions of {task}"),
         Step::Remove => format!("remove {task}"),
     }

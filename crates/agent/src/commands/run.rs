@@ -27,6 +27,7 @@ use crate::link::{self, Heard, Intervals, Shared, Talk};
 use crate::logs::Logs;
 use crate::logs::forwarder::Forwarder;
 use crate::mqtt::{self, MqttAccess};
+use crate::outputs::Registry;
 use crate::rotation::Rotation;
 use crate::server::{self, Server};
 use crate::{clock, confinement, process};
@@ -70,7 +71,8 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
     let client = server::client().context("cannot make an HTTP client")?;
     let credential = Credential::from(identity.token.clone());
     let fetcher = Fetcher::new(client.clone(), base.clone(), credential.clone(), data.clone(), fetch_settings(&config));
-    let robot = Arc::new(Robot::new(data.clone(), fetcher, &config, &identity.robot_id, identity.mac));
+    let registry = Registry::new(client.clone(), base.clone(), credential.clone());
+    let robot = Arc::new(Robot::new(data.clone(), fetcher, registry, &config, &identity.robot_id, identity.mac));
     let shutdown = CancellationToken::new();
     let shared = Shared::new(shutdown.clone());
     let instance = InstanceId::random();

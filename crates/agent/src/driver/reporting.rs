@@ -8,8 +8,9 @@ use task_proto::{Generation, TaskName};
 use super::{Driver, View};
 use crate::admission;
 use crate::effects::Effects;
-use crate::ledger::TaskRecord;
+use crate::ledger::{LostFiles, TaskRecord};
 use crate::observed::{Health, ProcessState};
+use crate::plan::Lane;
 
 impl<E: Effects> Driver<E> {
     /// Publishes a snapshot, if it says anything that the last one did not.
@@ -84,20 +85,32 @@ fn says_the_same(last: &Report, next: &Report) -> bool {
 }
 
 /// Why the run that is kept alive is not as it should be: something is missing that it once had, or the robot does not
-/// let an older one than ordered start again.
+/// let an older one than ordered start again, or its files do not come back.
 fn degraded(record: &TaskRecord, view: Option<&View>) -> Option<Failure> {
     let ready = record.active.as_ref().and_then(|active| active.process.as_ref()).is_some_and(|process| process.ready);
     match view.map(|view| &view.health) {
         Some(Health::Missing(missing)) if ready => Some(missing.failure()),
-        _ => record.refusal().filter(|(question, _)| !record.concerns_order(question)).map(|(_, why)| why.clone()),
+        _ => {
+            let refusal = record.refusal().filter(|(question, _)| !record.concerns_order(question));
+            let of_order =
+                |lost: &&LostFiles| lost.deployment == record.order.deployment && lost.run == record.order.run;
+            let files = record.collections.iter().find_map(|files| files.failure.as_ref());
+            let lost = record.lost.as_ref().filter(of_order).map(|lost| &lost.failure);
+            refusal.map(|(_, why)| why).or(files).or(lost).cloned()
+        }
     }
 }
 
 fn task_report(task: &TaskName, record: &TaskRecord, view: Option<&View>, now_ms: u64) -> TaskReport {
     let (phase, failure) = record.standing();
-    let progress = view.and_then(|view| view.progress).filter(|_| phase == Phase::Fetching);
+    let lane = match phase {
+        Phase::Fetching => Some(Lane::Prepare),
+        Phase::Running => Some(Lane::Collect),
+        _ => None,
+    };
+    let progress = lane.and_then(|lane| view?.progress.get(&lane).copied());
     // All bytes are there: what is left of a pull is unpacking.
-    let unpacking = progress.is_some_and(|progress| progress.done >= progress.total);
+    let unpacking = phase == Phase::Fetching && progress.is_some_and(|progress| progress.done >= progress.total);
     let active = record.active.as_ref();
     let for_order = active.filter(|active| active.is_for(&record.order));
     TaskReport {

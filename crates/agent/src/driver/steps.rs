@@ -21,9 +21,9 @@ impl<E: Effects> Driver<E> {
     pub(super) fn begin(&mut self, task: TaskName, step: Step) {
         tracing::info!("{}", plan::describe(&task, &step));
         let cancel = CancellationToken::new();
-        let (progress, pull) = watch::channel(Progress { done: 0, total: 0 });
-        if matches!(step, Step::PullContent(_)) {
-            self.views.entry(task.clone()).or_default().pull = Some(pull);
+        let (progress, transfer) = watch::channel(Progress { done: 0, total: 0 });
+        if matches!(step, Step::PullContent(_) | Step::Collect(_)) {
+            self.views.entry(task.clone()).or_default().transfers.insert(step.lane(), transfer);
         }
         let running = self.ledger.tasks.get(&task).and_then(|record| record.active.as_ref()?.process.clone());
         let (effects, lane) = (self.effects.clone(), step.lane());
@@ -42,6 +42,7 @@ impl<E: Effects> Driver<E> {
                     Step::Ask(question) => effects.ask_gate(&name, question).await.map(done),
                     Step::Start(run) => effects.start(&name, run).await.map(Some),
                     Step::Stop(run) => effects.stop(&name, run).await.map(done),
+                    Step::Collect(files) => effects.collect(&name, files, &progress, &stop).await.map(done),
                     Step::Prune { kept } => effects.prune(&name, kept, running.as_ref()).await.map(done),
                     Step::Remove => effects.remove(&name).await.map(done),
                 }
@@ -94,7 +95,8 @@ impl<E: Effects> Driver<E> {
         let Some((task, lane)) = found else { return };
         let Some(under_way) = self.under_way.remove(&(task.clone(), lane)) else { return };
         let view = self.views.entry(task.clone()).or_default();
-        (view.pull, view.progress) = (None, None);
+        view.transfers.remove(&lane);
+        view.progress.remove(&lane);
         if under_way.cancel.is_cancelled() {
             view.prepared = None;
             // It may have gathered more after its order was taken back.

@@ -12,8 +12,9 @@ use task_proto::{DeploymentId, Digest, Generation};
 
 use super::*;
 use crate::installation::Installation;
-use crate::ledger::{ActiveRun, GateQuestion, GateStep, LedgerError, ProcessRecord};
-use crate::observed::Missing;
+use crate::ledger::{ActiveRun, Collection, GateQuestion, GateStep, LedgerError, ProcessRecord};
+use crate::observed::{Exit, Missing};
+use crate::process::ExitStatus;
 
 /// How long a test waits for what should come at once.
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -23,6 +24,8 @@ struct Fake {
     state: Mutex<State>,
     /// While set, pulls of content wait to be cancelled.
     slow: std::sync::atomic::AtomicBool,
+    /// Changes when a process has ended.
+    exited: watch::Sender<()>,
 }
 
 #[derive(Default)]
@@ -43,6 +46,13 @@ struct State {
     /// What the robot's gate says, if it has one, and what it was asked.
     gate: Option<Result<(), String>>,
     asked: Vec<GateStep>,
+    /// What comes of an upload, unless it takes its time, and the runs whose files were sent.
+    upload: Option<Result<(), StepFailure>>,
+    collected: Vec<u64>,
+    /// The processes are jobs with files.
+    jobs: bool,
+    /// How processes ended.
+    exits: Vec<(String, i32)>,
     /// Versions that never get ready.
     bad: BTreeSet<Digest>,
     /// What ROS says of every process that lives.
@@ -52,6 +62,15 @@ struct State {
 impl Fake {
     fn state<T>(&self, look: impl FnOnce(&mut State) -> T) -> T {
         look(&mut self.state.lock().expect("no test panicked"))
+    }
+
+    /// Ends the process that lives.
+    fn exit(&self, code: i32) {
+        self.state(|state| {
+            let ended = std::mem::take(&mut state.alive);
+            state.exits.extend(ended.into_iter().map(|dir| (dir, code)));
+        });
+        self.exited.send_replace(());
     }
 
     fn sees(&self, health: Health) {
@@ -101,19 +120,35 @@ impl Effects for Fake {
     async fn prepared(&self, package: &PackageRef) -> Prepared {
         self.state(|state| {
             let content = state.contents.contains(&package.manifest.digest);
-            let manifest = || TaskManifest { exec_depends: state.exec_depends.clone(), ..manifest(package) };
+            let of_jobs = |mut manifest: TaskManifest| {
+                if state.jobs {
+                    manifest.run.kind = task_proto::manifest::TaskKind::Job;
+                    manifest.outputs.paths = vec!["maps/*.pgm".to_owned()];
+                }
+                manifest
+            };
+            let manifest = || TaskManifest { exec_depends: state.exec_depends.clone(), ..of_jobs(manifest(package)) };
             let manifest = state.manifests.contains(&package.manifest.digest).then(manifest);
             Prepared { manifest, content, built: content, versions: Vec::new() }
         })
     }
 
     async fn process(&self, _task: &TaskName, process: &ProcessRecord) -> ProcessState {
-        let alive = self.state(|state| state.alive.contains(&process.dir));
-        if alive { ProcessState::Alive { pid: 7 } } else { ProcessState::NeverStarted }
+        self.state(|state| match state.exits.iter().find(|(dir, _)| *dir == process.dir) {
+            Some((_, code)) => ProcessState::Ended(Exit {
+                status: Some(ExitStatus::Code(*code)),
+                last_lines: String::new(),
+                out_of_memory_bytes: None,
+            }),
+            None if state.alive.contains(&process.dir) => ProcessState::Alive { pid: 7 },
+            None => ProcessState::NeverStarted,
+        })
     }
 
-    async fn process_ended(&self, _task: &TaskName, _process: &ProcessRecord) {
-        std::future::pending().await
+    async fn process_ended(&self, _task: &TaskName, process: &ProcessRecord) {
+        let mut exited = self.exited.subscribe();
+        let ended = |_: &()| self.state(|state| state.exits.iter().any(|(dir, _)| *dir == process.dir));
+        exited.wait_for(ended).await.expect("the fake lives");
     }
 
     fn watch(&self, _task: &TaskName, run: &ActiveRun) -> watch::Receiver<Health> {
@@ -180,6 +215,22 @@ impl Effects for Fake {
         let process = run.process.as_ref().expect("a process to stop");
         self.state(|state| state.alive.remove(&process.dir));
         Ok(())
+    }
+
+    async fn collect(
+        &self,
+        _task: &TaskName,
+        files: &Collection,
+        progress: &watch::Sender<Progress>,
+        cancel: &CancellationToken,
+    ) -> Result<(), StepFailure> {
+        let answer = self.state(|state| state.upload.clone());
+        if answer.is_none() {
+            progress.send_replace(Progress { done: 1, total: 2 });
+            cancel.cancelled().await;
+        }
+        self.state(|state| state.collected.push(files.run));
+        answer.unwrap_or(Ok(()))
     }
 
     async fn prune(
@@ -434,6 +485,36 @@ async fn the_gate_is_asked_first_and_its_reason_is_reported() {
     bench.phase(Phase::Stopped).await;
     let asked = bench.fake.state(|state| state.asked.clone());
     assert!(asked.starts_with(&[GateStep::Start]) && asked.ends_with(&[GateStep::Stop]), "{asked:?}");
+}
+
+#[tokio::test]
+async fn a_job_has_succeeded_once_its_files_are_at_the_server() {
+    let bench = Bench::new().await;
+    bench.fake.state(|state| state.jobs = true);
+    let order = order("1.0");
+    bench.order(1, vec![order.clone()]).await;
+    bench.phase(Phase::Running).await;
+    bench.fake.exit(0);
+    let sending = |report: &Report| report.tasks[0].progress == Some(Progress { done: 1, total: 2 });
+    let report = bench.report(sending).await;
+    assert_eq!((report.tasks[0].phase, &report.tasks[0].active), (Phase::Running, &None));
+    // The agent dies meanwhile: the job is not run again, its files are sent again, and this time refused.
+    let (fake, key, robot) = (bench.fake.clone(), SigningKey::from_bytes(bench.key.to_bytes()), bench.robot.clone());
+    let ledger = bench.end().await;
+    let failure = Failure::new(FailureCode::OUTPUTS_LOST, "too much");
+    fake.state(|state| state.upload = Some(Err(StepFailure { failure, retry_after_ms: None })));
+    let bench = Bench::with(fake, ledger, key, robot).await;
+    let report = bench.phase(Phase::Succeeded).await;
+    let lost = report.tasks[0].degraded.as_ref().expect("said").to_string();
+    assert_eq!(lost, "outputs_lost: files of run 1 did not come back: outputs_lost: too much");
+    bench.fake.state(|state| state.upload = Some(Ok(())));
+    bench.order(2, vec![DesiredTask { run: 2, ..order }]).await;
+    bench.phase(Phase::Running).await;
+    bench.fake.exit(3);
+    let report = bench.phase(Phase::Failed).await;
+    assert_eq!(report.tasks[0].degraded, None);
+    let (collected, started) = bench.fake.state(|state| (state.collected.clone(), state.started.len()));
+    assert_eq!((collected, started), (vec![1, 2], 2));
 }
 
 #[tokio::test]

@@ -22,8 +22,9 @@ use crate::fetch::{self, FetchError, Fetcher};
 use crate::gate::Gate;
 use crate::installation::Installation;
 use crate::layout::{DataDir, VersionDir};
-use crate::ledger::{ActiveRun, GateQuestion, Ledger, LedgerError, ProcessRecord};
+use crate::ledger::{ActiveRun, Collection, GateQuestion, Ledger, LedgerError, ProcessRecord};
 use crate::observed::{Exit, Health, Prepared, ProcessState, RobotFacts};
+use crate::outputs::{self, OutputError, OutputOrder, Registry};
 use crate::plan::StepFailure;
 use crate::process::ExitStatus;
 use crate::run_dir::{LogSpec, RunSpec};
@@ -34,6 +35,10 @@ use crate::{clock, disk, durable, environment, installation, launch, logs, scrip
 
 /// Written into a version's directory once it is built.
 const BUILT_MARKER: &str = "built";
+/// Written into a version's directory while its files are sent.
+const UPLOADS: &str = "uploads.json";
+/// How many bytes a run may bring back, unless the robot's settings say otherwise.
+const OUTPUT_BYTES: u64 = 4 << 30;
 /// Written into a run's directory before its start: what the ledger says of the run, should the ledger be lost.
 const RUN_RECORD: &str = "run.json";
 /// Where looking into ROS installations has its files.
@@ -46,6 +51,9 @@ pub struct Robot {
     data: DataDir,
     fetcher: Fetcher,
     gate: Option<Gate>,
+    registry: Registry,
+    robot: RobotId,
+    output_bytes: u64,
     supervisor: Supervisor,
     /// The configured setup files.
     underlays: Vec<PathBuf>,
@@ -62,7 +70,14 @@ pub struct Robot {
 
 impl Robot {
     /// The robot whose data is in `data`.
-    pub fn new(data: DataDir, fetcher: Fetcher, config: &Config, robot: &RobotId, mac: MacAddress) -> Self {
+    pub fn new(
+        data: DataDir,
+        fetcher: Fetcher,
+        registry: Registry,
+        config: &Config,
+        robot: &RobotId,
+        mac: MacAddress,
+    ) -> Self {
         let mut settings: BTreeMap<String, String> = environment::ROS_VARIABLES
             .iter()
             .filter_map(|name| Some(((*name).to_owned(), std::env::var(name).ok()?)))
@@ -82,6 +97,9 @@ impl Robot {
             data,
             fetcher,
             gate,
+            registry,
+            robot: robot.clone(),
+            output_bytes: config.limits.output_bytes.unwrap_or(OUTPUT_BYTES),
             supervisor: Supervisor::of_this_program(cgroups.clone()),
             cgroups,
             task_user: TaskUser::find(config.task_user.as_deref()),
@@ -371,6 +389,38 @@ impl Effects for Robot {
         stopped.map(drop).map_err(|error: SupervisorError| later(FailureCode::IO_ERROR, &error, 0))
     }
 
+    async fn collect(
+        &self,
+        task: &TaskName,
+        files: &Collection,
+        progress: &watch::Sender<Progress>,
+        cancel: &CancellationToken,
+    ) -> Result<(), StepFailure> {
+        let manifest = self.manifest(&files.package).await?;
+        let version = self.version(&files.package);
+        let order = OutputOrder {
+            robot_id: self.robot.clone(),
+            task: task.clone(),
+            version: files.package.version.clone(),
+            deployment: files.deployment.clone(),
+            run: files.run,
+            directory: script::run_directory(manifest.build.tool, &version),
+            notes: version.root().join(UPLOADS),
+            patterns: manifest.outputs.paths,
+            max_bytes: self.output_bytes,
+        };
+        match outputs::bring_back(&self.registry, &order, progress, cancel).await {
+            Ok(count) => {
+                tracing::info!(%task, run = files.run, count, "its files are at the server");
+                Ok(())
+            }
+            Err(error) => Err(StepFailure {
+                retry_after_ms: error.retry_after().map(|wait| u64::try_from(wait.as_millis()).unwrap_or(u64::MAX)),
+                failure: Failure::new(outputs_code(&error), chain(&error)),
+            }),
+        }
+    }
+
     async fn prune(
         &self,
         task: &TaskName,
@@ -416,6 +466,17 @@ fn fetch_failure(error: FetchError) -> StepFailure {
         return later(code, &error, least_ms);
     }
     finally(code, &error)
+}
+
+fn outputs_code(error: &OutputError) -> FailureCode {
+    match error {
+        OutputError::Unreachable(_) | OutputError::Busy { .. } => FailureCode::SERVER_UNREACHABLE,
+        OutputError::Read { .. } | OutputError::Note { .. } => FailureCode::IO_ERROR,
+        OutputError::Cancelled => FailureCode::INTERRUPTED,
+        OutputError::Pattern { .. } | OutputError::TooMuch(_) | OutputError::Refused { .. } => {
+            FailureCode::OUTPUTS_LOST
+        }
+    }
 }
 
 fn finally(code: FailureCode, error: &dyn Error) -> StepFailure {

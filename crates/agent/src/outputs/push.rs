@@ -16,6 +16,7 @@ use task_proto::report::Progress;
 use tokio::sync::watch;
 
 use super::{OutputError, OutputOrder, find};
+use crate::credential::Credential;
 use crate::durable;
 
 /// Bytes sent in one request: what a bad link loses at most.
@@ -32,7 +33,7 @@ const MAX_ERROR_BYTES: usize = 4096;
 pub struct Registry {
     client: reqwest::Client,
     base: Url,
-    token: String,
+    token: Credential,
 }
 
 /// Uploads under way, by the digest of what they bring.
@@ -40,8 +41,8 @@ type Notes = BTreeMap<Digest, String>;
 
 impl Registry {
     /// The registry of the server at `base`.
-    pub fn new(client: reqwest::Client, base: Url, token: String) -> Self {
-        Self { client, base, token }
+    pub fn new(client: reqwest::Client, base: Url, token: impl Into<Credential>) -> Self {
+        Self { client, base, token: token.into() }
     }
 
     fn request(&self, method: Method, path: &str) -> RequestBuilder {
@@ -49,7 +50,7 @@ impl Registry {
         let (path, query) = path.split_once('?').map_or((path, None), |(path, query)| (path, Some(query)));
         url.set_path(&format!("{}{path}", self.base.path().trim_end_matches('/')));
         url.set_query(query);
-        self.client.request(method, url).bearer_auth(&self.token).timeout(REQUEST_TIMEOUT)
+        self.client.request(method, url).bearer_auth(self.token.current()).timeout(REQUEST_TIMEOUT)
     }
 
     async fn send(&self, what: &str, request: RequestBuilder) -> Result<Response, OutputError> {

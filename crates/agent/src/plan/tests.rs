@@ -41,6 +41,7 @@ struct World {
     /// The number of the package that never gets ready.
     bad: Option<u8>,
     gated: bool,
+    outputs: Outputs,
 }
 
 /// What can happen.
@@ -166,6 +167,7 @@ impl World {
             health: Health::Holds { since_ms: 0 },
             bad: None,
             gated: false,
+            outputs: Outputs::default(),
         }
     }
 
@@ -233,6 +235,7 @@ impl World {
                     Lane::Run => supervise(s),
                     Lane::Prepare => prepare(s),
                     Lane::Gate => consult(s),
+                    Lane::Collect => collect(s),
                 });
                 match next {
                     Next::Rest { .. } => {}
@@ -264,7 +267,7 @@ impl World {
         let level =
             self.disk.iter().find(|(on_disk, _)| *on_disk == record.order.package).map_or(0, |(_, level)| *level);
         let prepared = Prepared {
-            manifest: (level > 0).then(|| manifest(&self.manifest)),
+            manifest: (level > 0).then(|| TaskManifest { outputs: self.outputs.clone(), ..manifest(&self.manifest) }),
             content: level > 1,
             built: level > 2,
             versions: self.disk.iter().map(|(package, _)| package.manifest.digest).collect(),
@@ -290,6 +293,7 @@ impl World {
             health: &health,
             preparing: self.steps.iter().any(|(step, _)| step.lane() == Lane::Prepare),
             acting: self.steps.iter().any(|(step, _)| step.lane() == Lane::Run),
+            collecting: self.steps.iter().any(|(step, _)| step.lane() == Lane::Collect),
             deleting: self.steps.iter().any(|(step, _)| step.deletes()),
             robot: &RobotFacts { installations: self.ros_seen.then(|| vec![ros()]), ..RobotFacts::default() },
             may_begin: self.may_begin,
@@ -316,6 +320,14 @@ impl World {
             Step::PullManifest(package) => self.raise(package, 1),
             Step::LookForRos(_) => self.ros_seen = true,
             Step::Ask(_) => {}
+            Step::Collect(files) => {
+                assert!(self.disk.iter().any(|(package, _)| *package == files.package), "its files are gone");
+                let active = self.record.as_ref().and_then(|record| record.active.as_ref());
+                let same = active.is_some_and(|run| {
+                    run.deployment == files.deployment && run.run == files.run && run.process.is_some()
+                });
+                assert!(!same, "it still writes");
+            }
             Step::PullContent(package) => self.raise(package, 2),
             Step::Build(package) => self.raise(package, 3),
             Step::Start(run) => {
@@ -419,10 +431,12 @@ proptest! {
     #[test]
     fn whatever_happens_it_is_safe_and_converges(
         rules in run_rules(),
+        outputs in prop::bool::ANY,
         bad in prop_oneof![Just(None), Just(Some(0)), Just(Some(1))],
         happenings in prop::collection::vec(happening(), 1..80),
     ) {
-        let mut world = World { bad, ..World::new(rules) };
+        let outputs = Outputs { paths: outputs.then(|| "maps/*".to_owned()).into_iter().collect() };
+        let mut world = World { bad, outputs, ..World::new(rules) };
         for happening in happenings {
             world.happen(happening);
             prop_assert!(world.alive.len() <= 1);
@@ -450,6 +464,7 @@ proptest! {
                     }
                 }
                 prop_assert!(world.disk.len() <= 3);
+                prop_assert!(record.collections.is_empty());
             }
             (Some(_), None) => prop_assert!(false, "an order without a record"),
         }

@@ -6,7 +6,8 @@ use task_proto::report::{Failure, FailureCode, Phase};
 
 use super::{MAX_RESTARTS_IN_A_ROW, Situation, Step, run_dir_name};
 use crate::ledger::{
-    ActiveRun, Condemned, End, GateAnswer, GateRecord, Preparation, ProcessRecord, RunRules, TaskRecord,
+    ActiveRun, Collection, Condemned, End, GateAnswer, GateRecord, LostFiles, Preparation, ProcessRecord, RunRules,
+    TaskRecord,
 };
 use crate::observed::Exit;
 
@@ -54,7 +55,7 @@ pub fn begun(record: &TaskRecord, step: &Step, boot_id: &str, start: u64, now_ms
     let phase = match step {
         Step::PullManifest(_) | Step::LookForRos(_) | Step::PullContent(_) => Some(Phase::Fetching),
         Step::Build(_) => Some(Phase::Building),
-        Step::Ask(_) | Step::Start(_) | Step::Stop(_) | Step::Prune { .. } | Step::Remove => None,
+        Step::Ask(_) | Step::Start(_) | Step::Stop(_) | Step::Collect(_) | Step::Prune { .. } | Step::Remove => None,
     };
     if let Some(phase) = phase {
         let again = record.preparation.phase == phase && record.preparation.failure.is_some();
@@ -79,6 +80,9 @@ pub fn begun(record: &TaskRecord, step: &Step, boot_id: &str, start: u64, now_ms
             condemned: None,
         });
         record.active = Some(run);
+    }
+    if *step == Step::Remove {
+        record.collections.clear();
     }
     if let Step::Ask(question) = step
         && record.gate.as_ref().is_none_or(|gate| gate.question != *question)
@@ -114,7 +118,7 @@ pub fn finished(s: &Situation<'_>, step: &Step, outcome: Result<Option<u32>, Ste
             }
             give_up_or_retry(&mut record, s, error.failure, error.retry_after_ms.is_some());
         }
-        (Step::Stop(_), Ok(_)) => {
+        (Step::Stop(run), Ok(_)) => {
             let process = record.active.as_mut().and_then(|active| active.process.take());
             if let Some(condemned) = process.and_then(|process| process.condemned) {
                 give_up_or_retry(&mut record, s, condemned.failure, condemned.again);
@@ -124,6 +128,7 @@ pub fn finished(s: &Situation<'_>, step: &Step, outcome: Result<Option<u32>, Ste
             {
                 active.end = Some(interrupted("the job was stopped before it had ended"));
             }
+            collect_if_over(&mut record, run, s.now_ms);
         }
         (Step::Stop(_), Err(_)) => {
             if let Some(active) = &mut record.active {
@@ -135,6 +140,18 @@ pub fn finished(s: &Situation<'_>, step: &Step, outcome: Result<Option<u32>, Ste
                 answered(gate, s, outcome.err());
             }
         }
+        (Step::Collect(files), Ok(_)) => record.collections.retain(|other| !other.is_same(files)),
+        (Step::Collect(files), Err(StepFailure { failure, retry_after_ms })) => match retry_after_ms {
+            Some(least_ms) => {
+                for files in record.collections.iter_mut().filter(|other| other.is_same(files)) {
+                    files.attempts = files.attempts.saturating_add(1);
+                    let wait_ms = backoff_ms(files.attempts, MAX_STEP_BACKOFF_MS, s.jitter).max(least_ms);
+                    files.retry_at_ms = s.now_ms + wait_ms.max(BACKOFF_BASE_MS);
+                    files.failure = Some(failure.clone());
+                }
+            }
+            None => lose_files(&mut record, files, Some(&failure)),
+        },
         (Step::Remove, Err(_)) => {
             record.preparation.attempts = record.preparation.attempts.saturating_add(1);
             let wait_ms = backoff_ms(record.preparation.attempts, MAX_STEP_BACKOFF_MS, s.jitter);
@@ -190,7 +207,9 @@ pub(super) fn prepared_to(s: &Situation<'_>, phase: Phase, failure: Option<Failu
 pub(super) fn ready(s: &Situation<'_>) -> TaskRecord {
     let mut record = s.record.clone();
     // It has proved itself: what it replaced is not needed any more.
-    record.fallback = None;
+    if let Some(before) = record.fallback.take() {
+        collect_files(&mut record, &before, s.now_ms);
+    }
     if let Some(active) = &mut record.active {
         active.ever_ready = true;
         if let Some(process) = &mut active.process {
@@ -241,6 +260,7 @@ pub(super) fn never_started(s: &Situation<'_>) -> TaskRecord {
 pub(super) fn ended(s: &Situation<'_>, exit: &Exit) -> TaskRecord {
     let mut record = s.record.clone();
     let Some(active) = &mut record.active else { return record };
+    let run = active.clone();
     let Some(process) = active.process.take() else { return record };
     let job_done = active.rules.kind == TaskKind::Job && exit.is_success();
     if let Some(condemned) = process.condemned {
@@ -258,8 +278,50 @@ pub(super) fn ended(s: &Situation<'_>, exit: &Exit) -> TaskRecord {
         };
         give_up_or_retry(&mut record, s, exit.failure(), again);
     }
+    collect_if_over(&mut record, &run, s.now_ms);
     record.settle_phase(s.now_ms);
     record
+}
+
+/// Sees to the files of `run`, whose process is gone, unless the run goes on: with another process, or later.
+fn collect_if_over(record: &mut TaskRecord, run: &ActiveRun, now_ms: u64) {
+    let same = |active: &&ActiveRun| active.deployment == run.deployment && active.run == run.run;
+    let goes_on = record.active.as_ref().filter(same).is_some_and(|active| active.end.is_none());
+    let stopped = record.order.wanted == Wanted::Stopped;
+    // One that was replaced may come back; it is over once the new one is ready.
+    if !goes_on || stopped {
+        collect_files(record, run, now_ms);
+    }
+}
+
+fn collect_files(record: &mut TaskRecord, run: &ActiveRun, now_ms: u64) {
+    if run.rules.has_outputs {
+        let files = Collection::of(run, now_ms);
+        record.collections.retain(|other| !other.is_same(&files));
+        record.collections.push(files);
+    }
+}
+
+/// The record once the files of a run are given up.
+pub(super) fn gave_up_files(s: &Situation<'_>, files: &Collection) -> TaskRecord {
+    let mut record = s.record.clone();
+    lose_files(&mut record, files, files.failure.as_ref());
+    record.settle_phase(s.now_ms);
+    record
+}
+
+fn lose_files(record: &mut TaskRecord, files: &Collection, why: Option<&Failure>) {
+    record.collections.retain(|other| !other.is_same(files));
+    let why = why.map_or_else(|| "other runs ended before they could be sent".to_owned(), ToString::to_string);
+    let text = format!("files of run {} did not come back: {why}", files.run);
+    let failure = Failure::new(FailureCode::OUTPUTS_LOST, text);
+    record.lost = Some(LostFiles { deployment: files.deployment.clone(), run: files.run, failure });
+}
+
+impl Collection {
+    fn is_same(&self, other: &Self) -> bool {
+        self.deployment == other.deployment && self.run == other.run
+    }
 }
 
 fn after_reboot(record: &mut TaskRecord, now_ms: u64) {

@@ -30,6 +30,9 @@ pub struct Owners {
     pub theirs: BTreeSet<ParticipantId>,
     /// In another process, here or elsewhere.
     pub others: BTreeSet<ParticipantId>,
+    /// In no process any more: its addresses are all this host's, and nobody listens there who could be it. Discovery knows
+    /// of it until its lease ends.
+    pub gone: BTreeSet<ParticipantId>,
     /// It cannot be told.
     pub unknown: BTreeSet<ParticipantId>,
 }
@@ -93,7 +96,9 @@ impl Host {
     fn judge(&self, participants: &BTreeMap<ParticipantId, Participant>) -> Owners {
         let mut owners = Owners::default();
         for (id, participant) in participants {
-            let class = match self.holds(&participant.locators, participant.first_seen.elapsed()) {
+            let seen_for = participant.first_seen.elapsed();
+            let class = match self.holds(&participant.locators, seen_for) {
+                _ if self.is_deserted(&participant.locators, seen_for) => &mut owners.gone,
                 Some(true) => &mut owners.theirs,
                 Some(false) => &mut owners.others,
                 None => &mut owners.unknown,
@@ -124,6 +129,16 @@ impl Host {
             (true, true, _) | (false, false, true) => None,
             (false, ..) => self.complete.then_some(false),
         }
+    }
+
+    /// Whether all these addresses are this host's, and nobody listens there who did when they were first seen.
+    fn is_deserted(&self, locators: &BTreeSet<SocketAddr>, seen_for: Duration) -> bool {
+        let is_too_young = |socket: &u64| self.held.get(socket).is_some_and(|age| *age + CLOCK_STEP < seen_for);
+        let nobody = |locator: &SocketAddr| {
+            let sockets = self.sockets.get(&locator.port());
+            self.is_here(locator.ip()) && sockets.is_none_or(|sockets| sockets.iter().all(is_too_young))
+        };
+        !self.sockets.is_empty() && !locators.is_empty() && locators.iter().all(nobody)
     }
 
     fn is_here(&self, address: IpAddr) -> bool {
@@ -216,6 +231,24 @@ mod tests {
         let locators = participant(&["192.168.1.5:7411"]).locators;
         assert_eq!(host(true).holds(&locators, Duration::from_secs(10)), Some(true));
         assert_eq!(host(true).holds(&locators, Duration::from_secs(11)), Some(false));
+    }
+
+    #[test]
+    fn a_participant_is_gone_when_nobody_can_be_it() {
+        for (locators, seen_for_s, expected) in [
+            (&["192.168.1.5:7415"][..], 1, true),
+            (&["192.168.1.5:7413"], 1, false),
+            // Its port was taken over by a process that was started later.
+            (&["192.168.1.5:7411"], 11, true),
+            (&["192.168.1.5:7411"], 1, false),
+            (&["192.168.1.7:7415"], 1, false),
+            (&["192.168.1.5:7415", "192.168.1.7:7415"], 1, false),
+            (&[], 1, false),
+        ] {
+            let found = host(true).is_deserted(&participant(locators).locators, Duration::from_secs(seen_for_s));
+            assert_eq!(found, expected, "{locators:?} {seen_for_s}");
+        }
+        assert!(!Host::default().is_deserted(&participant(&["127.0.0.1:7415"]).locators, Duration::ZERO));
     }
 
     #[test]

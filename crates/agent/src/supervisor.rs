@@ -172,6 +172,16 @@ impl Supervisor {
         }
     }
 
+    /// The processes that the run at `path` has now.
+    pub async fn pids(&self, path: &Path) -> Result<Vec<u32>, SupervisorError> {
+        let (dir, started, cgroup) = read(path).await?;
+        let containment = Containment::new(dir.path(), started.map(|started| started.shim), cgroup);
+        let members = tokio::task::spawn_blocking(move || containment.members()).await;
+        let members =
+            members.map_err(std::io::Error::from).flatten().map_err(failed("look for the task's processes"))?;
+        Ok(members.iter().map(|member| member.pid).collect())
+    }
+
     /// Ends the run at `path`: SIGINT to the task's process group, or to its first process alone where its launcher wants
     /// that; `grace`; SIGTERM to all of it; `grace`; SIGKILL.
     /// Afterwards none of its processes is left, wherever they had hidden. Dropping the future leaves a run that may

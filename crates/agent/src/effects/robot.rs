@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use task_proto::desired::PackageRef;
 use task_proto::manifest::{BuildTool, TaskManifest};
-use task_proto::report::{Failure, FailureCode, HostFacts, Isolation, Progress};
+use task_proto::report::{Failure, FailureCode, HostFacts, Isolation, Progress, RosFacts};
 use task_proto::{Digest, MacAddress, RobotId, TaskName};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
@@ -20,6 +20,7 @@ use crate::cgroup::{Cgroups, RunLimits};
 use crate::config::Config;
 use crate::fetch::{self, FetchError, Fetcher};
 use crate::gate::Gate;
+use crate::graph_access::GraphAccess;
 use crate::installation::Installation;
 use crate::layout::{DataDir, VersionDir};
 use crate::ledger::{ActiveRun, Collection, GateQuestion, Ledger, LedgerError, ProcessRecord};
@@ -27,10 +28,12 @@ use crate::observed::{Exit, Health, Prepared, ProcessState, RobotFacts};
 use crate::outputs::{self, OutputError, OutputOrder, Registry};
 use crate::plan::StepFailure;
 use crate::process::ExitStatus;
+use crate::readiness::Promise;
 use crate::run_dir::{LogSpec, RunSpec};
 use crate::supervisor::{Observed, Supervisor, SupervisorError};
 use crate::task_user::{TaskUser, TaskUserError};
 use crate::underlay::{self, Places};
+use crate::watcher::{Watched, Watcher};
 use crate::{clock, disk, durable, environment, installation, launch, logs, script, survey};
 
 /// Written into a version's directory once it is built.
@@ -55,6 +58,7 @@ pub struct Robot {
     robot: RobotId,
     output_bytes: u64,
     supervisor: Supervisor,
+    watcher: Watcher,
     /// The configured setup files.
     underlays: Vec<PathBuf>,
     /// The ROS that was last seen.
@@ -100,6 +104,7 @@ impl Robot {
             registry,
             robot: robot.clone(),
             output_bytes: config.limits.output_bytes.unwrap_or(OUTPUT_BYTES),
+            watcher: Watcher::new(GraphAccess::of_robot(mac), Supervisor::of_this_program(cgroups.clone())),
             supervisor: Supervisor::of_this_program(cgroups.clone()),
             cgroups,
             task_user: TaskUser::find(config.task_user.as_deref()),
@@ -130,6 +135,15 @@ impl Robot {
         let mut log = LogSpec::at(self.data.task(task).output_log());
         log.max_bytes = self.log_bytes.unwrap_or(log.max_bytes);
         log
+    }
+
+    /// What this version promises about the ROS graph; nothing, where its manifest is gone.
+    fn promise(&self, package: &PackageRef) -> Promise {
+        fetch::stored_manifest(&self.data, package).map_or_else(Promise::default, |manifest| Promise::of(&manifest))
+    }
+
+    fn ros_facts(&self) -> Option<RosFacts> {
+        environment::ros_facts(&self.installations(), &self.environment)
     }
 
     fn installations(&self) -> Vec<Installation> {
@@ -288,12 +302,13 @@ impl Effects for Robot {
         }
     }
 
-    // A process that lives is all that is promised so far.
-    fn watch(&self, _task: &TaskName, run: &ActiveRun) -> watch::Receiver<Health> {
-        let since_ms = run.process.as_ref().map_or(0, |process| process.started_ms);
-        let (health, seen) = watch::channel(Health::Holds { since_ms });
-        tokio::spawn(async move { health.closed().await });
-        seen
+    fn watch(&self, task: &TaskName, run: &ActiveRun) -> watch::Receiver<Health> {
+        let watched = run.process.as_ref().map(|process| Watched {
+            dir: self.run_dir(task, process),
+            started_ms: process.started_ms,
+            was_ready: process.ready,
+        });
+        self.watcher.watch(watched.unwrap_or_default(), self.promise(&run.package), self.ros_facts())
     }
 
     fn keep_parts(&self, wanted: &[Digest]) {
@@ -373,6 +388,10 @@ impl Effects for Robot {
         for other in other_runs(&task_dir.run(), Some(&run_dir)) {
             self.supervisor.stop(&other, Duration::ZERO).await.map_err(|error| failed(&error))?;
         }
+        self.watcher.before_start(&Promise::of(&manifest), self.ros_facts().as_ref()).await.map_err(|failure| {
+            // Whoever has the name may go away: a run that was ready before waits for that.
+            StepFailure { failure, retry_after_ms: run.ever_ready.then_some(0) }
+        })?;
         let started = self.supervisor.start(&run_dir, &spec).await;
         let pid = started.map_err(|error| failed(&error))?.task.pid;
         // What earlier runs left is of no more use; that it can't be deleted is no reason not to run.
@@ -385,7 +404,9 @@ impl Effects for Robot {
     async fn stop(&self, task: &TaskName, run: &ActiveRun) -> Result<(), StepFailure> {
         let Some(process) = &run.process else { return Ok(()) };
         let grace = Duration::from_secs(u64::from(run.rules.stop_timeout_s));
-        let stopped = self.supervisor.stop(&self.run_dir(task, process), grace).await;
+        let dir = self.run_dir(task, process);
+        self.watcher.wind_down(&dir, &self.promise(&run.package), self.ros_facts().as_ref(), grace / 2).await;
+        let stopped = self.supervisor.stop(&dir, grace).await;
         stopped.map(drop).map_err(|error: SupervisorError| later(FailureCode::IO_ERROR, &error, 0))
     }
 

@@ -1,0 +1,107 @@
+//! When the agent takes part in the ROS graph: from the first time that a task or a question needs it, on a robot that has
+//! ROS 2, until the agent ends. A robot without ROS 2 never opens a socket for it. It looks at nothing itself.
+
+use std::error::Error as _;
+use std::sync::Arc;
+use std::time::Duration;
+
+use task_proto::MacAddress;
+use task_proto::id::InvalidId;
+use task_proto::report::{Failure, FailureCode, RosFacts};
+use tokio::sync::Mutex;
+use tokio::time::Instant;
+
+use crate::graph::{Graph, GraphSettings};
+
+/// How long discovery may take until the graph shows who was there before: nodes announce themselves every 3 s.
+const DISCOVERY: Duration = Duration::from_millis(3500);
+/// When to try again after the graph could not be opened.
+const RETRY: Duration = Duration::from_secs(10);
+
+/// The way to the robot's graph; clones share it.
+#[derive(Clone)]
+pub struct GraphAccess {
+    mac: MacAddress,
+    state: Arc<Mutex<State>>,
+}
+
+#[derive(Default)]
+enum State {
+    #[default]
+    Closed,
+    Open {
+        graph: Graph,
+        since: Instant,
+    },
+    Failed {
+        failure: Failure,
+        at: Instant,
+    },
+}
+
+impl GraphAccess {
+    /// Closed at first. The node is named for the robot, because two agents on one host, or in one domain, need two names.
+    pub fn of_robot(mac: MacAddress) -> Self {
+        Self { mac, state: Arc::default() }
+    }
+
+    /// The graph, opened now if it was not yet. `facts` say what the robot has, as it was seen last.
+    pub async fn open(&self, facts: Option<&RosFacts>) -> Result<Graph, Failure> {
+        self.opened(facts).await.map(|(graph, _)| graph)
+    }
+
+    /// The graph, if somebody has opened it.
+    pub async fn if_open(&self) -> Option<Graph> {
+        match &*self.state.lock().await {
+            State::Open { graph, .. } => Some(graph.clone()),
+            State::Closed | State::Failed { .. } => None,
+        }
+    }
+
+    /// Likewise, but not before it can show who was there when it was opened.
+    pub async fn settled(&self, facts: Option<&RosFacts>) -> Result<Graph, Failure> {
+        let (graph, since) = self.opened(facts).await?;
+        tokio::time::sleep_until(since + DISCOVERY).await;
+        Ok(graph)
+    }
+
+    async fn opened(&self, facts: Option<&RosFacts>) -> Result<(Graph, Instant), Failure> {
+        let mut state = self.state.lock().await;
+        match &*state {
+            State::Open { graph, since } => return Ok((graph.clone(), *since)),
+            State::Failed { failure, at } if at.elapsed() < RETRY => return Err(failure.clone()),
+            State::Closed | State::Failed { .. } => {}
+        }
+        let settings = self.settings(facts)?;
+        match Graph::open(&settings).await {
+            Ok(graph) => {
+                tracing::info!(domain_id = settings.domain_id, localhost_only = settings.localhost_only, "graph open");
+                let since = Instant::now();
+                *state = State::Open { graph: graph.clone(), since };
+                Ok((graph, since))
+            }
+            Err(error) => {
+                let why = error.source().map_or_else(String::new, |source| format!(": {source}"));
+                let failure = Failure::new(FailureCode::GRAPH_UNAVAILABLE, format!("{error}{why}"));
+                tracing::error!(%failure, "the ROS graph can't be opened");
+                *state = State::Failed { failure: failure.clone(), at: Instant::now() };
+                Err(failure)
+            }
+        }
+    }
+
+    fn settings(&self, facts: Option<&RosFacts>) -> Result<GraphSettings, Failure> {
+        let found = facts.and_then(|facts| Some((facts, facts.domain_id?)));
+        let none =
+            || Failure::new(FailureCode::GRAPH_UNAVAILABLE, "this robot has no ROS 2, whose graph could be watched");
+        let (facts, domain_id) = found.ok_or_else(none)?;
+        let name = format!("/task_agent_{}", self.mac.to_string().replace(':', ""));
+        let unnamed = |error: InvalidId| Failure::new(FailureCode::GRAPH_UNAVAILABLE, error.to_string());
+        Ok(GraphSettings {
+            domain_id,
+            localhost_only: facts.localhost_only,
+            node_name: name.parse().map_err(unnamed)?,
+            distro: Some(facts.distro.clone()),
+        })
+    }
+}

@@ -10,6 +10,7 @@ mod orders;
 mod proxy;
 mod registry;
 mod restore;
+mod ros;
 mod ros1;
 mod talker;
 mod tidy;

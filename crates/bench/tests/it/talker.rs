@@ -8,7 +8,7 @@ use task_proto::report::Phase;
 use crate::harness::{Robot, Server, eventually, processes_with, required};
 
 /// Calls the Trigger service `name` from a real rclpy node and gives the answer's text.
-async fn trigger(venv: &Path, domain: &str, name: &str) -> String {
+pub async fn trigger(venv: &Path, domain: &str, name: &str) -> String {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/it/trigger.py");
     let output = tokio::process::Command::new(venv.join("bin/python3"))
         .arg(script)

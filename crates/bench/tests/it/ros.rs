@@ -1,0 +1,309 @@
+//! "Running" as ROS says it: real rclpy nodes, built by real colcon and pushed through the whole system, keep or break what
+//! their packages promise. Each test has a server, a robot and a ROS domain of its own; its tasks go side by side.
+#![expect(clippy::disallowed_methods, reason = "a test starts processes")]
+
+use std::net::UdpSocket;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::Instant;
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use task_proto::api::RobotTask;
+use task_proto::report::{Failure, Phase};
+use tempfile::TempDir;
+
+use crate::harness::{Process, Robot, Server, eventually, processes_with, required};
+use crate::talker::trigger;
+
+/// Where the package lies whose node does as it is told.
+const PROBE: &str = "tests/it/graph_probe";
+
+/// A ROS domain that nobody else on this machine has while this lives: a port that no participant of it uses is the lock.
+struct Domain {
+    id: String,
+    _lock: UdpSocket,
+}
+
+impl Domain {
+    fn free() -> Self {
+        // Domains whose ports lie below those the system gives out; port 7400 + 250 n + 249 would be the 120th participant's.
+        let free = |id: u16| {
+            let lock = UdpSocket::bind(("127.0.0.1", 7400 + 250 * id + 249)).ok()?;
+            Some(Self { id: id.to_string(), _lock: lock })
+        };
+        (1..=70).rev().find_map(free).expect("a free ROS domain")
+    }
+}
+
+/// A server, a robot, and a domain in which the robot's nodes meet.
+struct Stage {
+    robot: Robot,
+    server: Server,
+    domain: Domain,
+    dir: TempDir,
+}
+
+impl Stage {
+    async fn start() -> Self {
+        let domain = Domain::free();
+        let activate = format!("{}/bin/activate", required("TASKD_TEST_ROS"));
+        let dir = TempDir::new().expect("temp dir");
+        build(&activate, &dir.path().join("built")).await;
+        let server = Server::start(&dir.path().join("server")).await;
+        let settings = [
+            ("TASK_AGENT_UNDERLAYS", activate.as_str()),
+            ("TASK_AGENT_ROS_DOMAIN_ID", &domain.id),
+            ("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
+        ];
+        let robot = Robot::start_with(&server, dir.path(), "robot-1", 1, &server.url(""), &settings).await;
+        Self { robot, server, domain, dir }
+    }
+
+    /// A package whose node gets `arguments`, and whose task.toml has `rest` behind its `[run]` table. It is built already.
+    fn package(&self, name: &str, version: &str, arguments: &str, rest: &str) -> PathBuf {
+        let dir = self.dir.path().join(format!("{name}-{version}"));
+        copy(&self.dir.path().join("built/install"), &dir.join("install"));
+        write_toml(&dir, name, version, arguments, &format!("{rest}\n[build]\ntool = 'none'\n"));
+        dir
+    }
+
+    async fn push(&self, name: &str, arguments: &str, rest: &str) {
+        self.server.push(&self.package(name, "1.0.0", arguments, rest), "*").await;
+    }
+
+    async fn task(&self, name: &str) -> Option<RobotTask> {
+        self.server.robot("robot-1").await?.tasks.into_iter().find(|task| task.task.as_str() == name)
+    }
+
+    /// Waits until the task runs as it should.
+    async fn runs(&self, name: &str) -> RobotTask {
+        self.is(name, Phase::Running, |task| task.degraded.is_none().then_some(task)).await
+    }
+
+    async fn fails(&self, name: &str) -> Failure {
+        self.is(name, Phase::Failed, |task| task.failure).await
+    }
+
+    async fn degrades(&self, name: &str) -> Failure {
+        self.is(name, Phase::Running, |task| task.degraded).await
+    }
+
+    async fn is<T>(&self, name: &str, phase: Phase, which: impl Fn(RobotTask) -> Option<T>) -> T {
+        eventually(&format!("{name} to be {phase} as expected"), async || {
+            let task = self.task(name).await;
+            which(task.filter(|task| task.phase == phase)?)
+        })
+        .await
+    }
+
+    /// The process of the task's node, which is the one that has these words in its command line.
+    fn node(&self, name: &str) -> i32 {
+        let needle = format!("tasks/{name}/");
+        let found: Vec<i32> = processes_with(self.dir.path().to_str().expect("utf-8").as_bytes())
+            .into_iter()
+            .filter(|pid| {
+                let line = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
+                let environment = std::fs::read(format!("/proc/{pid}/environ")).unwrap_or_default();
+                let text = String::from_utf8_lossy(&line).into_owned();
+                text.contains("graph_probe/probe")
+                    && !text.contains("--below")
+                    && String::from_utf8_lossy(&environment).contains(&needle)
+            })
+            .collect();
+        assert_eq!(found.len(), 1, "the processes of {name}'s node: {found:?}");
+        found[0]
+    }
+
+    fn signal(&self, name: &str, signal: Signal) {
+        kill(Pid::from_raw(self.node(name)), signal).expect("signalled");
+    }
+
+    async fn say(&self, service: &str) -> String {
+        trigger(Path::new(&required("TASKD_TEST_ROS")), &self.domain.id, service).await
+    }
+
+    fn log(&self, name: &str) -> String {
+        std::fs::read_to_string(self.robot.data().join(format!("tasks/{name}/logs/task.log"))).unwrap_or_default()
+    }
+}
+
+fn write_toml(dir: &Path, name: &str, version: &str, arguments: &str, rest: &str) {
+    let words = ["install/graph_probe/lib/graph_probe/probe"].into_iter().chain(arguments.split(' '));
+    let words: Vec<&str> = words.collect();
+    let toml = format!("name = {name:?}\nversion = {version:?}\n[run]\nexec = {words:?}\nstop_timeout_s = 6\n{rest}");
+    std::fs::write(dir.join("task.toml"), toml).expect("task.toml");
+}
+
+/// What a person does who builds the package on their own machine.
+async fn build(activate: &str, dir: &Path) {
+    copy(&Path::new(env!("CARGO_MANIFEST_DIR")).join(PROBE), &dir.join("src"));
+    let mut colcon = tokio::process::Command::new("bash");
+    colcon.args(["-c", ". \"$0\" && exec colcon build --base-paths src", activate]).current_dir(dir);
+    let output = colcon.output().await.expect("bash runs");
+    assert!(output.status.success(), "colcon: {}", String::from_utf8_lossy(&output.stderr));
+}
+
+fn copy(from: &Path, to: &Path) {
+    std::fs::create_dir_all(to).expect("directory");
+    for entry in std::fs::read_dir(from).expect("readable").map(|entry| entry.expect("entry")) {
+        let target = to.join(entry.file_name());
+        if entry.path().is_dir() {
+            copy(&entry.path(), &target);
+        } else {
+            std::fs::copy(entry.path(), target).expect("copied");
+        }
+    }
+}
+
+fn pid_of(task: &RobotTask) -> u32 {
+    task.active.as_ref().expect("a process").pid
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_task_runs_when_ros_says_so_and_stops_in_good_order() {
+    let stage = Stage::start().await;
+    let ready = |what: &str| format!("[ready]\nhold_s = 1\ntimeout_s = 60\n{what}\n");
+    // This one is built on the robot.
+    let sources = stage.dir.path().join("by-node");
+    copy(&Path::new(env!("CARGO_MANIFEST_DIR")).join(PROBE), &sources);
+    write_toml(&sources, "by-node", "1.0.0", "--node by_node", &ready("nodes = ['/by_node']"));
+    stage.server.push(&sources, "*").await;
+    let parameters = "services = ['/say']\n[parameters.'/by_service']\nresolution = 2";
+    stage.push("by-service", "--node by_service --service /say", &ready(parameters)).await;
+    stage
+        .push("by-topic", "--node by_topic --topic /ticks --hz 20", &ready("topics = { '/ticks' = { min_hz = 10 } }"))
+        .await;
+    let late =
+        "lifecycle = ['/by_lifecycle']\nservices = ['/ask']\n[parameters.'/by_lifecycle']\nlate = 7\nresolution = 0.5";
+    stage.push("by-lifecycle", "--node by_lifecycle --lifecycle --service /ask", &ready(late)).await;
+    for name in ["by-node", "by-service", "by-topic", "by-lifecycle"] {
+        stage.runs(name).await;
+    }
+    // An independent client: the parameters have arrived, a whole number as the node's double.
+    assert_eq!((stage.say("/say").await, stage.say("/ask").await), ("2.0".to_owned(), "0.5".to_owned()));
+
+    let asked = Instant::now();
+    stage.server.operate(["stop", "by-lifecycle", "--on", "*", "--yes"]).await;
+    stage.server.wait_phase("robot-1", "by-lifecycle", Phase::Stopped).await;
+    println!("stopped a lifecycle node in {:?}", asked.elapsed());
+    assert!(stage.log("by-lifecycle").contains("shut down in good order"), "{}", stage.log("by-lifecycle"));
+    let asked = Instant::now();
+    stage.server.operate(["stop", "by-node", "--on", "*", "--yes"]).await;
+    stage.server.wait_phase("robot-1", "by-node", Phase::Stopped).await;
+    println!("stopped a plain node in {:?}", asked.elapsed());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_never_gets_ready_fails_and_says_what_is_missing() {
+    let stage = Stage::start().await;
+    let ready = |what: &str| format!("restart = 'never'\n[ready]\nhold_s = 0\ntimeout_s = 8\n{what}\n");
+    stage.push("absent", "--node lidar", &ready("nodes = ['/mapper']")).await;
+    stage.push("slow", "--node slow --topic /slow --hz 2", &ready("topics = { '/slow' = { min_hz = 10 } }")).await;
+    let negative = ready("[parameters.'/picky']\nresolution = -1\nunheard_of = true");
+    stage.push("picky", "--node picky", &negative).await;
+    stage.push("stubborn", "--node stubborn --lifecycle --breaks configure", &ready("lifecycle = ['/stubborn']")).await;
+
+    let mut stranger = Command::new(format!("{}/bin/python3", required("TASKD_TEST_ROS")));
+    stranger
+        .arg(Path::new(env!("CARGO_MANIFEST_DIR")).join(PROBE).join("graph_probe/probe.py"))
+        .args(["--node", "taken"])
+        .env("ROS_DOMAIN_ID", &stage.domain.id)
+        .env("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        .stdout(Stdio::null());
+    let _stranger = Process::spawn(&mut stranger);
+    stage.push("taken", "--node taken --lifecycle", &ready("lifecycle = ['/taken']")).await;
+
+    let failures = [
+        ("absent", "not_ready", "`/mapper` did not appear within 8 s; on the graph: "),
+        ("slow", "not_ready", "`/slow` did not come at 10 Hz within 8 s; it came at "),
+        ("picky", "parameter_rejected", "`/picky` resolution = -1: must be positive"),
+        ("stubborn", "lifecycle_failed", "`/stubborn` failed to configure and is unconfigured"),
+        ("taken", "node_name_taken", "`/taken` is already on the graph: another process"),
+    ];
+    for (name, code, text) in failures {
+        let failure = stage.fails(name).await;
+        assert!(failure.code.as_str() == code && failure.text.contains(text), "{name}: {failure}");
+        assert!(name != "absent" || failure.text.contains("`/lidar`"), "{failure}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_breaks_while_it_runs_degrades_the_task_and_says_why() {
+    let stage = Stage::start().await;
+    let ready = |what: &str| format!("restart = 'never'\n[ready]\nhold_s = 0\ntimeout_s = 60\n{what}\n");
+    stage.push("crashing", "--node crashing --breaks crash", &ready("nodes = ['/crashing']")).await;
+    stage.push("killed", "--node killed --below", &ready("nodes = ['/killed']")).await;
+    let topic = ready("topics = { '/ticks' = { min_hz = 5 } }");
+    stage.push("silent", "--node silent --topic /ticks --breaks silence", &topic).await;
+    stage.push("inactive", "--node inactive --lifecycle --breaks inactive", &ready("lifecycle = ['/inactive']")).await;
+    stage.push("deaf", "--node deaf --service /say --breaks service", &ready("services = ['/say']")).await;
+    let back = "--node back --lifecycle --below --respawn";
+    stage.push("back", back, &ready("lifecycle = ['/back']\n[parameters.'/back']\nlate = 2")).await;
+    for name in ["crashing", "killed", "silent", "inactive", "deaf", "back"] {
+        stage.runs(name).await;
+    }
+    let before = stage.node("back");
+    for name in ["crashing", "silent", "inactive", "deaf"] {
+        stage.signal(name, Signal::SIGUSR1);
+    }
+    stage.signal("killed", Signal::SIGKILL);
+    let killed = Instant::now();
+    let failure = stage.degrades("killed").await;
+    println!("a killed node was noticed after {:?}", killed.elapsed());
+    assert_eq!(failure.to_string(), "node_vanished: `/killed` left the graph; its process is gone");
+    for (name, code) in [("silent", "topic_silent"), ("inactive", "node_inactive"), ("deaf", "service_lost")] {
+        let failure = stage.degrades(name).await;
+        assert_eq!(failure.code.as_str(), code, "{name}: {failure}");
+    }
+    assert_eq!(stage.fails("crashing").await.code.as_str(), "process_exited");
+
+    // What its launcher starts again is brought up again.
+    stage.signal("back", Signal::SIGKILL);
+    assert_eq!(stage.degrades("back").await.code.as_str(), "node_vanished");
+    stage.runs("back").await;
+    assert_ne!(stage.node("back"), before);
+    assert_eq!(stage.log("back").matches("activated with late = 2").count(), 2, "{}", stage.log("back"));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_new_agent_sees_running_tasks_as_they_are_and_leaves_them_alone() {
+    let mut stage = Stage::start().await;
+    let ready = |what: &str| format!("restart = 'never'\n[ready]\nhold_s = 0\ntimeout_s = 60\n{what}\n");
+    let kept = ready("lifecycle = ['/kept']\n[parameters.'/kept']\nlate = 2");
+    stage.push("kept", "--node kept --lifecycle", &kept).await;
+    stage.push("lost", "--node lost --below", &ready("nodes = ['/lost']")).await;
+    let (before, _) = (stage.runs("kept").await, stage.runs("lost").await);
+    stage.robot.kill();
+    stage.signal("lost", Signal::SIGKILL);
+    stage.robot.restart();
+    // Only the new agent can tell, and by then it has looked at the other task as well.
+    assert_eq!(stage.degrades("lost").await.code.as_str(), "node_vanished");
+    let after = stage.runs("kept").await;
+    assert_eq!((pid_of(&after), after.restarts), (pid_of(&before), before.restarts));
+    assert_eq!(stage.log("kept").matches("activated with late = 2").count(), 1, "{}", stage.log("kept"));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_version_that_does_not_get_ready_gives_way_to_the_one_before() {
+    let stage = Stage::start().await;
+    let ready = |node: &str| format!("[ready]\nhold_s = 0\ntimeout_s = 10\nlifecycle = ['/{node}']\n");
+    stage.push("mapper", "--node mapper --lifecycle", &ready("mapper")).await;
+    let before = stage.runs("mapper").await;
+    let second = stage.package("mapper", "2.0.0", "--node mapper --lifecycle", &ready("better_mapper"));
+    stage.server.push(&second, "*").await;
+    let failure = stage.is("mapper", Phase::RolledBack, |task| task.failure).await;
+    assert!(failure.text.contains("`/better_mapper` did not appear within 10 s"), "{failure}");
+    let after = stage
+        .is("mapper", Phase::RolledBack, |task| {
+            let version = task.active.as_ref()?.version.as_str().to_owned();
+            (version == "1.0.0" && task.degraded.is_none()).then_some(task)
+        })
+        .await;
+    assert_ne!(pid_of(&after), pid_of(&before));
+    // The one before is on the graph, and active, for whoever asks.
+    eventually("the old version to be active again", async || {
+        (stage.log("mapper").matches("activated with late = 1").count() == 2).then_some(())
+    })
+    .await;
+}

@@ -8,6 +8,7 @@ pub mod console;
 pub mod forwarder;
 pub mod line;
 pub mod record;
+pub mod ros;
 pub mod rotated;
 pub mod tail;
 

@@ -156,6 +156,14 @@ impl ProcessEntry {
         ProcessIdentity { pid: self.pid, start_ticks: self.start_ticks, boot_id: boot_id.to_owned() }
     }
 
+    /// What it was started with as the variable `name`. `None` also where that can't be read.
+    pub fn variable(&self, name: &str) -> Option<String> {
+        let environment = std::fs::read(format!("/proc/{}/environ", self.pid)).ok()?;
+        let mut entries = environment.split(|byte| *byte == 0);
+        let value = entries.find_map(|entry| entry.strip_prefix(name.as_bytes())?.strip_prefix(b"="))?;
+        String::from_utf8(value.to_vec()).ok()
+    }
+
     /// Whether it was started with `variable` (`NAME=value`) in its environment. False where that can't be read.
     pub fn was_started_with(&self, variable: &str) -> bool {
         let environment = std::fs::read(format!("/proc/{}/environ", self.pid)).unwrap_or_default();
@@ -453,5 +461,6 @@ mod tests {
         let path = std::env::var("PATH").expect("set");
         assert!(entry.was_started_with(&format!("PATH={path}")));
         assert!(!entry.was_started_with("PATH="));
+        assert_eq!((entry.variable("PATH"), entry.variable("PAT")), (Some(path), None));
     }
 }

@@ -11,6 +11,7 @@ mod gate;
 mod graph;
 mod harness;
 mod launch;
+mod logs;
 mod ros;
 mod supervise;
 mod unpack;

@@ -47,12 +47,18 @@ pub struct RosNode {
 impl RosNode {
     /// Starts it in this domain and waits until it says that it is up.
     pub async fn start(script: &str, domain_id: u16, arguments: &[&str]) -> Self {
+        Self::start_with(script, domain_id, arguments, &[]).await
+    }
+
+    /// The same with more in its environment.
+    pub async fn start_with(script: &str, domain_id: u16, arguments: &[&str], environment: &[(&str, &Path)]) -> Self {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/it/ros").join(script);
         let mut child = Command::new(ros().join("bin/python3"))
             .arg(path)
             .args(arguments)
             .env("ROS_DOMAIN_ID", domain_id.to_string())
             .env("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+            .envs(environment.iter().copied())
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .kill_on_drop(true)

@@ -1,0 +1,58 @@
+//! What real nodes say on ROS topics is kept with the task whose process said it.
+
+use task_agent::layout::DataDir;
+use task_agent::logs::archive::Wanted;
+use task_agent::logs::{Logs, ros};
+use task_proto::log::{LogLevel, LogLine, LogSource};
+
+use crate::harness::within;
+use crate::ros::{RosNode, open};
+
+/// Longer than a look at who takes part in the graph takes, shorter than a test may.
+const PAUSE: std::time::Duration = std::time::Duration::from_millis(200);
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_nodes_say_is_kept_with_their_task() {
+    let temp = tempfile::tempdir().unwrap();
+    let data = DataDir::new(temp.path()).unwrap();
+    let task = data.task(&"talker".parse().unwrap());
+    std::fs::create_dir_all(task.logs()).unwrap();
+    let run_dir = task.run().join("1");
+    let graph = open(118).await;
+    let keeping = tokio::spawn(ros::keep(graph.clone(), data.clone(), None));
+    let in_namespace = |namespace| ["--ros-args", "-r", namespace];
+    let environment = [("TASKD_RUN_DIR", run_dir.as_path())];
+    let mut ours = RosNode::start_with("talker.py", 118, &in_namespace("__ns:=/ours"), &environment).await;
+    let mut other = RosNode::start("talker.py", 118, &in_namespace("__ns:=/other")).await;
+    let logs = Logs::new(data);
+    let kept = async |task: Option<&str>| -> Vec<LogLine> {
+        let task = task.map(|task| task.parse().unwrap());
+        logs.kept(Wanted { task, level: LogLevel::Warn, since_ms: None, max_lines: 1000 }).await.unwrap()
+    };
+    let has = |lines: &[LogLine], text: &str| lines.iter().any(|line| line.text == text);
+    // What is sent before both sides have met is lost, so it is sent until it arrives.
+    let all = async {
+        let mut tick = tokio::time::interval(PAUSE);
+        loop {
+            tick.tick().await;
+            ours.order("warn low").await;
+            other.order("warn a neighbour").await;
+            ours.order("diagnose battery is low").await;
+            let lines = kept(Some("talker")).await;
+            if has(&lines, "low") && has(&lines, "battery: battery is low") && has(&kept(None).await, "a neighbour") {
+                return lines;
+            }
+        }
+    };
+    let lines = within("all to be kept", all).await;
+    assert!(!has(&lines, "a neighbour"), "{lines:?}");
+    let said = lines.iter().find(|line| line.text == "low").unwrap();
+    assert_eq!((said.level, said.source), (LogLevel::Warn, LogSource::Rosout));
+    assert_eq!(said.node.as_ref().map(|node| node.as_str()), Some("/ours/talker"));
+    let statuses = lines.iter().filter(|line| line.source == LogSource::Diagnostics).count();
+    assert_eq!(statuses, 1, "a status that does not change is said once: {lines:?}");
+    ours.leave().await;
+    other.leave().await;
+    graph.close().await;
+    within("the end of the graph", keeping).await.unwrap();
+}

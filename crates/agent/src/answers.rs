@@ -12,6 +12,7 @@ use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 
 use crate::clock;
+use crate::graph_answers::GraphAnswers;
 use crate::link::Message;
 use crate::logs::Logs;
 use crate::logs::archive::Wanted;
@@ -25,6 +26,8 @@ pub struct Answers {
     pub robot_id: RobotId,
     /// What its tasks said.
     pub logs: Logs,
+    /// Its ROS graph.
+    pub graph: GraphAnswers,
 }
 
 /// A refusal with `code` and `text`.
@@ -83,8 +86,14 @@ impl Answers {
                 self.logs.follow(level, Duration::from_millis(lease_ms));
                 Ok(Answer::Following)
             }
+            Ask::Nodes => self.graph.nodes().await,
+            Ask::Node { name } => self.graph.node(&name).await,
+            Ask::Topics => self.graph.topics().await,
+            Ask::Parameters { node } => self.graph.parameters(&node).await,
+            Ask::Parameter { node, name } => self.graph.parameter(&node, &name).await,
+            Ask::SetParameter { node, parameter } => self.graph.set_parameter(&node, &parameter).await,
+            Ask::Lifecycle { node, transition } => self.graph.lifecycle(&node, transition).await,
             Ask::Unknown => Err(refusal("unsupported", "this agent does not know the question; it may be too old")),
-            _ => Err(refusal("no_ros", "this robot has no ROS graph to look at")),
         }
     }
 

@@ -19,6 +19,7 @@ pub mod fetch;
 pub mod gate;
 pub mod graph;
 pub mod graph_access;
+pub mod graph_answers;
 pub mod identity;
 pub mod installation;
 pub mod launch;

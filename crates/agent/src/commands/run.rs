@@ -20,6 +20,7 @@ use crate::credential::Credential;
 use crate::driver::{Driver, Speaker};
 use crate::effects::Robot;
 use crate::fetch::{FetchSettings, Fetcher};
+use crate::graph_answers::GraphAnswers;
 use crate::identity::Identity;
 use crate::layout::DataDir as Layout;
 use crate::ledger::{Found, Ledger};
@@ -86,7 +87,7 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
         parallel_tasks: config.parallel_tasks,
     };
     let status = Status { online: true, start: ledger.start + 1, instance, connection: 0 };
-    let driver = Driver::new(robot, speaker, shared.clone(), ledger, lost).await;
+    let driver = Driver::new(robot.clone(), speaker, shared.clone(), ledger, lost).await;
     tracing::info!(robot = %identity.robot_id, server = %base, "task-agent runs");
 
     let (heard, messages) = mpsc::channel(QUEUED_MESSAGES);
@@ -106,7 +107,7 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
         let host = identity.mqtt.host.clone().or_else(|| base.host_str().map(str::to_owned)).unwrap_or_default();
         let (port, prefix) = (identity.mqtt.port, identity.mqtt.prefix.clone());
         let access = MqttAccess { host, port, prefix, robot: identity.robot_id, token: credential, status };
-        converse(access, shared, heard, data, &config);
+        converse(access, shared, heard, data, &config, robot);
     }
     let stop = tokio::spawn(cancel_on_signal(shutdown));
     driver.run(messages).await;
@@ -116,14 +117,21 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
 }
 
 /// Keeps a session up, answers what is asked in it and publishes what tasks say.
-fn converse(access: MqttAccess, shared: Shared, heard: mpsc::Sender<Heard>, data: Layout, config: &Config) {
+fn converse(
+    access: MqttAccess,
+    shared: Shared,
+    heard: mpsc::Sender<Heard>,
+    data: Layout,
+    config: &Config,
+    robot: Arc<Robot>,
+) {
     let robot_id = access.robot.clone();
     let logs = Logs::new(data.clone());
     let forwarder = Forwarder::new(robot_id.clone(), data, config.forward, logs.following());
     let (requests, asked) = mpsc::channel(QUEUED_QUESTIONS);
     let (messages, said) = mpsc::channel(QUEUED_MESSAGES);
     let (batches, lines) = mpsc::channel(1);
-    tokio::spawn(Answers { robot_id, logs }.run(asked, messages));
+    tokio::spawn(Answers { robot_id, logs, graph: GraphAnswers { robot } }.run(asked, messages));
     tokio::spawn(forwarder.run(shared.mqtt_up.subscribe(), batches));
     tokio::spawn(mqtt::run(access, shared, heard, Talk { requests, messages: said, lines }));
 }

@@ -36,6 +36,8 @@ use crate::underlay::{self, Places};
 use crate::watcher::{Watched, Watcher};
 use crate::{clock, disk, durable, environment, installation, launch, logs, script, survey};
 
+mod graph;
+
 /// Written into a version's directory once it is built.
 const BUILT_MARKER: &str = "built";
 /// Written into a version's directory while its files are sent.
@@ -59,6 +61,7 @@ pub struct Robot {
     output_bytes: u64,
     supervisor: Supervisor,
     watcher: Watcher,
+    graph: GraphAccess,
     /// The configured setup files.
     underlays: Vec<PathBuf>,
     /// The ROS that was last seen.
@@ -95,6 +98,7 @@ impl Robot {
         build_limits.pids = Some(config.task_pids);
         let memory_bytes = config.limits.task_memory_mb.map(|megabytes| megabytes << 20);
         let cgroups = Cgroups::find();
+        let graph = GraphAccess::of_robot(mac);
         let environment = environment::of_this_robot(&settings);
         let gate = config.gate.clone().map(|gate| Gate::new(gate, robot.clone(), environment.clone(), data.root()));
         Self {
@@ -104,7 +108,8 @@ impl Robot {
             registry,
             robot: robot.clone(),
             output_bytes: config.limits.output_bytes.unwrap_or(OUTPUT_BYTES),
-            watcher: Watcher::new(GraphAccess::of_robot(mac), Supervisor::of_this_program(cgroups.clone())),
+            watcher: Watcher::new(graph.clone(), Supervisor::of_this_program(cgroups.clone())),
+            graph,
             supervisor: Supervisor::of_this_program(cgroups.clone()),
             cgroups,
             task_user: TaskUser::find(config.task_user.as_deref()),

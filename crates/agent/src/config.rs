@@ -20,6 +20,10 @@ pub const FILE_NAME: &str = "agent.toml";
 pub const MAX_GATE_TIMEOUT_S: u64 = 300;
 /// What every variable starts with.
 const VARIABLE_PREFIX: &str = "TASK_AGENT_";
+/// The variable by which ROS 2 itself knows its domain; `ros_domain_id` wins.
+const ROS_DOMAIN_ID: &str = "ROS_DOMAIN_ID";
+/// ROS 2's last domain whose ports exist everywhere.
+const MAX_ROS_DOMAIN_ID: u32 = 232;
 /// Variables that are no settings: the data directory, the log filter, the enrolment token.
 const OTHER_VARIABLES: [&str; 3] = ["TASK_AGENT_DATA", "TASK_AGENT_LOG", "TASK_AGENT_ENROLL_TOKEN"];
 
@@ -39,7 +43,7 @@ pub struct Settings {
     /// Setup files that are sourced before a task is built or run. Absent: what is in `/opt/ros`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub underlays: Option<Vec<PathBuf>>,
-    /// `ROS_DOMAIN_ID` of every task.
+    /// `ROS_DOMAIN_ID` of every task. Absent: the agent's own, if it has one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ros_domain_id: Option<u32>,
     /// Seconds between two polls while MQTT works.
@@ -175,7 +179,7 @@ pub struct Config {
     pub labels: Option<Labels>,
     /// Setup files to source; empty: what is found.
     pub underlays: Vec<PathBuf>,
-    /// `ROS_DOMAIN_ID` of every task.
+    /// `ROS_DOMAIN_ID` of every task, if the settings or the agent's environment say.
     pub ros_domain_id: Option<u32>,
     /// Between two polls while MQTT works.
     pub poll_interval: Duration,
@@ -244,16 +248,22 @@ impl Config {
         let mut table = read_table(&path)?;
         // The file first, alone, so that an error names where it is.
         let _: Settings = deserialize(table.clone(), &path.display().to_string())?;
+        let mut ros_domain_id = None;
         for (name, value) in variables {
             // Others may hold any bytes. In a setting's value a wrong character becomes one that its type refuses.
             let (name, value) = (name.to_string_lossy(), value.to_string_lossy());
+            if name == ROS_DOMAIN_ID && !value.is_empty() {
+                ros_domain_id = Some(parse_ros_domain_id(&value)?);
+            }
             if !name.starts_with(VARIABLE_PREFIX) || OTHER_VARIABLES.contains(&&*name) {
                 continue;
             }
             override_by(&mut table, &name, &value)?;
             let _: Settings = deserialize(table.clone(), &name)?;
         }
-        Self::from_settings(deserialize(table, "the settings")?)
+        let mut settings: Settings = deserialize(table, "the settings")?;
+        settings.ros_domain_id = settings.ros_domain_id.or(ros_domain_id);
+        Self::from_settings(settings)
     }
 
     fn from_settings(settings: Settings) -> Result<Self, ConfigError> {
@@ -281,7 +291,7 @@ impl Config {
             forward,
         };
         let bounds = [
-            ("ros_domain_id", u64::from(config.ros_domain_id.unwrap_or(0)), 0, 232),
+            ("ros_domain_id", u64::from(config.ros_domain_id.unwrap_or(0)), 0, u64::from(MAX_ROS_DOMAIN_ID)),
             ("poll_interval_s", config.poll_interval.as_secs(), 1, 86_400),
             ("poll_interval_without_mqtt_s", config.poll_interval_without_mqtt.as_secs(), 1, 86_400),
             ("token_lifetime_s", config.token_lifetime.as_secs(), 3600, 3650 * 86_400),
@@ -300,6 +310,14 @@ impl Config {
         }
         Ok(config)
     }
+}
+
+fn parse_ros_domain_id(value: &str) -> Result<u32, ConfigError> {
+    let id = value.trim().parse().ok().filter(|id| *id <= MAX_ROS_DOMAIN_ID);
+    id.ok_or_else(|| ConfigError::Invalid {
+        origin: ROS_DOMAIN_ID.to_owned(),
+        reason: format!("{value:?} is not a number from 0 to {MAX_ROS_DOMAIN_ID}"),
+    })
 }
 
 fn gate(settings: GateSettings) -> Result<GateConfig, ConfigError> {
@@ -414,6 +432,15 @@ mod tests {
     }
 
     #[test]
+    fn the_domain_is_the_setting_or_what_the_agent_was_started_with() {
+        let domain = |file: &str, variables: &[(&str, &str)]| load(file, variables).expect("valid").ros_domain_id;
+        assert_eq!(domain("", &[("ROS_DOMAIN_ID", "7")]), Some(7));
+        assert_eq!(domain("ros_domain_id = 3\n", &[("ROS_DOMAIN_ID", "7")]), Some(3));
+        assert_eq!(domain("", &[("TASK_AGENT_ROS_DOMAIN_ID", "0"), ("ROS_DOMAIN_ID", "7")]), Some(0));
+        assert_eq!(domain("", &[("ROS_DOMAIN_ID", "")]), None);
+    }
+
+    #[test]
     fn what_is_wrong_is_named() {
         let text = |file: &str, variables: &[(&str, &str)]| load(file, variables).expect_err("refused").to_string();
         assert!(text("mqt = true\n", &[]).contains("mqt"));
@@ -422,6 +449,7 @@ mod tests {
         assert!(text("", &[("TASK_AGENT_MQTT", "perhaps")]).contains("TASK_AGENT_MQTT"));
         assert!(text("server = \"ftp://x\"\n", &[]).contains("server"));
         assert!(text("ros_domain_id = 400\n", &[]).contains("ros_domain_id"));
+        assert!(text("", &[("ROS_DOMAIN_ID", "233")]).contains("ROS_DOMAIN_ID: \"233\""));
         assert!(text("poll_interval_s = 0\n", &[]).contains("poll_interval_s"));
         assert!(text("[logs]\nforward_level = \"loud\"\n", &[]).contains("forward_level"));
         assert!(text("", &[("TASK_AGENT_LOGS_FORWARD_LINES_PER_S", "100000")]).contains("logs.forward_lines_per_s"));

@@ -18,7 +18,7 @@ const PASSED_ON: [(&str, Option<&str>); 6] = [
 ];
 
 /// Variables that say how a robot's nodes find each other and what carries them; tasks get the agent's, where it has them.
-/// `ROS_DOMAIN_ID` is a setting of its own.
+/// `ROS_DOMAIN_ID` is not among them: it is a setting, whose default is the agent's variable.
 pub const ROS_VARIABLES: [&str; 9] = [
     "ROS_AUTOMATIC_DISCOVERY_RANGE",
     "ROS_STATIC_PEERS",

@@ -2,14 +2,17 @@
 //! It asks them only through their public faces: commands, the HTTP API, files an operator may read.
 #![expect(clippy::disallowed_methods, reason = "a test harness starts processes")]
 
+use std::collections::BTreeSet;
 use std::ffi::OsStr;
 use std::fs::File;
 use std::net::SocketAddr;
+use std::os::fd::AsFd as _;
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
+use nix::poll::{PollFd, PollFlags};
 use serde_json::Value;
 use task_proto::RobotId;
 use task_proto::api::{DeploymentView, RobotView};
@@ -288,8 +291,46 @@ impl Drop for Robot {
     /// Tasks outlive the agent on purpose; they must not outlive the test.
     fn drop(&mut self) {
         self.process = None;
+        let groups = cgroups_of(&self.data);
         end_processes_below(&self.data);
+        groups.iter().for_each(|group| remove_cgroup(group));
     }
+}
+
+/// The control groups of a robot's runs, and of what else it has started: those that none but its killed agent removes.
+fn cgroups_of(data: &Path) -> BTreeSet<PathBuf> {
+    let entries = |dir: PathBuf| std::fs::read_dir(dir).into_iter().flatten().flatten().map(|entry| entry.path());
+    let runs = entries(data.join("tasks")).flat_map(|task| entries(task.join("run")));
+    let written = runs.filter_map(|run| {
+        let spec: Value = serde_json::from_slice(&std::fs::read(run.join("spec.json")).ok()?).ok()?;
+        Some(PathBuf::from(spec["cgroup"].as_str()?))
+    });
+    let mounts = std::fs::read_to_string("/proc/mounts").expect("mounts");
+    let mount = mounts.lines().find_map(|line| line.contains(" cgroup2 ").then(|| line.split(' ').nth(1)).flatten());
+    let carry = processes_with(data.to_str().expect("utf-8 path").as_bytes());
+    let joined = carry.into_iter().filter_map(|pid| {
+        let groups = std::fs::read_to_string(format!("/proc/{pid}/cgroup")).ok()?;
+        let own = groups.lines().find_map(|line| line.strip_prefix("0::/"))?;
+        own.contains("taskd/run-").then_some(Path::new(mount?).join(own))
+    });
+    written.chain(joined).collect()
+}
+
+/// Ends what is left in the group and removes it, and what it lay in if no other test has groups there.
+fn remove_cgroup(group: &Path) {
+    let start = Instant::now();
+    while group.exists() && std::fs::remove_dir(group).is_err() && start.elapsed() < PATIENCE {
+        let inside = std::fs::read_to_string(group.join("cgroup.procs")).unwrap_or_default();
+        for pid in inside.lines().filter_map(|line| line.parse().ok()) {
+            let _ = nix::sys::signal::kill(nix::unistd::Pid::from_raw(pid), nix::sys::signal::Signal::SIGKILL);
+        }
+        // The kernel takes a moment to let a killed process go, and says when.
+        if let Ok(events) = File::open(group.join("cgroup.events")) {
+            let _ = nix::poll::poll(&mut [PollFd::new(events.as_fd(), PollFlags::POLLPRI)], 50_u8);
+        }
+    }
+    let base = group.parent().expect("lies in one");
+    let _ = std::fs::remove_dir(base.join("shims")).and_then(|()| std::fs::remove_dir(base));
 }
 
 /// Kills every process of ours whose environment or command line names `dir`.

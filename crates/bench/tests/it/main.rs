@@ -8,6 +8,7 @@ mod load;
 mod logs;
 mod orders;
 mod proxy;
+mod questions;
 mod registry;
 mod restore;
 mod ros;

@@ -20,7 +20,7 @@ use crate::talker::trigger;
 const PROBE: &str = "tests/it/graph_probe";
 
 /// A ROS domain that nobody else on this machine has while this lives: a port that no participant of it uses is the lock.
-struct Domain {
+pub struct Domain {
     id: String,
     _lock: UdpSocket,
 }
@@ -37,15 +37,15 @@ impl Domain {
 }
 
 /// A server, a robot, and a domain in which the robot's nodes meet.
-struct Stage {
-    robot: Robot,
-    server: Server,
-    domain: Domain,
-    dir: TempDir,
+pub struct Stage {
+    pub robot: Robot,
+    pub server: Server,
+    pub domain: Domain,
+    pub dir: TempDir,
 }
 
 impl Stage {
-    async fn start() -> Self {
+    pub async fn start() -> Self {
         let domain = Domain::free();
         let activate = format!("{}/bin/activate", required("TASKD_TEST_ROS"));
         let dir = TempDir::new().expect("temp dir");
@@ -61,35 +61,35 @@ impl Stage {
     }
 
     /// A package whose node gets `arguments`, and whose task.toml has `rest` behind its `[run]` table. It is built already.
-    fn package(&self, name: &str, version: &str, arguments: &str, rest: &str) -> PathBuf {
+    pub fn package(&self, name: &str, version: &str, arguments: &str, rest: &str) -> PathBuf {
         let dir = self.dir.path().join(format!("{name}-{version}"));
         copy(&self.dir.path().join("built/install"), &dir.join("install"));
         write_toml(&dir, name, version, arguments, &format!("{rest}\n[build]\ntool = 'none'\n"));
         dir
     }
 
-    async fn push(&self, name: &str, arguments: &str, rest: &str) {
+    pub async fn push(&self, name: &str, arguments: &str, rest: &str) {
         self.server.push(&self.package(name, "1.0.0", arguments, rest), "*").await;
     }
 
-    async fn task(&self, name: &str) -> Option<RobotTask> {
+    pub async fn task(&self, name: &str) -> Option<RobotTask> {
         self.server.robot("robot-1").await?.tasks.into_iter().find(|task| task.task.as_str() == name)
     }
 
     /// Waits until the task runs as it should.
-    async fn runs(&self, name: &str) -> RobotTask {
+    pub async fn runs(&self, name: &str) -> RobotTask {
         self.is(name, Phase::Running, |task| task.degraded.is_none().then_some(task)).await
     }
 
-    async fn fails(&self, name: &str) -> Failure {
+    pub async fn fails(&self, name: &str) -> Failure {
         self.is(name, Phase::Failed, |task| task.failure).await
     }
 
-    async fn degrades(&self, name: &str) -> Failure {
+    pub async fn degrades(&self, name: &str) -> Failure {
         self.is(name, Phase::Running, |task| task.degraded).await
     }
 
-    async fn is<T>(&self, name: &str, phase: Phase, which: impl Fn(RobotTask) -> Option<T>) -> T {
+    pub async fn is<T>(&self, name: &str, phase: Phase, which: impl Fn(RobotTask) -> Option<T>) -> T {
         eventually(&format!("{name} to be {phase} as expected"), async || {
             let task = self.task(name).await;
             which(task.filter(|task| task.phase == phase)?)
@@ -119,11 +119,11 @@ impl Stage {
         kill(Pid::from_raw(self.node(name)), signal).expect("signalled");
     }
 
-    async fn say(&self, service: &str) -> String {
+    pub async fn say(&self, service: &str) -> String {
         trigger(Path::new(&required("TASKD_TEST_ROS")), &self.domain.id, service).await
     }
 
-    fn log(&self, name: &str) -> String {
+    pub fn log(&self, name: &str) -> String {
         std::fs::read_to_string(self.robot.data().join(format!("tasks/{name}/logs/task.log"))).unwrap_or_default()
     }
 }

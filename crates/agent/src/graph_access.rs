@@ -12,6 +12,8 @@ use tokio::sync::Mutex;
 use tokio::time::Instant;
 
 use crate::graph::{Graph, GraphSettings};
+use crate::layout::DataDir;
+use crate::logs::ros;
 
 /// How long discovery may take until the graph shows who was there before: nodes announce themselves every 3 s.
 const DISCOVERY: Duration = Duration::from_millis(3500);
@@ -22,6 +24,8 @@ const RETRY: Duration = Duration::from_secs(10);
 #[derive(Clone)]
 pub struct GraphAccess {
     mac: MacAddress,
+    data: DataDir,
+    log_bytes: Option<u64>,
     state: Arc<Mutex<State>>,
 }
 
@@ -41,8 +45,9 @@ enum State {
 
 impl GraphAccess {
     /// Closed at first. The node is named for the robot, because two agents on one host, or in one domain, need two names.
-    pub fn of_robot(mac: MacAddress) -> Self {
-        Self { mac, state: Arc::default() }
+    /// What nodes say is kept in `data` while it is open.
+    pub fn of_robot(mac: MacAddress, data: DataDir, log_bytes: Option<u64>) -> Self {
+        Self { mac, data, log_bytes, state: Arc::default() }
     }
 
     /// The graph, opened now if it was not yet. `facts` say what the robot has, as it was seen last.
@@ -77,6 +82,7 @@ impl GraphAccess {
             Ok(graph) => {
                 tracing::info!(domain_id = settings.domain_id, localhost_only = settings.localhost_only, "graph open");
                 let since = Instant::now();
+                tokio::spawn(ros::keep(graph.clone(), self.data.clone(), self.log_bytes));
                 *state = State::Open { graph: graph.clone(), since };
                 Ok((graph, since))
             }

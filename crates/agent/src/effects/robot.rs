@@ -98,7 +98,7 @@ impl Robot {
         build_limits.pids = Some(config.task_pids);
         let memory_bytes = config.limits.task_memory_mb.map(|megabytes| megabytes << 20);
         let cgroups = Cgroups::find();
-        let graph = GraphAccess::of_robot(mac);
+        let graph = GraphAccess::of_robot(mac, data.clone(), config.limits.log_bytes);
         let environment = environment::of_this_robot(&settings);
         let gate = config.gate.clone().map(|gate| Gate::new(gate, robot.clone(), environment.clone(), data.root()));
         Self {
@@ -313,6 +313,7 @@ impl Effects for Robot {
             started_ms: process.started_ms,
             was_ready: process.ready,
         });
+        self.listen_to(&run.package);
         self.watcher.watch(watched.unwrap_or_default(), self.promise(&run.package), self.ros_facts())
     }
 

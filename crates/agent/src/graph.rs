@@ -239,6 +239,11 @@ impl Graph {
         asked.unwrap_or(unknown)
     }
 
+    /// The process on this host that a participant lives in, where it can be told.
+    pub async fn process_of(participant: Participant) -> Option<u32> {
+        tokio::task::spawn_blocking(move || Owners::process_of(&participant)).await.ok().flatten()
+    }
+
     /// Makes what [`Self::lifecycle_state`], [`Self::change_state`] and the parameter calls need for this node. A node that
     /// starts later finds it there, and answers the sooner.
     pub async fn prepare(&self, node: &GraphName) -> Result<(), GraphError> {

@@ -257,17 +257,20 @@ impl Readiness {
     fn unprepared(&self, name: &GraphName, now_ms: u64) -> Option<Shortfall> {
         let node = self.nodes.get(name)?;
         let silent_ms = node.silent_since_ms().map(|since_ms| now_ms.saturating_sub(since_ms));
+        // What came back in a new process is as good as gone until it is up.
+        let certain = !node.is_up();
         let shortfall =
-            |item, code, what, seen: &str| Some(Shortfall { item, code, what, seen: seen.to_owned(), certain: false });
+            |item, code, what, seen: &str| Some(Shortfall { item, code, what, seen: seen.to_owned(), certain });
         if self.promise.lifecycle.contains(name) {
             let too_silent = silent_ms.is_some_and(|ms| ms >= SILENCE_MS);
             let active = node.state() == Some(LifecycleState::Active) && !too_silent;
             // Right after a restart of the agent nothing is known yet; that is no reason to doubt.
-            let unknown = self.was_ready && node.state().is_none() && !too_silent;
+            let unknown = self.was_ready && node.is_up() && node.state().is_none() && !too_silent;
             if !active && !unknown {
-                let seen = match node.state() {
-                    Some(state) if silent_ms.is_none() => format!("it is {}", state.as_str()),
-                    _ => "it does not answer as a lifecycle node".to_owned(),
+                let seen = match (node.state(), silent_ms) {
+                    (_, Some(_)) => "it does not answer as a lifecycle node".to_owned(),
+                    (Some(state), None) => format!("it is {}", state.as_str()),
+                    (None, None) => "its state is not known yet".to_owned(),
                 };
                 let what = match self.was_ready {
                     true => format!("`{name}` is not active any more"),
@@ -349,7 +352,7 @@ impl Readiness {
         self.health = match (refused, self.missing(&counted, now_ms)) {
             (Some(refused), _) if !self.was_ready => Health::Refused(refused),
             // What one node that came back refuses is no reason to take down the others.
-            (Some(refused), None) => self.missing_since(refused.code, refused.text, String::new(), now_ms),
+            (Some(refused), _) => self.missing_since(refused.code, refused.text, String::new(), now_ms),
             (_, Some(missing)) => missing,
             (None, None) => {
                 let since_ms = match self.health {

@@ -85,7 +85,8 @@ impl Watcher {
             // What was stopped a moment ago may still be on its way out.
             let changed = tokio::time::timeout_at(deadline, changes.changed()).await;
             if !matches!(changed, Ok(Ok(()))) {
-                return Err(failure);
+                let named = whose.naming_processes(&snapshot).await;
+                return Err(promise.taken(&snapshot, &named.others).unwrap_or(failure));
             }
         }
     }

@@ -376,6 +376,18 @@ impl TaskManifest {
                 problems.add("ready.topics", format!("{topic:?} min_hz: must be above 0 and at most 10000"));
             }
         }
+        if self.build.tool == BuildTool::Catkin {
+            let promised = [
+                ("ready.nodes", ready.nodes.is_empty()),
+                ("ready.lifecycle", ready.lifecycle.is_empty()),
+                ("ready.services", ready.services.is_empty()),
+                ("ready.topics", ready.topics.is_empty()),
+                ("parameters", self.parameters.is_empty()),
+            ];
+            for (key, _) in promised.iter().filter(|(_, is_empty)| !is_empty) {
+                problems.add(key, "is about the graph of ROS 2; build.tool = \"catkin\" means ROS 1".to_owned());
+            }
+        }
         if !(1..=3600).contains(&ready.timeout_s) {
             problems.add("ready.timeout_s", "must be between 1 and 3600".to_owned());
         }
@@ -472,5 +484,10 @@ mod tests {
         odd.ready.nodes = vec!["mapper".to_owned()];
         odd.outputs.paths = vec!["../secrets".to_owned()];
         assert_eq!(keys(&odd), ["ready.nodes", "outputs.paths"]);
+        let mut ros1 = manifest(run(&["true"]));
+        ros1.build.tool = BuildTool::Catkin;
+        ros1.ready.services = vec!["/say".to_owned()];
+        ros1.parameters.insert("/talker".to_owned(), BTreeMap::new());
+        assert_eq!(keys(&ros1), ["ready.services", "parameters"]);
     }
 }

@@ -58,6 +58,12 @@ impl Owners {
         });
         host.judge(participants)
     }
+
+    /// The process on this host that a participant lives in, where it can be told. It looks at every process.
+    pub(super) fn process_of(participant: &Participant) -> Option<u32> {
+        let host = Host::look(Path::new("/proc"), &[]).ok()?;
+        host.holder(Path::new("/proc"), &participant.locators)
+    }
 }
 
 impl Host {
@@ -131,14 +137,30 @@ impl Host {
         }
     }
 
-    /// Whether all these addresses are this host's, and nobody listens there who did when they were first seen.
+    /// Whether all these addresses are this host's, and at one of them nobody listens who did when they were first seen.
+    /// One is enough: a participant listens at all that it announces, and some of its ports are shared with others.
     fn is_deserted(&self, locators: &BTreeSet<SocketAddr>, seen_for: Duration) -> bool {
         let is_too_young = |socket: &u64| self.held.get(socket).is_some_and(|age| *age + CLOCK_STEP < seen_for);
-        let nobody = |locator: &SocketAddr| {
+        let is_left = |locator: &SocketAddr| {
             let sockets = self.sockets.get(&locator.port());
-            self.is_here(locator.ip()) && sockets.is_none_or(|sockets| sockets.iter().all(is_too_young))
+            sockets.is_none_or(|sockets| sockets.iter().all(is_too_young))
         };
-        !self.sockets.is_empty() && !locators.is_empty() && locators.iter().all(nobody)
+        let all_here = locators.iter().all(|locator| self.is_here(locator.ip()));
+        !self.sockets.is_empty() && all_here && locators.iter().any(is_left)
+    }
+
+    /// The process that listens at one of these addresses alone; `None`: it can't be told.
+    fn holder(&self, proc: &Path, locators: &BTreeSet<SocketAddr>) -> Option<u32> {
+        let here = locators.iter().filter(|locator| self.is_here(locator.ip()));
+        let ports = here.filter_map(|locator| self.sockets.get(&locator.port()));
+        let own: BTreeSet<u64> = ports.filter(|sockets| sockets.len() == 1).flatten().copied().collect();
+        let network = fs::metadata(proc.join("self/ns/net")).ok()?.ino();
+        let processes = fs::read_dir(proc).ok()?.filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok());
+        processes.into_iter().find(|pid: &u32| {
+            // One that another user hides stays without a name.
+            let held = held_by(*pid, &proc.join(pid.to_string()), network).ok().flatten();
+            held.is_some_and(|(_, sockets)| !sockets.is_disjoint(&own))
+        })
     }
 
     fn is_here(&self, address: IpAddr) -> bool {
@@ -241,6 +263,8 @@ mod tests {
             // Its port was taken over by a process that was started later.
             (&["192.168.1.5:7411"], 11, true),
             (&["192.168.1.5:7411"], 1, false),
+            // Of two ports that it had, one is shared with others who live.
+            (&["192.168.1.5:7415", "192.168.1.5:7413"], 1, true),
             (&["192.168.1.7:7415"], 1, false),
             (&["192.168.1.5:7415", "192.168.1.7:7415"], 1, false),
             (&[], 1, false),
@@ -259,6 +283,7 @@ mod tests {
         let participants = BTreeMap::from([(id, participant(&[&address]))]);
         assert_eq!(Owners::of(&participants, &[std::process::id()]).theirs, BTreeSet::from([id]));
         assert_eq!(Owners::of(&participants, &[]).others, BTreeSet::from([id]));
+        assert_eq!(Owners::process_of(&participants[&id]), Some(std::process::id()));
     }
 
     #[test]

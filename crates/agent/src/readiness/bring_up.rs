@@ -137,6 +137,11 @@ impl BringUp {
         self.refused.as_ref()
     }
 
+    /// Whether it was brought up, so that it is only looked at.
+    pub(super) fn is_up(&self) -> bool {
+        self.is_up
+    }
+
     pub(super) fn has_its_parameters(&self) -> bool {
         self.pending.is_empty()
     }

@@ -63,6 +63,17 @@ impl Whose {
         whose
     }
 
+    /// The same, with the processes of the others on this robot in words, where that can be told. It takes a moment.
+    pub(super) async fn naming_processes(mut self, snapshot: &Snapshot) -> Self {
+        for (id, words) in &mut self.others {
+            let Some(participant) = snapshot.participants.get(id) else { continue };
+            if let Some(pid) = Graph::process_of(participant.clone()).await {
+                *words = format!("process {pid} on this robot");
+            }
+        }
+        self
+    }
+
     /// Whether this participant was there at the last look.
     pub(super) fn knows(&self, id: &ParticipantId) -> bool {
         self.ours.contains(id) || self.others.contains_key(id) || self.gone.contains(id)
@@ -86,9 +97,9 @@ fn replaced(participants: &BTreeMap<ParticipantId, Participant>) -> BTreeSet<Par
 }
 
 fn describe(participant: &Participant) -> String {
-    match participant.locators.first() {
-        Some(locator) if locator.ip().is_loopback() => format!("another process on this robot ({locator})"),
-        Some(locator) => format!("another process ({locator})"),
+    let hosts: BTreeSet<_> = participant.locators.iter().map(|locator| locator.ip().to_string()).collect();
+    match hosts.first() {
+        Some(host) => format!("another process (at {host})"),
         None => "another process".to_owned(),
     }
 }

@@ -219,7 +219,7 @@ async fn what_never_gets_ready_fails_and_says_what_is_missing() {
         ("slow", "not_ready", "`/slow` did not come at 10 Hz within 8 s; it came at "),
         ("picky", "parameter_rejected", "`/picky` resolution = -1: must be positive"),
         ("stubborn", "lifecycle_failed", "`/stubborn` failed to configure and is unconfigured"),
-        ("taken", "node_name_taken", "`/taken` is already on the graph: another process"),
+        ("taken", "node_name_taken", "`/taken` is already on the graph: process "),
     ];
     for (name, code, text) in failures {
         let failure = stage.fails(name).await;
@@ -260,10 +260,12 @@ async fn what_breaks_while_it_runs_degrades_the_task_and_says_why() {
 
     // What its launcher starts again is brought up again.
     stage.signal("back", Signal::SIGKILL);
-    assert_eq!(stage.degrades("back").await.code.as_str(), "node_vanished");
+    eventually("the node to be active again", async || {
+        (stage.log("back").matches("activated with late = 2").count() == 2).then_some(())
+    })
+    .await;
     stage.runs("back").await;
     assert_ne!(stage.node("back"), before);
-    assert_eq!(stage.log("back").matches("activated with late = 2").count(), 2, "{}", stage.log("back"));
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -6,7 +6,6 @@ use std::time::Duration;
 use clap::{Args, ValueEnum};
 use task_proto::api::{CreateDeployment, DeploymentView, MatchedRobot, MatchedRobots};
 use task_proto::desired::Delivery;
-use task_proto::manifest::TaskManifest;
 use task_proto::selector::Selector;
 
 use super::confirm::confirm;
@@ -134,20 +133,7 @@ async fn packed(dir: PathBuf) -> Result<Packed, CommandError> {
         what: "the packer ended unexpectedly".to_owned(),
         source: error.into(),
     })??;
-    for key in not_obeyed_yet(&packed.manifest) {
-        say(&format!("task.toml: {key}: it travels with the package, but robots do not act on it yet"));
-    }
     Ok(packed)
-}
-
-/// The keys that say something to which this version's agent pays no attention: nobody should count on them.
-fn not_obeyed_yet(manifest: &TaskManifest) -> impl Iterator<Item = &'static str> {
-    let keys = [
-        ("ready.nodes", manifest.ready.nodes.is_empty()),
-        ("ready.lifecycle", manifest.ready.lifecycle.is_empty()),
-        ("parameters", manifest.parameters.is_empty()),
-    ];
-    keys.into_iter().filter(|(_, is_empty)| !is_empty).map(|(key, _)| key)
 }
 
 pub(super) async fn pack(output: &Output, pack: Pack) -> Result<Outcome, CommandError> {

@@ -344,13 +344,3 @@ async fn the_examples_can_be_packed() {
         run(command(&["pack", examples.join(name).to_str().unwrap()])).await.expect(0, "");
     }
 }
-
-#[tokio::test(flavor = "multi_thread")]
-async fn what_robots_do_not_act_on_yet_is_said() {
-    let bench = Bench::start().await;
-    let plain = run(command(&["pack", &bench.package("1.0.0", "")])).await;
-    assert!(!plain.stderr.contains("not act"), "{}", plain.stderr);
-    let asking = bench.package("2.0.0", "[ready]\nnodes = [\"/hello\"]\nlifecycle = [\"/hello\"]\n");
-    let said = run(command(&["pack", &asking])).await.expect(0, "ready.nodes: ");
-    assert!(said.stderr.contains("ready.lifecycle: "), "{}", said.stderr);
-}

@@ -40,7 +40,12 @@ pub fn required(variable: &str) -> String {
 }
 
 /// Asks again until there is an answer; fails with `what` when patience ends.
-pub async fn eventually<T>(what: &str, mut ask: impl AsyncFnMut() -> Option<T>) -> T {
+pub async fn eventually<T>(what: &str, ask: impl AsyncFnMut() -> Option<T>) -> T {
+    eventually_within(PATIENCE, what, ask).await
+}
+
+/// The same, for what takes longer than most.
+pub async fn eventually_within<T>(patience: Duration, what: &str, mut ask: impl AsyncFnMut() -> Option<T>) -> T {
     let start = Instant::now();
     let mut tick = tokio::time::interval(Duration::from_millis(50));
     loop {
@@ -48,7 +53,7 @@ pub async fn eventually<T>(what: &str, mut ask: impl AsyncFnMut() -> Option<T>) 
         if let Some(answer) = ask().await {
             return answer;
         }
-        assert!(start.elapsed() < PATIENCE, "after {PATIENCE:?} still waiting for {what}");
+        assert!(start.elapsed() < patience, "after {patience:?} still waiting for {what}");
     }
 }
 

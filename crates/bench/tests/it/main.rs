@@ -1,6 +1,7 @@
 //! The end-to-end tests: the real programs, started as processes, and the rules all of the source keeps.
 
 mod confinement;
+mod corridor;
 mod crash;
 mod harness;
 mod hostile;

@@ -5,7 +5,7 @@
 use std::net::UdpSocket;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
@@ -13,11 +13,13 @@ use task_proto::api::RobotTask;
 use task_proto::report::{Failure, Phase};
 use tempfile::TempDir;
 
-use crate::harness::{Process, Robot, Server, eventually, processes_with, required};
+use crate::harness::{Process, Robot, Server, eventually, eventually_within, processes_with, required};
 use crate::talker::trigger;
 
 /// Where the package lies whose node does as it is told.
 const PROBE: &str = "tests/it/graph_probe";
+/// How long a job may take on a busy machine.
+const JOB_PATIENCE: Duration = Duration::from_secs(600);
 
 /// A ROS domain that nobody else on this machine has while this lives: a port that no participant of it uses is the lock.
 pub struct Domain {
@@ -45,11 +47,18 @@ pub struct Stage {
 }
 
 impl Stage {
+    /// A stage whose node is built.
     pub async fn start() -> Self {
+        let stage = Self::bare().await;
+        build(&activate(), &stage.dir.path().join("built")).await;
+        stage
+    }
+
+    /// A stage without anything built.
+    pub async fn bare() -> Self {
         let domain = Domain::free();
-        let activate = format!("{}/bin/activate", required("TASKD_TEST_ROS"));
+        let activate = activate();
         let dir = TempDir::new().expect("temp dir");
-        build(&activate, &dir.path().join("built")).await;
         let server = Server::start(&dir.path().join("server")).await;
         let settings = [
             ("TASK_AGENT_UNDERLAYS", activate.as_str()),
@@ -83,6 +92,17 @@ impl Stage {
 
     pub async fn fails(&self, name: &str) -> Failure {
         self.is(name, Phase::Failed, |task| task.failure).await
+    }
+
+    /// Waits for a job's good end.
+    pub async fn succeeds(&self, name: &str) {
+        eventually_within(JOB_PATIENCE, &format!("{name} to succeed"), async || {
+            let task = self.task(name).await?;
+            let is_over = task.phase.is_final() && task.phase != Phase::Succeeded;
+            assert!(!is_over, "{name} is {}: {:?}\n{}", task.phase, task.failure, self.log(name));
+            (task.phase == Phase::Succeeded).then_some(())
+        })
+        .await;
     }
 
     pub async fn degrades(&self, name: &str) -> Failure {
@@ -128,6 +148,11 @@ impl Stage {
     }
 }
 
+/// The script that sets up ROS.
+fn activate() -> String {
+    format!("{}/bin/activate", required("TASKD_TEST_ROS"))
+}
+
 fn write_toml(dir: &Path, name: &str, version: &str, arguments: &str, rest: &str) {
     let words = ["install/graph_probe/lib/graph_probe/probe"].into_iter().chain(arguments.split(' '));
     let words: Vec<&str> = words.collect();
@@ -144,7 +169,7 @@ async fn build(activate: &str, dir: &Path) {
     assert!(output.status.success(), "colcon: {}", String::from_utf8_lossy(&output.stderr));
 }
 
-fn copy(from: &Path, to: &Path) {
+pub fn copy(from: &Path, to: &Path) {
     std::fs::create_dir_all(to).expect("directory");
     for entry in std::fs::read_dir(from).expect("readable").map(|entry| entry.expect("entry")) {
         let target = to.join(entry.file_name());

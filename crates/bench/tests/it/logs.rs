@@ -9,7 +9,7 @@ use task_proto::api::{LogsFrom, LogsView};
 use task_proto::log::{LogLevel, LogLine};
 use task_proto::report::Phase;
 
-use crate::harness::{Fleet, PATIENCE, eventually};
+use crate::harness::{Fleet, PATIENCE, eventually, open_directory};
 
 /// A robot with a task that does what it is told.
 struct Bench {
@@ -20,9 +20,14 @@ struct Bench {
 impl Bench {
     async fn start(first: &str) -> Self {
         let fleet = Fleet::start(1).await;
-        let orders = fleet.dir.path().join("orders");
+        // The task runs without the test's rights.
+        let open = fleet.dir.path().join("open");
+        open_directory(&open);
+        let orders = open.join("orders");
         let path = orders.display();
-        let script = format!("mkfifo {path}\n{first}\nwhile :; do . {path}; done\n");
+        // Held open both ways, so that no order falls between the end of one and the beginning of the next.
+        let script =
+            format!("mkfifo {path}\nexec 3<>{path}\n{first}\nwhile read -r order <&3; do eval \"$order\"; done\n");
         fleet.server.push(&fleet.package("speaker", "1.0.0", "service", &script), "*").await;
         fleet.server.wait_phase("robot-1", "speaker", Phase::Running).await;
         Self { fleet, orders }
@@ -31,7 +36,7 @@ impl Bench {
     /// Has the task run a line of shell.
     async fn order(&self, line: String) {
         let orders = self.orders.clone();
-        // Opening it waits for the task.
+        // It waits for the task to read, should that be behind.
         tokio::task::spawn_blocking(move || std::fs::write(orders, line).expect("ordered")).await.expect("no panic");
     }
 

@@ -3,6 +3,7 @@
 use clap::Subcommand;
 use task_proto::RobotName;
 use task_proto::api::{RobotList, RobotTask, RobotView};
+use task_proto::report::{Isolation, RosFacts};
 use task_proto::selector::Selector;
 
 use super::confirm::always;
@@ -72,7 +73,7 @@ async fn one(session: &Session, name: &RobotName) -> Result<RobotView, CommandEr
 const HEADER: [&str; 7] = ["id", "name", "mac", "address", "state", "last seen", "tasks"];
 
 fn row(robot: &RobotView) -> Vec<String> {
-    let tasks: Vec<_> = robot.tasks.iter().map(|task| format!("{}:{}", task.task, task.phase)).collect();
+    let tasks: Vec<_> = robot.tasks.iter().map(standing).collect();
     vec![
         robot.id.to_string(),
         robot.name.to_string(),
@@ -82,6 +83,12 @@ fn row(robot: &RobotView) -> Vec<String> {
         robot.last_seen_ms.map_or_else(|| "never".to_owned(), time),
         if tasks.is_empty() { "-".to_owned() } else { tasks.join(" ") },
     ]
+}
+
+/// A task and where it stands, in a word or two.
+fn standing(task: &RobotTask) -> String {
+    let health = if task.degraded.is_some() { "/degraded" } else { "" };
+    format!("{}:{}{health}", task.task, task.phase)
 }
 
 /// Online or offline, and the conditions an operator must know about.
@@ -107,6 +114,10 @@ fn describe(robot: &RobotView) -> String {
     if let Some(host) = &robot.host {
         facts.push(("host", format!("{} {} agent {}", host.hostname, host.arch, host.agent_version)));
         facts.push(("ros", if host.ros_distros.is_empty() { "-".to_owned() } else { host.ros_distros.join(" ") }));
+        if let Some(ros) = &host.ros {
+            facts.push(("ros in use", ros_in_use(ros)));
+        }
+        facts.push(("isolation", if host.isolation == Isolation::Cgroup { "cgroup" } else { "none" }.to_owned()));
         facts.push(("disk free", super::output::bytes(host.disk_free_bytes)));
     }
     if let Some(mqtt) = &robot.mqtt {
@@ -118,10 +129,18 @@ fn describe(robot: &RobotView) -> String {
     let mut text: String = facts.iter().map(|(key, value)| format!("{key:<12}{}\n", printable(value))).collect();
     if !robot.tasks.is_empty() {
         text.push('\n');
-        let header = ["task", "version", "wanted", "run", "phase", "restarts", "deployment", "failure"];
+        let header = ["task", "version", "wanted", "run", "phase", "restarts", "deployment", "problem"];
         text.push_str(&table(&header, robot.tasks.iter().map(task_row).collect()));
     }
     text
+}
+
+/// How tasks meet ROS, in words.
+fn ros_in_use(ros: &RosFacts) -> String {
+    let domain = ros.domain_id.map(|domain| format!("domain {domain}"));
+    let range = ros.localhost_only.then(|| "this host only".to_owned());
+    let parts = [Some(ros.distro.clone()), ros.rmw.clone(), domain, range];
+    parts.into_iter().flatten().collect::<Vec<_>>().join(", ")
 }
 
 fn task_row(task: &RobotTask) -> Vec<String> {
@@ -137,6 +156,15 @@ fn task_row(task: &RobotTask) -> Vec<String> {
         task.phase.to_string(),
         task.restarts.to_string(),
         task.deployment.to_string(),
-        task.failure.as_ref().map_or_else(|| "-".to_owned(), ToString::to_string),
+        problem(task),
     ]
+}
+
+/// Why a task failed or waits, or else why it runs not as it should.
+fn problem(task: &RobotTask) -> String {
+    match (&task.failure, &task.degraded) {
+        (Some(failure), _) => failure.to_string(),
+        (None, Some(degraded)) => format!("degraded: {degraded}"),
+        (None, None) => "-".to_owned(),
+    }
 }

@@ -1,9 +1,15 @@
 //! How deployments and robots look to a person at the terminal. Text only; what is shown was asked for elsewhere.
 
-use task_proto::api::{AssignmentView, DeploymentState, DeploymentView, MatchedRobot, MatchedRobots};
+use std::collections::BTreeMap;
 
-use super::output::{printable, table, time};
+use task_proto::api::{AssignmentView, DeploymentState, DeploymentView, MatchedRobot, MatchedRobots};
+use task_proto::report::Phase;
+
+use super::output::{printable, robots, table, time};
 use super::{CommandError, Session};
+
+/// Reasons for waiting that are shown; a gate may give each robot one of its own.
+const MAX_REASONS: usize = 5;
 
 /// A deployment's state, in a word.
 pub(super) fn state(state: DeploymentState) -> &'static str {
@@ -39,6 +45,8 @@ pub(super) fn describe(view: &DeploymentView) -> String {
     if !supersedes.is_empty() {
         facts.push(("supersedes", supersedes.join(" ")));
     }
+    let assignments = view.assignments.as_deref().unwrap_or_default();
+    facts.extend(deferred(assignments).into_iter().map(|line| ("deferred", line)));
     let mut text: String = facts.iter().map(|(key, value)| format!("{key:<12}{}\n", printable(value))).collect();
     if let Some(assignments) = &view.assignments {
         text.push('\n');
@@ -48,6 +56,25 @@ pub(super) fn describe(view: &DeploymentView) -> String {
         ));
     }
     text
+}
+
+/// How many robots wait for what, the most common reason first.
+fn deferred(assignments: &[AssignmentView]) -> Vec<String> {
+    let mut counts: BTreeMap<&str, u64> = BTreeMap::new();
+    for assignment in assignments.iter().filter(|assignment| assignment.phase == Phase::Deferred) {
+        let reason = assignment.failure.as_ref().map_or("", |failure| failure.text.trim());
+        *counts.entry(if reason.is_empty() { "no reason given" } else { reason }).or_default() += 1;
+    }
+    let mut reasons: Vec<(&str, u64)> = counts.into_iter().collect();
+    reasons.sort_by_key(|&(_, count)| std::cmp::Reverse(count));
+    let others = reasons.split_off(reasons.len().min(MAX_REASONS));
+    let mut lines: Vec<String> =
+        reasons.iter().map(|&(reason, count)| format!("{}: {reason}", robots(count))).collect();
+    if !others.is_empty() {
+        let count = others.iter().map(|(_, count)| count).sum();
+        lines.push(format!("{}: {} other reasons, see below", robots(count), others.len()));
+    }
+    lines
 }
 
 fn assignment_row(assignment: &AssignmentView) -> Vec<String> {
@@ -79,4 +106,44 @@ pub(super) fn print_matched(session: &Session, matched: &MatchedRobots) -> Resul
         };
         matched.robots.iter().map(row).collect()
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use task_proto::RobotId;
+    use task_proto::report::{Failure, FailureCode};
+
+    fn assignment(phase: Phase, reason: Option<&str>) -> AssignmentView {
+        AssignmentView {
+            robot: RobotId::random(),
+            name: "atlas".parse().expect("a name"),
+            online: true,
+            released: true,
+            phase,
+            progress: None,
+            failure: reason.map(|reason| Failure::new(FailureCode::GATE_REFUSED, reason)),
+            attempts: 1,
+            superseded_by: None,
+            updated_at_ms: 0,
+        }
+    }
+
+    #[test]
+    fn waiting_robots_are_counted_by_their_reasons() {
+        let mut assignments = vec![
+            assignment(Phase::Running, None),
+            assignment(Phase::Failed, Some("battery low")),
+            assignment(Phase::Deferred, Some("carries a load")),
+            assignment(Phase::Deferred, Some("battery low")),
+            assignment(Phase::Deferred, Some("battery low\n")),
+        ];
+        assert_eq!(deferred(&assignments[..2]), [""; 0]);
+        assert_eq!(deferred(&assignments), ["2 robots: battery low", "1 robot: carries a load"]);
+        assignments.extend((0..MAX_REASONS).map(|n| assignment(Phase::Deferred, Some(&format!("load {n}")))));
+        let lines = deferred(&assignments);
+        assert_eq!((lines.len(), lines[0].as_str()), (MAX_REASONS + 1, "2 robots: battery low"));
+        assert_eq!(lines[MAX_REASONS], "2 robots: 2 other reasons, see below");
+        assert!(deferred(&[assignment(Phase::Deferred, None)])[0].ends_with("no reason given"));
+    }
 }

@@ -9,7 +9,8 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 use task_proto::api::{
-    CreateDeployment, EnrollRequest, EnrollResponse, ErrorBody, Event, MqttEndpoint, ReportReply, RobotToken,
+    CreateDeployment, EnrollRequest, EnrollResponse, ErrorBody, Event, LogEvent, LogsFrom, LogsView, MqttConnection,
+    MqttEndpoint, MqttTraffic, OutputList, OutputView, ReportReply, RobotToken, ServerInfo, Traffic,
 };
 use task_proto::desired::{BlobRef, Delivery, DesiredState, DesiredTask, Doorbell, PackageRef, Wanted};
 use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
@@ -18,6 +19,7 @@ use task_proto::manifest::{
     Build, BuildTool, ContentFacts, Limits, Outputs, Ready, ReadyTopic, Requires, Run, TaskKind, TaskManifest,
 };
 use task_proto::oci::ImageManifest;
+use task_proto::output::{OutputFile, OutputSet};
 use task_proto::report::{
     ActiveVersion, Condition, Failure, FailureCode, HostFacts, Isolation, Phase, Progress, Report, RosFacts, Status,
     TaskReport,
@@ -346,6 +348,77 @@ fn documents_of_the_api() {
             dry_run: false,
         },
     );
+}
+
+#[test]
+fn documents_about_what_came_back() {
+    let file = |path: &str| OutputFile { path: parsed(path), blob: blob(path) };
+    let output = OutputSet {
+        robot_id: robot(),
+        task: parsed("mapping"),
+        version: parsed("1.2.0"),
+        deployment: parsed("d00000000000000b2"),
+        run: 2,
+        files: vec![file("maps/corridor.pgm"), file("maps/corridor.yaml")],
+    };
+    check("output_set.json", &output);
+    check_tolerance::<OutputSet>("output_set.json");
+    check("output_manifest.json", &output.manifest(blob("config")));
+    let (robot_name, manifest) = (parsed("atlas"), Digest::of(b"manifest"));
+    let view = OutputView { robot_name, manifest, pushed_at_ms: 1_800_000_000_000, output };
+    check("output_view.json", &view);
+    check_tolerance::<OutputView>("output_view.json");
+    check_text("output_list.json", &OutputList { outputs: vec![view] });
+}
+
+#[test]
+fn documents_about_what_was_said() {
+    let view = LogsView {
+        from: LogsFrom::Server,
+        age_ms: 61_000,
+        reason: Some("atlas is not connected over MQTT".to_owned()),
+        lines: log_batch().lines,
+        suppressed: 3,
+    };
+    check("logs_view.json", &view);
+    check_tolerance::<LogsView>("logs_view.json");
+    let events = [
+        LogEvent::Following,
+        LogEvent::Away { reason: "atlas is not connected over MQTT".to_owned() },
+        LogEvent::Lines { lines: log_batch().lines, suppressed: 3 },
+    ];
+    check("log_events.json", &events.to_vec());
+    check_tolerance::<Vec<LogEvent>>("log_events.json");
+}
+
+#[test]
+fn documents_about_the_traffic() {
+    let traffic = Traffic {
+        bytes_in: 1,
+        bytes_out: 2,
+        packets_in: 3,
+        packets_out: 4,
+        messages_in: 5,
+        messages_out: 6,
+        acks_in: 7,
+        acks_out: 8,
+    };
+    check("mqtt_connection.json", &MqttConnection { since_ms: 1_800_000_000_000, traffic });
+    let info = ServerInfo {
+        version: "0.1.0".to_owned(),
+        key: SigningKey::from_bytes([7; 32]).public_key(),
+        mqtt: "127.0.0.1:1883".to_owned(),
+        now_ms: 1_800_000_000_000,
+        traffic: MqttTraffic {
+            robots_connected: 1,
+            connections_accepted: 2,
+            connections_refused: 3,
+            messages_refused: 4,
+            messages_dropped: 5,
+            all: traffic,
+        },
+    };
+    check_text("server_info.json", &info);
 }
 
 #[test]

@@ -13,6 +13,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use futures_util::{Stream, StreamExt as _};
 use sha2::{Digest as _, Sha256};
+use task_proto::output::owner;
 use task_proto::{Digest, RepositoryName};
 use tokio::sync::OwnedMutexGuard;
 
@@ -22,6 +23,8 @@ use super::{BlobError, BlobSettings, Blobs, modified_ms, move_into_place, on_dis
 const GATHERED_BYTES: usize = 1024 * 1024;
 /// How long a sender may be silent in the middle of a body.
 const SILENCE: Duration = Duration::from_secs(60);
+/// Uploads that one robot may leave unfinished: it sends one file after another, and forgets some on the way.
+const MAX_OF_ROBOT: usize = 8;
 const ID_DIGITS: usize = 32;
 
 /// Names an upload.
@@ -147,6 +150,17 @@ impl Uploads {
         let mut all = self.active();
         if all.len() >= max {
             return Err(BlobError::TooManyUploads { max });
+        }
+        if let Some((robot, _)) = owner(&active.repository) {
+            // However many robots there are, a quarter stays free for operators.
+            let max_of_robots = max - max / 4;
+            let robots: Vec<_> = all.values().filter_map(|other| owner(&other.repository)).collect();
+            if robots.len() >= max_of_robots {
+                return Err(BlobError::TooManyUploads { max: max_of_robots });
+            }
+            if robots.iter().filter(|(other, _)| *other == robot).count() >= MAX_OF_ROBOT {
+                return Err(BlobError::TooManyUploads { max: MAX_OF_ROBOT });
+            }
         }
         all.insert(id, active);
         Ok(())
@@ -326,5 +340,24 @@ mod tests {
         let gone = blobs.upload_offset(&repository, &id).await;
         assert!(matches!(gone, Err(BlobError::UploadUnknown)), "{gone:?}");
         assert_eq!(fs::read_dir(&blobs.shared.uploads.directory).expect("there").count(), 0);
+    }
+
+    #[tokio::test]
+    async fn robots_leave_room_for_each_other_and_for_operators() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let settings = BlobSettings { max_uploads: 2 * MAX_OF_ROBOT, ..BlobSettings::default() };
+        let blobs = Blobs::open(directory.path(), settings).expect("opens");
+        let [first, second] = ["outputs/r00000000000000a1/mapping", "outputs/r00000000000000a2/mapping"];
+        let begun = async |repository: &str, count: usize| {
+            let repository: RepositoryName = repository.parse().expect("a name");
+            let mut begun = 0;
+            for _ in 0..count {
+                begun += usize::from(blobs.begin_upload(&repository).await.is_ok());
+            }
+            begun
+        };
+        assert_eq!(begun(first, MAX_OF_ROBOT + 1).await, MAX_OF_ROBOT);
+        assert_eq!(begun(second, MAX_OF_ROBOT).await, MAX_OF_ROBOT / 2, "a quarter is nobody's");
+        assert_eq!(begun("talker", MAX_OF_ROBOT).await, MAX_OF_ROBOT / 2);
     }
 }

@@ -110,6 +110,11 @@ async fn a_robot_pushes_nothing_else_and_nowhere_else() {
     let package = task_proto::oci::ImageManifest::package(map, map);
     let put = own.ask(Method::PUT, "manifests/latest").header("content-type", MANIFEST_TYPE).json(&package);
     assert_eq!(put.send().await.expect("an answer").status(), StatusCode::FORBIDDEN, "no package");
+    let set = output(&robot, 1, vec![file("a", map)]);
+    let config = own.blob(&serde_json::to_vec(&set).expect("json")).await;
+    let put =
+        own.ask(Method::PUT, "manifests/latest").header("content-type", MANIFEST_TYPE).json(&set.manifest(config));
+    assert_eq!(put.send().await.expect("an answer").status(), StatusCode::FORBIDDEN, "another tag than the run's");
     let lie = OutputSet { robot_id: other.id.clone(), ..output(&robot, 1, vec![file("a", map)]) };
     assert_eq!(own.output(&lie).await, StatusCode::BAD_REQUEST, "another robot's");
     let larger = BlobRef { size: 2, ..map };

@@ -82,6 +82,10 @@ pub(super) async fn put(
         Some(image) => Some(check_output(registry, repository, image).await?),
         None => None,
     };
+    if only.is_some() && output.as_ref().is_some_and(|output| tags.iter().any(|tag| output.tag().as_ref() != Some(tag)))
+    {
+        return Err(OciError::denied("a robot may only tag an output with its own run"));
+    }
     let now_ms = registry.clock.now_ms();
     registry.blobs.put(bytes).await?;
     registry.blobs.touch(digest, now_ms).await?;

@@ -12,7 +12,7 @@ use tokio::sync::{Notify, broadcast};
 const MAX_ROBOT_LINES: usize = 200;
 /// Bytes kept of all robots; each has an equal share, if it needs it.
 const MAX_BYTES: usize = 64 * 1024 * 1024;
-/// What a line takes beside its text.
+/// What a line takes beside its texts.
 const LINE_OVERHEAD_BYTES: usize = 160;
 /// What a robot may publish a second, and at once.
 const BYTES_PER_S: u64 = 256 * 1024;
@@ -249,7 +249,9 @@ impl Drop for Follower {
 }
 
 fn size(line: &LogLine) -> usize {
-    line.text.len() + LINE_OVERHEAD_BYTES
+    let task_bytes = line.task.as_ref().map_or(0, |task| task.as_str().len());
+    let node_bytes = line.node.as_ref().map_or(0, |node| node.as_str().len());
+    line.text.len() + task_bytes + node_bytes + LINE_OVERHEAD_BYTES
 }
 
 /// A text as it should have come: on one line, of a bounded length.

@@ -3,6 +3,7 @@
 
 use serde_json::Value;
 
+use crate::harness::eventually;
 use crate::ros::Stage;
 
 const ROBOT: &str = "robot-1";
@@ -48,6 +49,16 @@ async fn an_operator_looks_at_nodes_and_changes_them() {
     let set = stage.asked(&["param", "set", ROBOT, "/asked", "resolution", "2"]).await;
     assert_eq!(set["parameter"]["value"], 2.0, "a whole number becomes the node's double: {set}");
     assert_eq!(stage.say("/say").await, "2.0", "as an independent client hears");
+    // What the node said about it is kept with its task, once, though it stands on its standard error as well.
+    let said = eventually("the node's words", async || {
+        let logs = stage.asked(&["logs", ROBOT, "asked", "--level", "warn"]).await;
+        let lines = logs["lines"].as_array().expect("lines").clone();
+        let said: Vec<Value> = lines.into_iter().filter(|line| line["text"] == "I was asked").collect();
+        (!said.is_empty()).then_some(said)
+    })
+    .await;
+    assert_eq!(said.len(), 1, "{said:?}");
+    assert_eq!((&said[0]["node"], &said[0]["level"]), (&"/asked".into(), &"warn".into()), "{said:?}");
     let all = stage.asked(&["param", "list", ROBOT, "/asked"]).await;
     assert_eq!(named(&all["parameters"], "resolution")["value"], 2.0);
     let rejected = stage.refused(&["param", "set", ROBOT, "/asked", "resolution", "-1"]).await;

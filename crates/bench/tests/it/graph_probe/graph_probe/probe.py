@@ -40,6 +40,7 @@ class Endpoints:
         return SetParametersResult(successful=True)
 
     def on_say(self, _request, response):
+        self.get_logger().warning("I was asked")
         response.success = True
         response.message = str(self.get_parameter("resolution").value)
         return response

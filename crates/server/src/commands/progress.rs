@@ -54,12 +54,12 @@ impl DeploymentProgress {
             self.show_summary(view, assignments);
         } else {
             for assignment in assignments {
-                self.show_robot(assignment);
+                self.show_robot(assignment, assignment.phase.is_settled(view.kind));
             }
         }
     }
 
-    fn show_robot(&mut self, assignment: &AssignmentView) {
+    fn show_robot(&mut self, assignment: &AssignmentView, is_settled: bool) {
         if !self.moving {
             if self.said.insert(assignment.robot.clone(), assignment.phase) != Some(assignment.phase) {
                 say(&line(assignment));
@@ -73,7 +73,11 @@ impl DeploymentProgress {
                 bar.set_length(progress.total);
                 bar.set_position(progress.done);
             }
-            None => bar.set_length(0),
+            // A bar of no length would be full.
+            None => {
+                bar.set_length(1);
+                bar.set_position(u64::from(is_settled));
+            }
         }
         bar.set_message(line(assignment));
     }

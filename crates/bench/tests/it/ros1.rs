@@ -81,7 +81,8 @@ async fn a_ros_1_package_is_built_launched_and_stopped() {
 async fn a_robot_without_a_ros_package_is_unmet_before_the_content_travels() {
     let venv = required("TASKD_TEST_ROS");
     let mut fleet = Fleet::start(0).await;
-    let settings = [("TASK_AGENT_UNDERLAYS", &*format!("{venv}/bin/activate")), ("TASK_AGENT_ROS_DOMAIN_ID", "73")];
+    // The domain is the one of the shell that the agent was started in.
+    let settings = [("TASK_AGENT_UNDERLAYS", &*format!("{venv}/bin/activate")), ("ROS_DOMAIN_ID", "73")];
     let url = fleet.server.url("");
     fleet.robots.push(Robot::start_with(&fleet.server, fleet.dir.path(), "robot-1", 1, &url, &settings).await);
     let package = fleet.dir.path().join("navigator");

@@ -143,6 +143,13 @@ impl Promise {
         (!texts.is_empty()).then(|| Failure::new(FailureCode::NODE_NAME_TAKEN, texts.join("; ")))
     }
 
+    /// Those of the others that have a promised name.
+    pub fn takers(&self, snapshot: &Snapshot, others: &BTreeMap<ParticipantId, String>) -> BTreeSet<ParticipantId> {
+        let named = self.nodes.iter().flat_map(|name| snapshot.named(name));
+        let offering = self.services.iter().flat_map(|name| snapshot.servers_of(name));
+        named.chain(offering).map(|node| node.participant).filter(|id| others.contains_key(id)).collect()
+    }
+
     /// Promised names that somebody else has.
     fn foreign(&self, snapshot: &Snapshot, others: &BTreeMap<ParticipantId, String>) -> Vec<Shortfall> {
         let nodes = self.nodes.iter().filter_map(|name| {
@@ -178,6 +185,11 @@ impl Readiness {
             lasting: BTreeMap::new(),
             health: Health::default(),
         }
+    }
+
+    /// What it holds the run against.
+    pub fn promise(&self) -> &Promise {
+        &self.promise
     }
 
     /// How the run stands, as of the last look.

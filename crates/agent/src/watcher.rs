@@ -85,7 +85,7 @@ impl Watcher {
             // What was stopped a moment ago may still be on its way out.
             let changed = tokio::time::timeout_at(deadline, changes.changed()).await;
             if !matches!(changed, Ok(Ok(()))) {
-                let named = whose.naming_processes(&snapshot).await;
+                let named = whose.naming_takers(promise, &snapshot).await;
                 return Err(promise.taken(&snapshot, &named.others).unwrap_or(failure));
             }
         }
@@ -275,7 +275,8 @@ impl Eyes {
             }
         }
         let ours = std::mem::take(&mut self.whose).ever_ours;
-        self.whose = Whose::look(snapshot.clone(), self.pids.clone(), &ours, self.started).await;
+        let whose = Whose::look(snapshot.clone(), self.pids.clone(), &ours, self.started).await;
+        self.whose = whose.naming_takers(readiness.promise(), snapshot).await;
         self.meter(snapshot);
         let counts = self.meters.iter().map(|(topic, meter)| (topic.clone(), meter.rate().samples)).collect();
         let Whose { ours, others, gone, .. } = &self.whose;

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use crate::graph::{Graph, Owners, Participant, ParticipantId, Snapshot};
+use crate::readiness::Promise;
 
 /// How long before its start was recorded a process may have been seen: the record is written after the start.
 const START_SLACK: Duration = Duration::from_secs(1);
@@ -63,10 +64,13 @@ impl Whose {
         whose
     }
 
-    /// The same, with the processes of the others on this robot in words, where that can be told. It takes a moment.
-    pub(super) async fn naming_processes(mut self, snapshot: &Snapshot) -> Self {
-        for (id, words) in &mut self.others {
-            let Some(participant) = snapshot.participants.get(id) else { continue };
+    /// The same, with those of the others that have promised names as processes of this robot, where that can be told. It
+    /// takes a moment for each of them.
+    pub(super) async fn naming_takers(mut self, promise: &Promise, snapshot: &Snapshot) -> Self {
+        for id in promise.takers(snapshot, &self.others) {
+            let (Some(words), Some(participant)) = (self.others.get_mut(&id), snapshot.participants.get(&id)) else {
+                continue;
+            };
             if let Some(pid) = Graph::process_of(participant.clone()).await {
                 *words = format!("process {pid} on this robot");
             }

@@ -5,7 +5,6 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::fs::{self, File};
 use std::io::{self, PipeReader, Read, Write};
-use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -17,6 +16,7 @@ use crate::cgroup::{Cgroups, RunLimits};
 use crate::confinement::Confinement;
 use crate::containment::{Containment, ContainmentError, KillOnDrop, RUN_DIR_VARIABLE};
 use crate::durable;
+use crate::foreign_file;
 use crate::layout::VersionDir;
 use crate::process::{self, ExitStatus};
 use crate::script;
@@ -274,10 +274,7 @@ fn missing_package(version: &VersionDir) -> Option<String> {
 /// The name in a `package.xml`. It was checked when the package was pushed, so looking for the element is enough. The build
 /// may have put anything in its place: what is no plain file is not read.
 fn package_name(path: &Path) -> Option<String> {
-    let file = File::options().read(true).custom_flags(libc::O_NOFOLLOW | libc::O_NONBLOCK).open(path).ok()?;
-    let mut text = String::new();
-    file.metadata().ok().filter(fs::Metadata::is_file)?;
-    file.take(MAX_PACKAGE_XML_BYTES).read_to_string(&mut text).ok()?;
+    let text = String::from_utf8(foreign_file::read(path, MAX_PACKAGE_XML_BYTES).ok()?).ok()?;
     let (_, rest) = text.split_once("<name>")?;
     let (name, _) = rest.split_once("</name>")?;
     let name = name.trim();

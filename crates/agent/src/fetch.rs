@@ -29,6 +29,7 @@ use self::intake::Intake;
 use crate::credential::Credential;
 use crate::disk::{self, DiskFull, Need};
 use crate::durable;
+use crate::foreign_file;
 use crate::layout::DataDir;
 use crate::unpack::{Limits, Refusal};
 
@@ -385,7 +386,9 @@ impl Fetcher {
 
 /// The package's task manifest if it was pulled before and is still there whole.
 pub fn stored_manifest(data: &DataDir, package: &PackageRef) -> Option<TaskManifest> {
-    let bytes = fs::read(data.task(&package.name).version(&package.manifest.digest).manifest()).ok()?;
+    // It lies among the task's own files, which the task may have exchanged.
+    let path = data.task(&package.name).version(&package.manifest.digest).manifest();
+    let bytes = foreign_file::read(&path, MAX_MANIFEST_BYTES).ok()?;
     if Digest::of(&bytes) != package.config.digest {
         return None;
     }

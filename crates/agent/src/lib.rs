@@ -16,6 +16,7 @@ pub mod durable;
 pub mod effects;
 pub mod environment;
 pub mod fetch;
+pub mod foreign_file;
 pub mod gate;
 pub mod graph;
 pub mod graph_access;

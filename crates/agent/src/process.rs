@@ -5,9 +5,11 @@
 //! and the boot, and signals go through a pidfd that was checked against it.
 
 use std::collections::BTreeMap;
+use std::ffi::CString;
 use std::fs::File;
 use std::io::{self, PipeReader, PipeWriter};
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd, FromRawFd, OwnedFd, RawFd};
+use std::os::unix::ffi::OsStrExt as _;
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::Path;
 use std::process::Stdio;
@@ -259,12 +261,15 @@ pub fn spawn_task(
     errors: PipeWriter,
 ) -> io::Result<u32> {
     let mut command = command(Path::new("/bin/bash"), environment);
-    command.arg(script).current_dir(directory).process_group(0);
+    command.arg(script).process_group(0);
     command.stdin(Stdio::null()).stdout(output).stderr(errors);
+    let directory = CString::new(directory.as_os_str().as_bytes())?;
     let parent = nix::unistd::getpid();
     let prepare = move || {
         reset_for_exec()?;
         confinement.enter()?;
+        // Entered with the task's rights: it may have put a link to what only root may enter in its place.
+        nix::unistd::chdir(directory.as_c_str())?;
         // A change of user takes the wish back, so it comes after.
         prctl::set_pdeathsig(Signal::SIGINT)?;
         // It died before the line above: nobody would send the signal any more.

@@ -366,6 +366,11 @@ impl Graph {
         Ok(meter)
     }
 
+    /// Whether it shows nothing new any more.
+    pub fn is_closed(&self) -> bool {
+        self.shared.tasks.closing.is_cancelled()
+    }
+
     /// What `call` gives, or an error as soon as the graph is closed.
     async fn while_open<T>(&self, call: impl Future<Output = Result<T, GraphError>>) -> Result<T, GraphError> {
         self.shared.tasks.closing.run_until_cancelled(call).await.unwrap_or(Err(GraphError::Closed))

@@ -1,5 +1,5 @@
 //! When the agent takes part in the ROS graph: from the first time that a task or a question needs it, on a robot that has
-//! ROS 2, until the agent ends. A robot without ROS 2 never opens a socket for it. It looks at nothing itself.
+//! ROS 2, until the agent ends; anew, should it have been thrown out. A robot without ROS 2 never opens a socket for it. It looks at nothing itself.
 
 use std::error::Error as _;
 use std::sync::Arc;
@@ -55,14 +55,6 @@ impl GraphAccess {
         self.opened(facts).await.map(|(graph, _)| graph)
     }
 
-    /// The graph, if somebody has opened it.
-    pub async fn if_open(&self) -> Option<Graph> {
-        match &*self.state.lock().await {
-            State::Open { graph, .. } => Some(graph.clone()),
-            State::Closed | State::Failed { .. } => None,
-        }
-    }
-
     /// Likewise, but not before it can show who was there when it was opened.
     pub async fn settled(&self, facts: Option<&RosFacts>) -> Result<Graph, Failure> {
         let (graph, since) = self.opened(facts).await?;
@@ -73,9 +65,10 @@ impl GraphAccess {
     async fn opened(&self, facts: Option<&RosFacts>) -> Result<(Graph, Instant), Failure> {
         let mut state = self.state.lock().await;
         match &*state {
-            State::Open { graph, since } => return Ok((graph.clone(), *since)),
+            State::Open { graph, since } if !graph.is_closed() => return Ok((graph.clone(), *since)),
             State::Failed { failure, at } if at.elapsed() < RETRY => return Err(failure.clone()),
-            State::Closed | State::Failed { .. } => {}
+            // What has closed by itself, because its listening ended, is opened anew.
+            State::Closed | State::Open { .. } | State::Failed { .. } => {}
         }
         let settings = self.settings(facts)?;
         match Graph::open(&settings).await {

@@ -55,7 +55,7 @@ pub struct Watcher {
     access: GraphAccess,
     supervisor: Supervisor,
     /// What ends the watch of each run directory.
-    watches: Arc<Mutex<HashMap<PathBuf, CancellationToken>>>,
+    watches: Arc<Mutex<HashMap<PathBuf, Arc<CancellationToken>>>>,
 }
 
 impl Watcher {
@@ -99,12 +99,11 @@ impl Watcher {
             return seen;
         }
         let (health, seen) = watch::channel(Health::Unknown);
-        let over = CancellationToken::new();
+        let over = Arc::new(CancellationToken::new());
         let watches = self.watches.clone();
         lock(&watches).insert(run.dir.clone(), over.clone());
         let (access, supervisor) = (self.access.clone(), self.supervisor.clone());
         tokio::spawn(async move {
-            let dir = run.dir.clone();
             let watching = watch_run(run, promise, facts, &access, supervisor, &health);
             tokio::select! {
                 () = watching => {}
@@ -112,7 +111,8 @@ impl Watcher {
                 () = health.closed() => {}
                 () = over.cancelled() => health.closed().await,
             }
-            lock(&watches).remove(&dir);
+            // The same run may be watched anew by now.
+            lock(&watches).retain(|_, known| !Arc::ptr_eq(known, &over));
         });
         seen
     }

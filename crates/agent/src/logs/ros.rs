@@ -203,6 +203,10 @@ impl Recorder {
         if let Some(Err(error)) = parent.map(std::fs::create_dir_all) {
             tracing::debug!(%error, "what nodes say can't be kept");
         }
+        if !path.exists() {
+            // It was never begun, or its task was removed with it: what was open then is no file of the next one.
+            self.logs.remove(&task);
+        }
         let log = self.logs.entry(task).or_insert_with(|| {
             let mut spec = LogSpec::at(path);
             spec.files = FILES;
@@ -228,5 +232,27 @@ fn console_level(level: LogLevel) -> &'static str {
         LogLevel::Warn => "WARN",
         LogLevel::Error => "ERROR",
         LogLevel::Fatal => "FATAL",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::durable;
+
+    #[test]
+    fn a_task_that_comes_back_has_a_log_of_its_own() {
+        let temp = tempfile::tempdir().expect("temp dir");
+        let data = DataDir::new(temp.path()).expect("data dir");
+        let name: TaskName = "talker".parse().expect("valid");
+        let task = data.task(&name);
+        let mut recorder = Recorder::new(data.clone(), None);
+        for text in ["first", "second"] {
+            durable::create_dir_all(&task.logs()).expect("made");
+            recorder.write(Some(name.clone()), LogSource::Rosout, text);
+            let log = std::fs::read_to_string(task.ros_log()).expect("a log");
+            assert!(log.contains(text), "{log}");
+            task.remove().expect("removed");
+        }
     }
 }

@@ -11,6 +11,7 @@
 //! tasks/<name>/run/                 the shim's files: pid, exit status
 //! tasks/<name>/logs/                the task's and the build's output, and what its nodes say on ROS topics
 //! tasks/<name>/home/                the task's home directory, where it runs as a user of its own
+//! tasks/<name>/uploads.json         which uploads of its files are under way
 //! tasks/<name>/<hex>/               one version, by the digest of its OCI manifest
 //!   task.json                       the task manifest, byte for byte as it was pulled
 //!   src/  build/  install/  run.sh
@@ -165,6 +166,11 @@ impl TaskDir {
     /// The home directory of the user that the task runs as.
     pub fn home(&self) -> PathBuf {
         self.root.join("home")
+    }
+
+    /// Which uploads of its files are under way: out of the task's reach, because it says where the robot's token goes.
+    pub fn uploads(&self) -> PathBuf {
+        self.root.join("uploads.json")
     }
 
     /// The version whose package has this manifest digest.

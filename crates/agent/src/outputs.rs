@@ -15,6 +15,8 @@ use task_proto::{DeploymentId, RobotId, TaskName, Version};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
+use crate::task_user::{self, TaskUser};
+
 pub use push::Registry;
 
 /// Which files to bring back, and of what.
@@ -32,6 +34,8 @@ pub struct OutputOrder {
     pub run: u64,
     /// The directory the task ran in.
     pub directory: PathBuf,
+    /// Whom it ran as; `None`: whoever the agent is. The files are read with its rights.
+    pub user: Option<TaskUser>,
     /// The patterns of `outputs.paths`.
     pub patterns: Vec<String>,
     /// Where to note uploads under way, so that the next try goes on with them.
@@ -54,6 +58,9 @@ pub enum OutputError {
     /// Beyond a limit.
     #[error("outputs.paths: {0}")]
     TooMuch(String),
+    /// The files can't be looked at as the task's user.
+    #[error("cannot take the rights of the user that tasks run as")]
+    User(#[source] io::Error),
     /// A file can't be read.
     #[error("cannot read {path}")]
     Read {
@@ -102,7 +109,7 @@ impl OutputError {
         match self {
             Self::Unreachable(_) | Self::Note { .. } | Self::Cancelled => Some(Duration::ZERO),
             // What can't be read now may be readable once a file system is back.
-            Self::Read { .. } => Some(Duration::from_secs(30)),
+            Self::Read { .. } | Self::User(_) => Some(Duration::from_secs(30)),
             Self::Busy { retry_after, .. } => Some(retry_after.unwrap_or_default()),
             // A robot that is enrolled anew, or replaces its token, is known again.
             Self::Refused { status: 401, .. } => Some(Duration::from_secs(30)),
@@ -120,11 +127,10 @@ pub async fn bring_back(
 ) -> Result<usize, OutputError> {
     let work = async {
         let found = order.clone();
-        let searched =
-            tokio::task::spawn_blocking(move || find::files(&found.directory, &found.patterns, found.max_bytes));
-        let files = searched
-            .await
-            .map_err(|error| OutputError::Read { path: order.directory.clone(), source: io::Error::other(error) })??;
+        let searched = task_user::do_as(order.user.as_ref(), move || {
+            find::files(&found.directory, &found.patterns, found.max_bytes)
+        });
+        let files = searched.await.map_err(OutputError::User)??;
         if files.is_empty() {
             return Ok(0);
         }

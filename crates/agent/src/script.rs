@@ -78,12 +78,14 @@ pub fn build_script(tool: BuildTool, version: &VersionDir, underlays: &[PathBuf]
     Some(script)
 }
 
-/// The script that writes what the `variables` are after sourcing `underlays` into the file `answer`, each ended by NUL.
-pub fn survey_script(underlays: &[PathBuf], variables: &[&str], answer: &Path) -> String {
+/// The script that writes what the `variables` are after sourcing `underlays` to its standard output, each ended by NUL.
+pub fn survey_script(underlays: &[PathBuf], variables: &[&str]) -> String {
     let mut script = HEAD.to_owned();
+    // What setup files print is no part of the answer.
+    script.push_str("exec {_taskd_answer}>&1 >/dev/null 2>&1\n");
     source_underlays(&mut script, underlays);
     let values = variables.iter().map(|name| format!("\"${{{name}-}}\"")).collect::<Vec<_>>();
-    script.push_str(&format!("printf '%s\\0' {} > {}\n", values.join(" "), quote_path(answer)));
+    script.push_str(&format!("printf '%s\\0' {} >&\"$_taskd_answer\"\n", values.join(" ")));
     script
 }
 

@@ -1,9 +1,9 @@
-//! Looks into ROS installations: sources the setup files as a task would, and lists the packages that can be found then.
-//! Bounded in time and in what is listed; what can't be seen stays unknown. It chooses nothing.
+//! Looks into ROS installations: sources the setup files as a task would, under the same account, and lists the packages
+//! that can be found then. Bounded in time and in what is listed; what can't be seen stays unknown. It chooses nothing.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::OsStr;
-use std::io;
+use std::io::{self, PipeReader, Read as _};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -14,6 +14,7 @@ use crate::durable;
 use crate::installation::{Installation, RosVersion};
 use crate::process::{self, ExitStatus};
 use crate::script;
+use crate::task_user::{self, TaskUser};
 
 /// Added to the agent's niceness.
 const NICE: i32 = 10;
@@ -41,17 +42,18 @@ const VARIABLES: [&str; 7] = [
     "RMW_IMPLEMENTATION",
 ];
 
-/// `installations` with what was seen in them. `dir` is for the survey alone.
+/// `installations` with what `user` has seen in them. `dir` is for the survey alone.
 pub async fn survey(
     installations: Vec<Installation>,
     environment: &BTreeMap<String, String>,
     dir: &Path,
+    user: Option<&TaskUser>,
 ) -> Vec<Installation> {
     let mut seen = Vec::new();
     for (number, mut installation) in installations.into_iter().enumerate() {
         if number < MAX_INSTALLATIONS {
-            match source(&installation.setups, environment, dir).await {
-                Ok(answer) => look_into(&mut installation, answer).await,
+            match source(&installation.setups, environment, dir, user).await {
+                Ok(answer) => look_into(&mut installation, answer, user).await,
                 Err(error) => {
                     tracing::warn!(setups = ?installation.setups, %error, "cannot look into this ROS installation");
                 }
@@ -63,43 +65,51 @@ pub async fn survey(
 }
 
 /// What the variables are after sourcing `setups`.
-async fn source(setups: &[PathBuf], environment: &BTreeMap<String, String>, dir: &Path) -> io::Result<Vec<String>> {
+async fn source(
+    setups: &[PathBuf],
+    environment: &BTreeMap<String, String>,
+    dir: &Path,
+    user: Option<&TaskUser>,
+) -> io::Result<Vec<String>> {
     durable::create_dir_all(dir)?;
     let dir = dir.canonicalize()?;
-    let (path, answer) = (dir.join("survey.sh"), dir.join("answer"));
-    let text = script::survey_script(setups, &VARIABLES, &answer);
-    durable::write(&path, text.as_bytes(), 0o700)?;
+    let path = dir.join("survey.sh");
+    durable::write(&path, script::survey_script(setups, &VARIABLES).as_bytes(), 0o755)?;
     let mut environment = environment.clone();
     environment.insert(RUN_DIR_VARIABLE.to_owned(), dir.display().to_string());
+    if let Some(user) = user {
+        let way: Vec<PathBuf> = dir.parent().into_iter().chain([dir.as_path()]).map(Path::to_owned).collect();
+        user.let_through(&way)?;
+        environment.insert("HOME".to_owned(), dir.display().to_string());
+        environment.extend(["USER", "LOGNAME"].map(|name| (name.to_owned(), user.name.clone())));
+    }
     let containment = Containment::new(&dir, None, None);
     // An agent that was killed leaves its survey running.
     containment.end(KILL_TIMEOUT).await.map_err(io::Error::other)?;
     let (reader, writer) = io::pipe()?;
-    let confinement = Confinement::new(&path, None, &RunLimits::default(), None)?;
+    let confinement = Confinement::new(&path, None, &RunLimits::default(), user)?;
     let mut child = process::spawn_build(&path, &dir, &environment, NICE, confinement, writer)?;
-    // What setup files print is of no interest, but they must not wait for a reader.
-    let draining = tokio::task::spawn_blocking(move || io::copy(&mut { reader }, &mut io::sink()));
+    let reading = tokio::task::spawn_blocking(move || read_answer(reader));
     let ended = tokio::time::timeout(SOURCING_TIMEOUT, child.wait()).await;
     containment.end(KILL_TIMEOUT).await.map_err(io::Error::other)?;
-    draining.abort();
     let status = ExitStatus::from(ended.map_err(|_| io::Error::from(io::ErrorKind::TimedOut))??);
     if status != ExitStatus::Code(0) {
         return Err(io::Error::other(status.to_string()));
     }
-    read_answer(&answer)
+    // A process that got away may hold its end open.
+    tokio::time::timeout(KILL_TIMEOUT, reading).await.map_err(|_| io::Error::from(io::ErrorKind::TimedOut))??
 }
 
-fn read_answer(path: &Path) -> io::Result<Vec<String>> {
-    use std::io::Read as _;
+fn read_answer(answer: PipeReader) -> io::Result<Vec<String>> {
     let mut bytes = Vec::new();
-    std::fs::File::open(path)?.take(MAX_ANSWER_BYTES).read_to_end(&mut bytes)?;
+    answer.take(MAX_ANSWER_BYTES).read_to_end(&mut bytes)?;
     let values: Vec<String> =
         bytes.split(|byte| *byte == 0).map(|value| String::from_utf8_lossy(value).into()).collect();
     // The last value is ended too, which gives an empty text after it.
     if values.len() == VARIABLES.len() + 1 { Ok(values) } else { Err(io::Error::other("the answer is not complete")) }
 }
 
-async fn look_into(installation: &mut Installation, answer: Vec<String>) {
+async fn look_into(installation: &mut Installation, answer: Vec<String>, user: Option<&TaskUser>) {
     let value = |name: &str| {
         let at = VARIABLES.iter().position(|variable| *variable == name);
         at.and_then(|at| answer.get(at)).filter(|value| !value.is_empty()).cloned()
@@ -129,7 +139,7 @@ async fn look_into(installation: &mut Installation, answer: Vec<String>) {
         places.pythons.push("/usr/lib/python3/dist-packages".into());
     }
     // A thread that panicked has seen nothing.
-    installation.packages = tokio::task::spawn_blocking(move || places.packages()).await.ok();
+    installation.packages = task_user::do_as(user, move || places.packages()).await.ok();
 }
 
 /// Where packages lie.
@@ -218,7 +228,7 @@ mod tests {
         );
         write(root.join("my setup.bash"), &text);
         let given = Installation { setups: vec![root.join("my setup.bash")], ..Installation::default() };
-        let seen = survey(vec![given], &system(), &root.join("survey")).await.remove(0);
+        let seen = survey(vec![given], &system(), &root.join("survey"), None).await.remove(0);
         assert_eq!((seen.distros, seen.versions), (vec!["jazzy".to_owned()], vec![RosVersion::Ros2]));
         assert_eq!(seen.rmw.as_deref(), Some("rmw_cyclonedds_cpp"));
         let packages: Vec<_> = seen.packages.expect("seen").into_iter().collect();
@@ -231,7 +241,7 @@ mod tests {
         write(temp.path().join("exits.bash"), "exit 3\n");
         for setup in ["exits.bash", "absent.bash"] {
             let given = Installation { setups: vec![temp.path().join(setup)], ..Installation::default() };
-            let seen = survey(vec![given.clone()], &system(), &temp.path().join("survey")).await;
+            let seen = survey(vec![given.clone()], &system(), &temp.path().join("survey"), None).await;
             assert_eq!(seen, [given]);
         }
     }

@@ -8,15 +8,21 @@ use std::os::fd::{AsFd, AsRawFd as _, OwnedFd};
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 
+use nix::errno::Errno;
 use nix::fcntl::{AtFlags, OFlag, openat};
-use nix::sys::stat::{FileStat, Mode, SFlag, fstat, fstatat};
-use nix::unistd::{Gid, Uid, fchown, fchownat};
+use nix::sys::stat::{FileStat, Mode, SFlag, fstat};
+use nix::unistd::{Gid, Uid, fchown, fchownat, setfsgid, setfsuid};
 use serde::{Deserialize, Serialize};
 
 /// The account that is used when the settings name none.
 pub const DEFAULT_NAME: &str = "taskd-task";
 /// How deep a tree may be that is handed over.
 const MAX_DEPTH: usize = 256;
+/// The call that sets the groups of one thread, with ids of 32 bits.
+#[cfg(target_pointer_width = "64")]
+const SETGROUPS: libc::c_long = libc::SYS_setgroups;
+#[cfg(target_pointer_width = "32")]
+const SETGROUPS: libc::c_long = libc::SYS_setgroups32;
 
 /// An account.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -128,6 +134,33 @@ impl TaskUser {
         Ok(fchown(&opened, Some(self.user()), Some(self.group()))?)
     }
 
+    /// Does `work`, which must not touch what is the agent's alone, with the account's rights to files and no others: where
+    /// a task may exchange any file or directory for a link, what it can't read itself can't be read for it.
+    pub fn with_its_rights<T: Send>(&self, work: impl FnOnce() -> T + Send) -> io::Result<T> {
+        // The thread ends with the work, so there are no rights to be taken back.
+        std::thread::scope(|scope| {
+            let working = scope.spawn(|| self.take_file_rights().map(|()| work()));
+            working.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+        })
+    }
+
+    /// Leaves the calling thread, and it alone, the account's rights to files. It stays root in all else, or every process of
+    /// the account could end the agent by a signal to this thread.
+    fn take_file_rights(&self) -> io::Result<()> {
+        let groups: Vec<libc::gid_t> = std::iter::once(self.gid).chain(self.groups.iter().copied()).collect();
+        // SAFETY: the list outlives the call. The C library's own call would change all threads.
+        Errno::result(unsafe { libc::syscall(SETGROUPS, groups.len(), groups.as_ptr()) })?;
+        // They tell what was before, and nothing of a failure; an id that is none changes nothing.
+        setfsgid(self.group());
+        setfsuid(self.user());
+        let (none, now) = (u32::MAX, (self.user(), self.group()));
+        if (setfsuid(Uid::from_raw(none)), setfsgid(Gid::from_raw(none))) == now {
+            Ok(())
+        } else {
+            Err(io::Error::from(io::ErrorKind::PermissionDenied))
+        }
+    }
+
     fn hand_over_below(&self, dir: &OwnedFd, depth: usize) -> io::Result<()> {
         if depth > MAX_DEPTH {
             return Err(io::Error::other(format!("a directory lies more than {MAX_DEPTH} levels deep")));
@@ -135,7 +168,10 @@ impl TaskUser {
         for entry in fs::read_dir(format!("/proc/self/fd/{}", dir.as_raw_fd()))? {
             let name = entry?.file_name();
             let flags = OFlag::O_RDONLY | OFlag::O_DIRECTORY | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
-            let stat = fstatat(dir, name.as_os_str(), AtFlags::AT_SYMLINK_NOFOLLOW)?;
+            // What is looked at is what is handed over, whatever takes its name in between.
+            let entry =
+                openat(dir, name.as_os_str(), OFlag::O_PATH | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC, Mode::empty())?;
+            let stat = fstat(&entry)?;
             if is_kind(&stat, SFlag::S_IFDIR) {
                 let below = openat(dir, name.as_os_str(), flags, Mode::empty())?;
                 self.hand_over_below(&below, depth + 1)?;
@@ -143,7 +179,7 @@ impl TaskUser {
             } else if !is_kind(&stat, SFlag::S_IFREG) || stat.st_nlink == 1 {
                 // A file with a second name may be anybody's; packages have none.
                 let (user, group) = (Some(self.user()), Some(self.group()));
-                fchownat(dir, name.as_os_str(), user, group, AtFlags::AT_SYMLINK_NOFOLLOW)?;
+                fchownat(&entry, "", user, group, AtFlags::AT_EMPTY_PATH)?;
             }
         }
         Ok(())
@@ -156,6 +192,19 @@ impl TaskUser {
     fn group(&self) -> Gid {
         Gid::from_raw(self.gid)
     }
+}
+
+/// Does blocking `work` with the rights to files that `user` has, or with the agent's where tasks run as whoever it is.
+pub async fn do_as<T: Send + 'static>(
+    user: Option<&TaskUser>,
+    work: impl FnOnce() -> T + Send + 'static,
+) -> io::Result<T> {
+    let user = user.cloned();
+    let working = tokio::task::spawn_blocking(move || match user {
+        Some(user) => user.with_its_rights(work),
+        None => Ok(work()),
+    });
+    working.await.map_err(io::Error::other).flatten()
 }
 
 fn is_kind(stat: &FileStat, kind: SFlag) -> bool {
@@ -189,6 +238,22 @@ mod tests {
         let missing = TaskUser::choose(None, 0, "root:x:0:0::/:/bin/sh\n", "").expect_err("refused").to_string();
         assert!(missing.contains("useradd --system taskd-task") && missing.contains("task_user"), "{missing}");
         assert!(choose(Some("tasks"), 0).expect_err("refused").to_string().contains("\"tasks\""));
+    }
+
+    #[test]
+    fn work_with_the_accounts_rights_reads_what_the_account_can_and_leaves_this_thread_as_it_was() {
+        let temp = tempfile::tempdir().expect("temp dir");
+        let own = temp.path().join("own");
+        fs::write(&own, "text").expect("written");
+        let user = TaskUser { name: "4711".to_owned(), uid: 4711, gid: 4711, groups: Vec::new() };
+        let read =
+            user.with_its_rights(|| (fs::read(&own).map_err(|error| error.kind()), fs::read("/etc/passwd").is_ok()));
+        if nix::unistd::geteuid().is_root() {
+            assert_eq!(read.expect("the rights"), (Err(io::ErrorKind::PermissionDenied), true));
+        } else {
+            assert!(read.is_err(), "only root may have another's rights");
+        }
+        assert!(fs::read(&own).is_ok());
     }
 
     #[test]

@@ -40,8 +40,6 @@ mod graph;
 
 /// Written into a version's directory once it is built.
 const BUILT_MARKER: &str = "built";
-/// Written into a version's directory while its files are sent.
-const UPLOADS: &str = "uploads.json";
 /// How many bytes a run may bring back, unless the robot's settings say otherwise.
 const OUTPUT_BYTES: u64 = 4 << 30;
 /// Written into a run's directory before its start: what the ledger says of the run, should the ledger be lost.
@@ -226,7 +224,12 @@ impl Effects for Robot {
 
     async fn look_for_ros(&self) {
         let found = underlay::find(&self.underlays, &Places::of_this_machine());
-        let seen = survey::survey(found, &self.environment, &self.data.root().join(SURVEY_DIR)).await;
+        let dir = self.data.root().join(SURVEY_DIR);
+        let seen = match &self.task_user {
+            Ok(user) => survey::survey(found, &self.environment, &dir, user.as_ref()).await,
+            // Setup files may be anybody's: they are never sourced as root for want of a user.
+            Err(_) => found,
+        };
         *self.ros.write().unwrap_or_else(PoisonError::into_inner) = seen;
     }
 
@@ -432,7 +435,8 @@ impl Effects for Robot {
             deployment: files.deployment.clone(),
             run: files.run,
             directory: script::run_directory(manifest.build.tool, &version),
-            notes: version.root().join(UPLOADS),
+            user: self.task_user.clone().map_err(|error| later(FailureCode::NO_TASK_USER, &error, 0))?,
+            notes: self.data.task(task).uploads(),
             patterns: manifest.outputs.paths,
             max_bytes: self.output_bytes,
         };
@@ -498,7 +502,7 @@ fn fetch_failure(error: FetchError) -> StepFailure {
 fn outputs_code(error: &OutputError) -> FailureCode {
     match error {
         OutputError::Unreachable(_) | OutputError::Busy { .. } => FailureCode::SERVER_UNREACHABLE,
-        OutputError::Read { .. } | OutputError::Note { .. } => FailureCode::IO_ERROR,
+        OutputError::Read { .. } | OutputError::User(_) | OutputError::Note { .. } => FailureCode::IO_ERROR,
         OutputError::Cancelled => FailureCode::INTERRUPTED,
         OutputError::Pattern { .. } | OutputError::TooMuch(_) | OutputError::Refused { .. } => {
             FailureCode::OUTPUTS_LOST

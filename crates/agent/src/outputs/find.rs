@@ -2,9 +2,8 @@
 //! back, because a task could point them at what is not its own.
 
 use std::collections::BTreeMap;
-use std::fs::{self, File, Metadata, OpenOptions};
+use std::fs::{self, Metadata};
 use std::io::{self, Read as _};
-use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::{Path, PathBuf};
 
 use sha2::{Digest as _, Sha256};
@@ -14,6 +13,7 @@ use task_proto::id::OutputPath;
 use task_proto::output::{MAX_FILES, OutputFile};
 
 use super::{OutputError, too_many};
+use crate::foreign_file;
 
 /// The most names looked at for one pattern.
 const MAX_LOOKED_AT: usize = 200_000;
@@ -34,8 +34,8 @@ pub(super) fn files(directory: &Path, patterns: &[String], max_bytes: u64) -> Re
             "the files have {bytes} bytes, {max_bytes} may be brought back (limits.output_bytes of this robot)"
         )));
     }
-    let hashed = found.into_iter().map(|(path, (file, _))| {
-        let blob = hash(&file).map_err(|source| OutputError::Read { path: file, source })?;
+    let hashed = found.into_iter().map(|(path, (file, size))| {
+        let blob = hash(&file, size).map_err(|source| OutputError::Read { path: file, source })?;
         Ok(OutputFile { path, blob })
     });
     hashed.collect()
@@ -113,15 +113,9 @@ impl Search<'_> {
     }
 }
 
-/// Opens a file for reading, if it still is one.
-pub(super) fn open(path: &Path) -> io::Result<File> {
-    let flags = nix::fcntl::OFlag::O_NOFOLLOW | nix::fcntl::OFlag::O_NONBLOCK;
-    let file = OpenOptions::new().read(true).custom_flags(flags.bits()).open(path)?;
-    if file.metadata()?.is_file() { Ok(file) } else { Err(io::Error::other("it is no regular file any more")) }
-}
-
-fn hash(path: &Path) -> io::Result<BlobRef> {
-    let mut file = open(path)?;
+/// The digest of a file as long as it was when it was found: something may still write to it, without end.
+fn hash(path: &Path, found: u64) -> io::Result<BlobRef> {
+    let mut file = foreign_file::open(path)?.take(found);
     let (mut hash, mut size) = (Sha256::new(), 0);
     let mut buffer = vec![0; 256 * 1024];
     loop {
@@ -163,6 +157,7 @@ mod tests {
         assert_eq!(names(&root, &["./log.txt", "nothing/*", "maps", "up/*.pgm"]), ["log.txt"]);
         let blob = files(&root, &["log.txt".to_owned()], 100).expect("found")[0].blob;
         assert_eq!(blob, BlobRef { digest: Digest::of(b"log.txt"), size: 7 });
+        assert_eq!(hash(&root.join("log.txt"), 3).expect("read"), BlobRef { digest: Digest::of(b"log"), size: 3 });
         assert!(matches!(files(&root, &["../*".to_owned()], 100), Err(OutputError::Pattern { .. })));
         assert!(matches!(files(&root, &["maps/*".to_owned()], 20), Err(OutputError::TooMuch(_))));
     }

@@ -15,9 +15,10 @@ use task_proto::output::OutputSet;
 use task_proto::report::Progress;
 use tokio::sync::watch;
 
-use super::{OutputError, OutputOrder, find};
+use super::{OutputError, OutputOrder};
 use crate::credential::Credential;
-use crate::durable;
+use crate::task_user::{self, TaskUser};
+use crate::{durable, foreign_file};
 
 /// Bytes sent in one request: what a bad link loses at most.
 const CHUNK_BYTES: u64 = 1024 * 1024;
@@ -73,7 +74,8 @@ pub(super) async fn push(
     let mut push = Push {
         registry,
         base: format!("/v2/{repository}"),
-        notes: read_notes(&order.notes),
+        notes: read_notes(&order.notes, output),
+        user: order.user.as_ref(),
         notes_path: &order.notes,
         done: 0,
         progress,
@@ -96,6 +98,7 @@ pub(super) async fn push(
 struct Push<'a> {
     registry: &'a Registry,
     base: String,
+    user: Option<&'a TaskUser>,
     notes: Notes,
     notes_path: &'a Path,
     /// Bytes of the files before this one.
@@ -112,7 +115,7 @@ impl Push<'_> {
             Err(error) => return Err(error),
         }
         if blob.size <= CHUNK_BYTES {
-            let bytes = read_part(path, 0, blob.size).await?;
+            let bytes = read_part(self.user, path, 0, blob.size).await?;
             return self.small(blob.digest, bytes).await;
         }
         let mut beginnings = 0;
@@ -152,7 +155,7 @@ impl Push<'_> {
             }
         };
         while offset < blob.size {
-            let bytes = read_part(path, offset, CHUNK_BYTES.min(blob.size - offset)).await?;
+            let bytes = read_part(self.user, path, offset, CHUNK_BYTES.min(blob.size - offset)).await?;
             let last = offset + bytes.len() as u64 - 1;
             let patch = self.registry.request(Method::PATCH, &location);
             let patch = patch.header(CONTENT_RANGE, format!("{offset}-{last}")).body(bytes);
@@ -181,24 +184,27 @@ fn note_error(path: &Path, source: std::io::Error) -> OutputError {
     OutputError::Note { path: path.to_owned(), source }
 }
 
-/// What an earlier try noted; nothing, if that can't be read: then uploads begin anew.
-fn read_notes(path: &Path) -> Notes {
-    std::fs::read(path).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok()).unwrap_or_default()
+/// What an earlier try noted of these files; nothing, if that can't be read: then uploads begin anew.
+fn read_notes(path: &Path, output: &OutputSet) -> Notes {
+    let read = std::fs::read(path).ok().and_then(|bytes| serde_json::from_slice::<Notes>(&bytes).ok());
+    let mut notes = read.unwrap_or_default();
+    notes.retain(|digest, _| output.files.iter().any(|file| file.blob.digest == *digest));
+    notes
 }
 
-async fn read_part(path: &Path, offset: u64, length: u64) -> Result<Vec<u8>, OutputError> {
+async fn read_part(user: Option<&TaskUser>, path: &Path, offset: u64, length: u64) -> Result<Vec<u8>, OutputError> {
     let path = path.to_owned();
     let read = {
         let path = path.clone();
         move || {
-            let mut file = find::open(&path)?;
+            let mut file = foreign_file::open(&path)?;
             file.seek(SeekFrom::Start(offset))?;
             let mut bytes = Vec::new();
             file.take(length).read_to_end(&mut bytes)?;
             if bytes.len() as u64 == length { Ok(bytes) } else { Err(std::io::Error::other("it became shorter")) }
         }
     };
-    let read = tokio::task::spawn_blocking(read).await.map_err(std::io::Error::other).flatten();
+    let read = task_user::do_as(user, read).await.map_err(OutputError::User)?;
     read.map_err(|source| OutputError::Read { path, source })
 }
 

@@ -134,7 +134,7 @@ mod tests {
         assert_eq!(at_ms("1970-01-01T00:00:07.500Z O [INFO] [7.123456789] [n]: x"), 7123, "by the node's own clock");
         assert_eq!(at_ms("1970-01-01T01:00:00.000Z O [INFO] [7.1, 3.0]: x"), 3_600_000, "but not by a simulated one");
         let line = entry("[INFO] [1.5] [talker-1]: up").unwrap().line;
-        assert_eq!((line.at_ms, line.source, line.node), (7, LogSource::Stdout, None));
+        assert_eq!((line.at_ms, line.source, line.node), (1500, LogSource::Stdout, None));
         assert_eq!(line.text, "[INFO] [1.5] [talker-1]: up");
         assert_eq!(entry(""), None);
         assert_eq!(entry("2026-11-21T10:00:00.123Z O \x1b[0m"), None);

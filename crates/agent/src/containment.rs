@@ -84,8 +84,9 @@ impl Containment {
         self.cgroup.as_ref().map_or(Ok(()), Cgroup::remove)
     }
 
-    /// Kills all members: at one stroke those in the control group, then those found otherwise. They are stopped first, until a look finds no new one, so that none forks away between the
-    /// look and the kill. Returns those that were killed; they may take a moment to be gone.
+    /// Kills all members: at one stroke those in the control group, then those found otherwise. They are stopped first,
+    /// until a look finds no new one, so that none forks away between the look and the kill. Returns those that were killed;
+    /// they may take a moment to be gone.
     pub fn kill(&self) -> io::Result<Vec<ProcessIdentity>> {
         if let Some(cgroup) = &self.cgroup {
             cgroup.kill()?;
@@ -109,7 +110,7 @@ impl Containment {
     pub async fn end(&self, timeout: Duration) -> Result<(), ContainmentError> {
         let ended = tokio::time::timeout(timeout, async {
             loop {
-                let killed = self.kill()?;
+                let killed = self.in_background(Self::kill).await?;
                 if killed.is_empty() {
                     return Ok(());
                 }
@@ -121,17 +122,19 @@ impl Containment {
             }
         });
         match ended.await {
-            Ok(Ok(())) => {
-                let ended = self.clone();
-                let removing = tokio::task::spawn_blocking(move || ended.remove());
-                Ok(removing.await.unwrap_or_else(|error| Err(error.into()))?)
-            }
+            Ok(Ok(())) => Ok(self.in_background(Self::remove).await?),
             Ok(failed) => failed,
             Err(_) => {
-                let pids = self.members()?.into_iter().map(|member| member.pid).collect();
+                let pids = self.in_background(Self::members).await?.into_iter().map(|member| member.pid).collect();
                 Err(ContainmentError::Survivors { pids })
             }
         }
+    }
+
+    /// Does what goes through the whole process table where nobody waits for it.
+    async fn in_background<T: Send + 'static>(&self, work: fn(&Self) -> io::Result<T>) -> io::Result<T> {
+        let own = self.clone();
+        tokio::task::spawn_blocking(move || work(&own)).await.map_err(io::Error::from).flatten()
     }
 
     fn entries(&self) -> io::Result<(Vec<ProcessEntry>, Vec<ProcessIdentity>)> {

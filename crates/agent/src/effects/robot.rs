@@ -469,6 +469,11 @@ impl Effects for Robot {
 
     async fn remove(&self, task: &TaskName) -> Result<(), StepFailure> {
         let task = self.data.task(task);
+        // As before a start: one that seemed to fail may have come about after all.
+        for run in other_runs(&task.run(), None) {
+            let stopped = self.supervisor.stop(&run, Duration::ZERO).await;
+            stopped.map_err(|error| later(FailureCode::IO_ERROR, &error, 0))?;
+        }
         on_disk(move || task.remove()).await
     }
 }

@@ -245,6 +245,7 @@ mod tests {
         let temp = tempfile::tempdir().expect("temp dir");
         let own = temp.path().join("own");
         fs::write(&own, "text").expect("written");
+        fs::set_permissions(&own, fs::Permissions::from_mode(0o600)).expect("for this user alone");
         let user = TaskUser { name: "4711".to_owned(), uid: 4711, gid: 4711, groups: Vec::new() };
         let read =
             user.with_its_rights(|| (fs::read(&own).map_err(|error| error.kind()), fs::read("/etc/passwd").is_ok()));

@@ -115,6 +115,7 @@ mod tests {
             wanted: Wanted::Running,
             run: 1,
             delivery: Delivery::PushPull,
+            priority: 0,
         }
     }
 

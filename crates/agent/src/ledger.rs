@@ -367,6 +367,7 @@ impl TaskRecord {
             wanted: Wanted::Running,
             run: run.run,
             delivery: Delivery::default(),
+            priority: 0,
         };
         let mut record = Self::new(order, now_ms);
         record.active = Some(run);
@@ -542,6 +543,7 @@ mod tests {
             wanted: Wanted::Running,
             run: 1,
             delivery: Delivery::PushPull,
+            priority: 0,
         }
     }
 

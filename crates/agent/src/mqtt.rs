@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use rumqttc::{AsyncClient, ConnectReturnCode, ConnectionError, Event, LastWill, MqttOptions, Outgoing, Packet, QoS};
 use task_proto::RobotId;
-use task_proto::desired::{Doorbell, MAX_PUSHED_ENVELOPE_BYTES};
+use task_proto::desired::{Doorbell, MAX_DOORBELL_BYTES};
 use task_proto::report::Status;
 use task_proto::request::Request;
 use task_proto::topic::{RobotTopic, Topic, TopicPrefix};
@@ -199,7 +199,7 @@ impl Session<'_> {
             return;
         }
         match serde_json::from_slice::<Doorbell>(payload) {
-            Ok(Doorbell::State(envelope)) => {
+            Ok(Doorbell::State { envelope, .. }) => {
                 // The driver ends before this task: nobody listens only when the agent ends.
                 let _ = self.heard.send(Heard::Desired(Box::new(envelope))).await;
             }
@@ -269,7 +269,7 @@ fn options(access: &MqttAccess) -> MqttOptions {
     options.set_clean_session(true);
     options.set_keep_alive(KEEP_ALIVE);
     // Base64 and JSON around the payload are counted in the limit, topic and header are not.
-    options.set_max_packet_size(MAX_PUSHED_ENVELOPE_BYTES + 4096, MAX_SENT_BYTES);
+    options.set_max_packet_size(MAX_DOORBELL_BYTES + 4096, MAX_SENT_BYTES);
     let will = status_payload(access, false);
     options.set_last_will(LastWill::new(topic_name(access, RobotTopic::Status), will, QoS::AtLeastOnce, false));
     options

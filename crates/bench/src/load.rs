@@ -8,8 +8,7 @@ use anyhow::{Context as _, anyhow, ensure};
 use clap::Args;
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use reqwest::Url;
-use task_proto::api::{CreateDeployment, CreateEnrollmentToken, EnrollRequest, PhaseCount};
-use task_proto::desired::Delivery;
+use task_proto::api::{CreateDeployment, CreateEnrollmentToken, DeliveryChoice, EnrollRequest, PhaseCount};
 use task_proto::id::Labels;
 use task_proto::report::Phase as TaskPhase;
 use task_proto::token::Token;
@@ -199,7 +198,8 @@ impl Load {
             package,
             manifest,
             selector: self.label().parse()?,
-            delivery: Delivery::PushPull,
+            delivery: DeliveryChoice::PushPull,
+            priority: 0,
             batch: None,
             max_failures: None,
             expires_in_s: None,

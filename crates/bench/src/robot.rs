@@ -8,7 +8,7 @@ use rumqttc::{
     AsyncClient, Event, EventLoop, Incoming, LastWill, MqttOptions, NetworkOptions, Outgoing, QoS, SubscribeReasonCode,
 };
 use task_proto::api::EnrollResponse;
-use task_proto::desired::{DesiredState, DesiredTask, Doorbell, MAX_PUSHED_ENVELOPE_BYTES};
+use task_proto::desired::{DesiredState, DesiredTask, Doorbell, MAX_DOORBELL_BYTES};
 use task_proto::envelope::{DESIRED_STATE_TYPE, PublicKey};
 use task_proto::report::{ActiveVersion, HostFacts, Phase, Report, Status, TaskReport};
 use task_proto::topic::{RobotTopic, Topic};
@@ -168,6 +168,7 @@ impl Robot {
             phase,
             phase_ms: 0,
             progress: None,
+            missing_parts: None,
             attempts: 1,
             restarts: 0,
             failure: None,
@@ -193,6 +194,7 @@ impl Robot {
                 ..HostFacts::default()
             },
             conditions: Vec::new(),
+            link: None,
             tasks: self.order.iter().map(|(_, ordered)| task(ordered)).collect(),
         }
     }
@@ -207,7 +209,7 @@ impl Identity {
         let mut options = MqttOptions::new(self.enrolled.robot_id.as_str(), &self.host, self.port);
         options.set_credentials(self.enrolled.robot_id.as_str(), &self.enrolled.token);
         options.set_keep_alive(KEEP_ALIVE);
-        options.set_max_packet_size(2 * MAX_PUSHED_ENVELOPE_BYTES, MAX_PUSHED_ENVELOPE_BYTES);
+        options.set_max_packet_size(MAX_DOORBELL_BYTES + 4096, MAX_DOORBELL_BYTES);
         options.set_last_will(LastWill::new(self.topic(RobotTopic::Status), will, QoS::AtLeastOnce, false));
         options
     }
@@ -215,7 +217,7 @@ impl Identity {
     /// The state in a message on the `desired` topic, verified.
     fn open(&self, payload: &[u8]) -> Result<DesiredState, String> {
         let doorbell = serde_json::from_slice(payload).map_err(|error| format!("not a desired state: {error}"))?;
-        let Doorbell::State(envelope) = doorbell else {
+        let Doorbell::State { envelope, .. } = doorbell else {
             return Err("a desired state was too large for a message".to_owned());
         };
         let payload = envelope.open(DESIRED_STATE_TYPE, &self.key).map_err(|error| error.to_string())?;

@@ -1,17 +1,19 @@
 //! Bodies of the HTTP API under `/api/v1`. Times are milliseconds since the Unix epoch by the server's clock, sizes are
 //! bytes. Unknown fields are tolerated in answers; requests are checked by the server.
 
+mod delivery;
 mod logs;
 
 use serde::{Deserialize, Serialize};
 
+pub use self::delivery::{DeliveryChoice, DeliveryDecision, MAX_PRIORITY, MIN_PRIORITY};
 pub use self::logs::{LogEvent, LogsFrom, LogsQuery, LogsView};
-use crate::desired::{Delivery, PackageRef, Wanted};
+use crate::desired::{PackageRef, Wanted};
 use crate::envelope::PublicKey;
 use crate::id::Labels;
 use crate::manifest::{TaskKind, TaskManifest};
 use crate::output::OutputSet;
-use crate::report::{ActiveVersion, Condition, Failure, HostFacts, Phase, Progress};
+use crate::report::{ActiveVersion, Condition, Failure, HostFacts, LinkFacts, Phase, Progress};
 use crate::selector::Selector;
 use crate::topic::TopicPrefix;
 use crate::{DeploymentId, Digest, Generation, MacAddress, RobotId, RobotName, TaskName, Version};
@@ -200,6 +202,9 @@ pub struct RobotView {
     pub conditions: Vec<Condition>,
     /// What it said of its machine.
     pub host: Option<HostFacts>,
+    /// What it measured of its way to the server.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub link: Option<LinkFacts>,
     /// Its tasks, sorted by name.
     pub tasks: Vec<RobotTask>,
     /// Its MQTT connection, if it has one; only in `GET /robots/{robot}`.
@@ -316,8 +321,11 @@ pub struct CreateDeployment {
     /// Which robots; resolved once, now.
     pub selector: Selector,
     /// How the bytes should travel.
-    #[serde(default, deserialize_with = "known_delivery")]
-    pub delivery: Delivery,
+    #[serde(default)]
+    pub delivery: DeliveryChoice,
+    /// From -100 to 100: the higher comes first, on the robot and where transfers have to wait.
+    #[serde(default)]
+    pub priority: i32,
     /// How many robots at a time; absent: all at once.
     #[serde(default)]
     pub batch: Option<u64>,
@@ -330,20 +338,6 @@ pub struct CreateDeployment {
     /// Only say which robots it would be. Stores nothing, needs no key.
     #[serde(default)]
     pub dry_run: bool,
-}
-
-/// An order names a way that exists; only what a robot reads may name one that is newer than its reader.
-fn known_delivery<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Delivery, D::Error> {
-    #[derive(Deserialize)]
-    #[serde(rename_all = "kebab-case")]
-    enum Known {
-        Poll,
-        PushPull,
-    }
-    Known::deserialize(deserializer).map(|known| match known {
-        Known::Poll => Delivery::Poll,
-        Known::PushPull => Delivery::PushPull,
-    })
 }
 
 /// Answer to a dry run, and to an order on tasks: the robots meant.
@@ -382,8 +376,11 @@ pub struct DeploymentView {
     pub kind: TaskKind,
     /// The selector as it was given.
     pub selector: Selector,
-    /// How the bytes travel.
-    pub delivery: Delivery,
+    /// How the bytes travel, as it was ordered.
+    pub delivery: DeliveryChoice,
+    /// The higher comes first.
+    #[serde(default)]
+    pub priority: i32,
     /// Where it stands as a whole.
     pub state: DeploymentState,
     /// Robots at a time.
@@ -437,6 +434,9 @@ pub struct AssignmentView {
     pub online: bool,
     /// Whether its batch has begun.
     pub released: bool,
+    /// How its bytes travel, and why; absent until its batch begins.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub delivery: Option<DeliveryDecision>,
     /// Where it stands.
     pub phase: Phase,
     /// How far the phase has come.

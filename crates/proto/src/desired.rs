@@ -1,6 +1,11 @@
 //! The state a robot should be in: one signed document per robot and generation, and how it is announced.
 //! Whatever is absent from the document should be absent from the robot.
 
+use std::collections::BTreeMap;
+use std::fmt;
+
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
 use serde::{Deserialize, Serialize};
 
 use crate::envelope::Envelope;
@@ -8,6 +13,8 @@ use crate::{DeploymentId, Digest, Generation, RobotId, TaskName, Version};
 
 /// The largest [`Envelope`], in bytes of JSON, that travels inside an MQTT message; above it only the generation does.
 pub const MAX_PUSHED_ENVELOPE_BYTES: usize = 64 * 1024;
+/// The largest [`Doorbell`], in bytes of JSON: an envelope and the blobs that ride beside it.
+pub const MAX_DOORBELL_BYTES: usize = 128 * 1024;
 
 /// Everything one robot should run. Travels as the payload of an [`Envelope`].
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -40,6 +47,13 @@ pub struct DesiredTask {
     /// How the bytes should travel.
     #[serde(default)]
     pub delivery: Delivery,
+    /// What the robot does first: the highest. From -100 to 100.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub priority: i32,
+}
+
+fn is_zero(priority: &i32) -> bool {
+    *priority == 0
 }
 
 /// A package pinned by digest.
@@ -77,15 +91,37 @@ pub enum Wanted {
 }
 
 /// How a package's bytes travel to a robot.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Delivery {
     /// Nothing is published; the robot asks on its own timer.
     Poll,
+    /// The bytes come as parts on the package's topic, see [`crate::part`].
+    DirectPush,
+    /// They ride beside the state, see [`Inline`].
+    Inline,
     /// MQTT pushes the link, the robot pulls over HTTP. Also what an agent does with a mechanism it does not know.
     #[default]
     #[serde(other)]
     PushPull,
+}
+
+impl Delivery {
+    /// The mechanism as it is written on the wire.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Poll => "poll",
+            Self::DirectPush => "direct-push",
+            Self::Inline => "inline",
+            Self::PushPull => "push-pull",
+        }
+    }
+}
+
+impl fmt::Display for Delivery {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(self.as_str())
+    }
 }
 
 /// What the server publishes on a robot's `desired` topic.
@@ -93,10 +129,88 @@ pub enum Delivery {
 #[serde(untagged)]
 pub enum Doorbell {
     /// The whole signed state.
-    State(Envelope),
+    State {
+        /// The state.
+        #[serde(flatten)]
+        envelope: Envelope,
+        /// Blobs that it names.
+        #[serde(default, skip_serializing_if = "Inline::is_empty")]
+        inline: Inline,
+    },
     /// Too large for a message: the robot GETs it.
     Notice {
         /// The generation that waits.
         generation: Generation,
     },
+}
+
+/// Blobs that ride beside a signed state, in base64. They are not signed: they are only reached by the digest that the
+/// state names, which they must hash to.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Inline(BTreeMap<Digest, Vec<u8>>);
+
+impl Inline {
+    /// Adds a blob under its digest.
+    pub fn insert(&mut self, digest: Digest, bytes: Vec<u8>) {
+        self.0.insert(digest, bytes);
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    /// The bytes of `blob`, if they came along and are what it says.
+    pub fn get(&self, blob: &BlobRef) -> Option<&[u8]> {
+        let bytes = self.0.get(&blob.digest)?;
+        (bytes.len() as u64 == blob.size && Digest::of(bytes) == blob.digest).then_some(bytes)
+    }
+}
+
+impl Serialize for Inline {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_map(self.0.iter().map(|(digest, bytes)| (digest, STANDARD.encode(bytes))))
+    }
+}
+
+/// What can't be read is passed over, for the state beside it counts all the same.
+impl<'de> Deserialize<'de> for Inline {
+    fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let given: BTreeMap<String, serde_json::Value> = Deserialize::deserialize(deserializer)?;
+        let readable = given
+            .into_iter()
+            .filter_map(|(digest, text)| Some((digest.parse().ok()?, STANDARD.decode(text.as_str()?).ok()?)));
+        Ok(Self(readable.collect()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn blob(bytes: &[u8]) -> BlobRef {
+        BlobRef { digest: Digest::of(bytes), size: bytes.len() as u64 }
+    }
+
+    #[test]
+    fn bytes_that_ride_along_are_only_reached_if_they_are_what_the_state_names() {
+        let mut inline = Inline::default();
+        inline.insert(Digest::of(b"true"), b"true".to_vec());
+        inline.insert(Digest::of(b"other"), b"false".to_vec());
+        let read: Inline = serde_json::from_value(serde_json::to_value(&inline).expect("json")).expect("reads");
+        assert_eq!(read, inline);
+        assert_eq!(read.get(&blob(b"true")), Some(&b"true"[..]));
+        assert_eq!(read.get(&blob(b"other")), None);
+        assert_eq!(read.get(&blob(b"absent")), None);
+        assert_eq!(read.get(&BlobRef { size: 5, ..blob(b"true") }), None);
+    }
+
+    #[test]
+    fn what_rides_along_and_can_not_be_read_is_passed_over() {
+        let good = Digest::of(b"x").to_string();
+        let value = serde_json::json!({"sha512:00": "eA==", "x": 7, good: "eA==", Digest::of(b"y").to_string(): "!"});
+        let read: Inline = serde_json::from_value(value).expect("reads");
+        assert_eq!(read.get(&blob(b"x")), Some(&b"x"[..]));
+        assert_eq!(read.0.len(), 1);
+    }
 }

@@ -10,6 +10,7 @@ pub mod log;
 pub mod manifest;
 pub mod oci;
 pub mod output;
+pub mod part;
 pub mod report;
 pub mod request;
 pub mod ros;

@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::desired::{PackageRef, Wanted};
 use crate::manifest::TaskKind;
+use crate::part::PartRange;
 use crate::{DeploymentId, Generation, InstanceId, MacAddress, RobotId, TaskName, Version};
 
 /// A robot's whole state. A later one replaces an earlier one; (start, seq) says which is later.
@@ -32,8 +33,27 @@ pub struct Report {
     /// Everything out of the ordinary that concerns the robot as a whole.
     #[serde(default)]
     pub conditions: Vec<Condition>,
+    /// The robot's way to the server, once something was measured.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub link: Option<LinkFacts>,
     /// All tasks in the ledger, sorted by name.
     pub tasks: Vec<TaskReport>,
+}
+
+/// What earlier transfers have shown of a robot's way to the server.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct LinkFacts {
+    /// Moving average of fetches; absent before the first that was long enough to measure.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub throughput_bytes_per_s: Option<u64>,
+    /// Moving average of the time from a request to the first byte of its answer; absent before the first.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rtt_ms: Option<u32>,
+    /// Sessions that were lost in the last hour.
+    pub reconnects: u32,
+    /// Transfers that broke off in the last hour.
+    pub losses: u32,
 }
 
 /// What the agent found out about its machine.
@@ -60,6 +80,9 @@ pub struct HostFacts {
     /// What keeps tasks from using more than their limits.
     #[serde(default)]
     pub isolation: Isolation,
+    /// What is left of its battery; absent where it has none that can be read.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub battery_percent: Option<u8>,
 }
 
 /// How tasks on a robot meet ROS.
@@ -122,6 +145,10 @@ pub struct TaskReport {
     /// How far the phase has come, where that is known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub progress: Option<Progress>,
+    /// While the package's parts are awaited: the first runs of those it lacks, at most
+    /// [`crate::part::MAX_MISSING_RANGES`]. Empty: it listens and asks for nothing yet. Absent: it does not listen.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub missing_parts: Option<Vec<PartRange>>,
     /// Tries of the current phase, from 1.
     #[serde(default)]
     pub attempts: u32,

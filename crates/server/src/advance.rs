@@ -30,7 +30,7 @@ pub async fn advance(
                 // Robots that are to ask by themselves are not rung.
                 let told = match released.delivery {
                     Delivery::Poll => &mut consequences.robots,
-                    Delivery::PushPull => &mut consequences.rings,
+                    Delivery::PushPull | Delivery::DirectPush | Delivery::Inline => &mut consequences.rings,
                 };
                 told.extend(released.robots);
                 waiting.extend(released.superseded);

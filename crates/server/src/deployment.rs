@@ -111,6 +111,7 @@ mod tests {
             phase,
             phase_ms: 0,
             progress: None,
+            missing_parts: None,
             attempts: 0,
             restarts: 0,
             failure: None,

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use task_proto::RobotId;
-use task_proto::desired::{Doorbell, MAX_PUSHED_ENVELOPE_BYTES};
+use task_proto::desired::{Doorbell, Inline, MAX_PUSHED_ENVELOPE_BYTES};
 use tokio_util::sync::CancellationToken;
 
 use crate::actions::{Actions, Desired};
@@ -78,7 +78,7 @@ impl Downlink {
 }
 
 fn payload(desired: &Desired) -> Result<Bytes, serde_json::Error> {
-    let whole = serde_json::to_vec(&Doorbell::State(desired.envelope.clone()))?;
+    let whole = serde_json::to_vec(&Doorbell::State { envelope: desired.envelope.clone(), inline: Inline::default() })?;
     if whole.len() <= MAX_PUSHED_ENVELOPE_BYTES {
         return Ok(whole.into());
     }
@@ -99,7 +99,7 @@ mod tests {
             envelope: Envelope::seal(DESIRED_STATE_TYPE, &vec![b' '; bytes], &key),
         };
         let parsed = |desired: &Desired| serde_json::from_slice::<Doorbell>(&payload(desired).expect("json"));
-        assert!(matches!(parsed(&desired(40_000)).expect("json"), Doorbell::State(_)));
+        assert!(matches!(parsed(&desired(40_000)).expect("json"), Doorbell::State { .. }));
         let notice = parsed(&desired(MAX_PUSHED_ENVELOPE_BYTES)).expect("json");
         assert_eq!(notice, Doorbell::Notice { generation: Generation(12) });
     }

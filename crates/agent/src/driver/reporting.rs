@@ -38,6 +38,7 @@ impl<E: Effects> Driver<E> {
             uptime_ms: u64::try_from(self.started.elapsed().as_millis()).unwrap_or(u64::MAX),
             host: self.effects.host_facts(),
             conditions: self.all_conditions(),
+            link: None,
             tasks: tasks.map(|(task, record)| task_report(task, record, self.views.get(task), now_ms)).collect(),
         }
     }
@@ -123,6 +124,7 @@ fn task_report(task: &TaskName, record: &TaskRecord, view: Option<&View>, now_ms
         phase: if unpacking { Phase::Unpacking } else { phase },
         phase_ms: now_ms.saturating_sub(record.phase_since_ms),
         progress: progress.filter(|_| !unpacking),
+        missing_parts: None,
         attempts: record.preparation.attempts,
         restarts: for_order.map_or(0, |active| active.restarts),
         failure: failure.cloned(),

@@ -27,6 +27,7 @@ fn order(version: &str) -> DesiredTask {
         wanted: Wanted::Running,
         run: 1,
         delivery: Delivery::PushPull,
+        priority: 0,
     }
 }
 

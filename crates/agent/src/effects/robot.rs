@@ -244,6 +244,7 @@ impl Effects for Robot {
             ros_distros: installation::all_distros(&installations),
             disk_free_bytes: disk::room(self.data.root()).map_or(0, |room| room.free),
             ros: environment::ros_facts(&installations, &self.environment),
+            battery_percent: None,
             isolation: if isolates { Isolation::Cgroup } else { Isolation::None },
         }
     }

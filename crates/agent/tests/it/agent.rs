@@ -195,6 +195,7 @@ async fn a_report_is_sent_again_until_it_is_stored() {
         uptime_ms: 0,
         host: HostFacts::default(),
         conditions: Vec::new(),
+        link: None,
         tasks: Vec::new(),
     };
     shared.reports.send_replace(Some(Arc::new(report)));

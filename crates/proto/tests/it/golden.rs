@@ -9,10 +9,11 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 use task_proto::api::{
-    CreateDeployment, EnrollRequest, EnrollResponse, ErrorBody, Event, LogEvent, LogsFrom, LogsView, MqttConnection,
-    MqttEndpoint, MqttTraffic, OutputList, OutputView, ReportReply, RobotToken, ServerInfo, Traffic,
+    CreateDeployment, DeliveryChoice, DeliveryDecision, EnrollRequest, EnrollResponse, ErrorBody, Event, LogEvent,
+    LogsFrom, LogsView, MqttConnection, MqttEndpoint, MqttTraffic, OutputList, OutputView, ReportReply, RobotToken,
+    ServerInfo, Traffic,
 };
-use task_proto::desired::{BlobRef, Delivery, DesiredState, DesiredTask, Doorbell, PackageRef, Wanted};
+use task_proto::desired::{BlobRef, Delivery, DesiredState, DesiredTask, Doorbell, Inline, PackageRef, Wanted};
 use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
 use task_proto::log::{LogBatch, LogLevel, LogLine, LogSource};
 use task_proto::manifest::{
@@ -20,9 +21,10 @@ use task_proto::manifest::{
 };
 use task_proto::oci::ImageManifest;
 use task_proto::output::{OutputFile, OutputSet};
+use task_proto::part::{Part, PartRange};
 use task_proto::report::{
-    ActiveVersion, Condition, Failure, FailureCode, HostFacts, Isolation, Phase, Progress, Report, RosFacts, Status,
-    TaskReport,
+    ActiveVersion, Condition, Failure, FailureCode, HostFacts, Isolation, LinkFacts, Phase, Progress, Report, RosFacts,
+    Status, TaskReport,
 };
 use task_proto::request::{Answer, Ask, Outcome, Refusal, Reply, Request};
 use task_proto::ros::{Endpoint, LifecycleState, NodeDetail, NodeSummary, Parameter, TopicSummary, Transition};
@@ -64,6 +66,7 @@ fn desired_state() -> DesiredState {
             wanted: Wanted::Running,
             run: 1,
             delivery: Delivery::PushPull,
+            priority: 5,
         }],
     }
 }
@@ -91,8 +94,10 @@ fn report() -> Report {
                 localhost_only: false,
             }),
             isolation: Isolation::Cgroup,
+            battery_percent: Some(80),
         },
         conditions: vec![Condition { code: "held".to_owned(), text: "held at the robot".to_owned() }],
+        link: Some(LinkFacts { throughput_bytes_per_s: Some(2_400_000), rtt_ms: Some(31), reconnects: 1, losses: 2 }),
         tasks: vec![
             TaskReport {
                 task: parsed("mapper"),
@@ -104,6 +109,7 @@ fn report() -> Report {
                 phase: Phase::Fetching,
                 phase_ms: 1_500,
                 progress: Some(Progress { done: 1, total: 7 }),
+                missing_parts: Some(vec![PartRange { from: 0, to: 0 }, PartRange { from: 3, to: 5 }]),
                 attempts: 1,
                 restarts: 0,
                 failure: None,
@@ -120,6 +126,7 @@ fn report() -> Report {
                 phase: Phase::Failed,
                 phase_ms: 9_000,
                 progress: None,
+                missing_parts: None,
                 attempts: 3,
                 restarts: 1,
                 failure: Some(Failure::new(FailureCode::BUILD_FAILED, "colcon build ended with status 1")),
@@ -184,11 +191,8 @@ fn check<T: Serialize + DeserializeOwned + PartialEq + Debug>(name: &str, value:
 }
 
 fn check_text<T: Serialize + DeserializeOwned>(name: &str, value: &T) {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden").join(name);
     let written = serde_json::to_string_pretty(value).expect("json") + "\n";
-    if std::env::var_os("UPDATE_GOLDEN").is_some() {
-        std::fs::write(&path, &written).expect("golden file written");
-    }
+    update_golden(name, &written);
     assert_eq!(written, golden(name), "{name} has changed on the wire");
     serde_json::from_str::<T>(&written).expect("reads what it wrote");
 }
@@ -198,6 +202,13 @@ fn check_tolerance<T: DeserializeOwned + PartialEq + Debug>(name: &str) {
     let value: Value = serde_json::from_str(&golden(name)).expect("json");
     let now: T = serde_json::from_value(value.clone()).expect("reads its own");
     assert_eq!(serde_json::from_value::<T>(from_the_future(&value)).expect("reads the future"), now, "{name}");
+}
+
+fn update_golden(name: &str, written: &str) {
+    if std::env::var_os("UPDATE_GOLDEN").is_some() {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden").join(name);
+        std::fs::write(path, written).expect("golden file written");
+    }
 }
 
 fn golden(name: &str) -> String {
@@ -211,7 +222,11 @@ fn documents_between_server_and_robot() {
     let state = desired_state();
     check("desired_state.json", &state);
     let envelope = Envelope::seal(DESIRED_STATE_TYPE, &serde_json::to_vec(&state).expect("json"), &key);
-    check("doorbell_state.json", &Doorbell::State(envelope.clone()));
+    check("doorbell_state.json", &Doorbell::State { envelope: envelope.clone(), inline: Inline::default() });
+    let mut inline = Inline::default();
+    inline.insert(blob("config").digest, b"config".to_vec());
+    inline.insert(blob("content").digest, b"content".to_vec());
+    check("doorbell_inline.json", &Doorbell::State { envelope: envelope.clone(), inline });
     check("doorbell_notice.json", &Doorbell::Notice { generation: Generation(8) });
     check("report.json", &report());
     check("status.json", &Status { online: true, start: 3, instance: parsed("i00000000000000c3"), connection: 2 });
@@ -224,6 +239,7 @@ fn documents_between_server_and_robot() {
 
     check_tolerance::<DesiredState>("desired_state.json");
     check_tolerance::<Doorbell>("doorbell_state.json");
+    check_tolerance::<Doorbell>("doorbell_inline.json");
     check_tolerance::<Doorbell>("doorbell_notice.json");
     check_tolerance::<Report>("report.json");
     check_tolerance::<Status>("status.json");
@@ -341,13 +357,36 @@ fn documents_of_the_api() {
             package: parsed("talker"),
             manifest: Digest::of(b"manifest"),
             selector: parsed("site=lab"),
-            delivery: Delivery::PushPull,
+            delivery: DeliveryChoice::Adaptive,
+            priority: 0,
             batch: Some(10),
             max_failures: Some(1),
             expires_in_s: None,
             dry_run: false,
         },
     );
+}
+
+#[test]
+fn a_decision_about_the_delivery() {
+    let decision = DeliveryDecision {
+        mechanism: Delivery::DirectPush,
+        rule: "many small".to_owned(),
+        because: "size 20 KB ≤ 256 KB, robots 40 ≥ 8".to_owned(),
+    };
+    check("delivery_decision.json", &decision);
+    check_tolerance::<DeliveryDecision>("delivery_decision.json");
+}
+
+/// The last part of a blob of 1,030 bytes, in hexadecimal digits.
+#[test]
+fn a_part_of_a_package() {
+    let blob: Vec<u8> = (0..1030).map(|at| (at % 256) as u8).collect();
+    let part = Part { index: 1, count: 2, part_bytes: 1024, bytes: &blob[1024..] };
+    let written = part.encode().iter().map(|byte| format!("{byte:02x}")).collect::<String>() + "\n";
+    update_golden("part.hex", &written);
+    assert_eq!(written, golden("part.hex"), "parts have changed on the wire");
+    assert_eq!(Part::decode(&part.encode(), blob.len() as u64), Ok(part));
 }
 
 #[test]

@@ -4,8 +4,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::{Args, ValueEnum};
-use task_proto::api::{CreateDeployment, DeploymentView, MatchedRobot, MatchedRobots};
-use task_proto::desired::Delivery;
+use task_proto::api::{CreateDeployment, DeliveryChoice, DeploymentView, MatchedRobot, MatchedRobots};
 use task_proto::selector::Selector;
 
 use super::confirm::confirm;
@@ -94,9 +93,10 @@ pub(super) async fn run(session: &Session, push: Push) -> Result<Outcome, Comman
         manifest: packed.package.manifest.digest,
         selector,
         delivery: match push.delivery {
-            DeliveryName::PushPull => Delivery::PushPull,
-            DeliveryName::Poll => Delivery::Poll,
+            DeliveryName::PushPull => DeliveryChoice::PushPull,
+            DeliveryName::Poll => DeliveryChoice::Poll,
         },
+        priority: 0,
         batch: push.batch,
         max_failures: push.max_failures,
         expires_in_s: push.expires.map(|expires| expires.as_secs()),

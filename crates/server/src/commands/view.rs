@@ -120,6 +120,7 @@ mod tests {
             name: "atlas".parse().expect("a name"),
             online: true,
             released: true,
+            delivery: None,
             phase,
             progress: None,
             failure: reason.map(|reason| Failure::new(FailureCode::GATE_REFUSED, reason)),

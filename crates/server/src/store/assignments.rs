@@ -5,6 +5,7 @@
 use std::collections::BTreeSet;
 
 use sqlx::{AssertSqlSafe, Row as _};
+use task_proto::api::DeliveryChoice;
 use task_proto::desired::Delivery;
 use task_proto::report::Phase;
 use task_proto::{DeploymentId, RobotId, TaskName};
@@ -149,7 +150,8 @@ impl Write {
             .bind(deployment.as_str())
             .fetch_one(self.connection())
             .await?;
-        let delivery = from_word("deployments.delivery", &delivery)?;
+        let choice: DeliveryChoice = from_word("deployments.delivery", &delivery)?;
+        let delivery = choice.mechanism().unwrap_or_default();
         Ok(Released { robots, superseded: deployments(superseded)?, delivery })
     }
 

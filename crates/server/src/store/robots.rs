@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 
 use sqlx::{AssertSqlSafe, Row as _};
-use task_proto::api::{RobotTask, RobotView};
+use task_proto::api::{DeliveryChoice, RobotTask, RobotView};
 use task_proto::desired::{DesiredTask, PackageRef};
 use task_proto::id::Labels;
 use task_proto::report::{Condition, Phase, Report};
@@ -256,13 +256,15 @@ fn known_robot(row: &sqlx::any::AnyRow) -> Result<KnownRobot, StoreError> {
 
 fn desired_task(row: &sqlx::any::AnyRow) -> Result<Option<DesiredTask>, StoreError> {
     let Some(task) = row.try_get::<Option<String>, _>("task")? else { return Ok(None) };
+    let choice: DeliveryChoice = from_word("deployments.delivery", row.try_get("delivery")?)?;
     Ok(Some(DesiredTask {
         task: id("assignments.task", &task)?,
         deployment: id("assignments.deployment_id", row.try_get("deployment_id")?)?,
         package: from_json("deployments.package", row.try_get("package")?)?,
         wanted: from_word("assignments.wanted", row.try_get("wanted")?)?,
         run: number(row.try_get("run")?),
-        delivery: from_word("deployments.delivery", row.try_get("delivery")?)?,
+        delivery: choice.mechanism().unwrap_or_default(),
+        priority: 0,
     }))
 }
 
@@ -291,10 +293,11 @@ fn robot_view(row: &sqlx::any::AnyRow, mut tasks: Vec<RobotTask>) -> Result<Robo
         );
         conditions.push(Condition { code: "diverged".to_owned(), text });
     }
-    let (mut host, mut reported) = (None, Vec::new());
+    let (mut host, mut link, mut reported) = (None, None, Vec::new());
     if let Some(report) = report {
         conditions.extend(report.conditions);
         host = Some(report.host);
+        link = report.link;
         reported = report.tasks;
     }
     tasks.sort_by(|one, other| one.task.cmp(&other.task));
@@ -318,6 +321,7 @@ fn robot_view(row: &sqlx::any::AnyRow, mut tasks: Vec<RobotTask>) -> Result<Robo
         observed_generation,
         conditions,
         host,
+        link,
         tasks,
         mqtt: None,
     })

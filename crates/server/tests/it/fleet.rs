@@ -2,8 +2,10 @@
 
 use std::collections::BTreeMap;
 
-use task_proto::api::{CreateDeployment, CreateEnrollmentToken, DeploymentView, EnrollRequest, PackageView, RobotView};
-use task_proto::desired::{BlobRef, Delivery, DesiredState, DesiredTask, PackageRef};
+use task_proto::api::{
+    CreateDeployment, CreateEnrollmentToken, DeliveryChoice, DeploymentView, EnrollRequest, PackageView, RobotView,
+};
+use task_proto::desired::{BlobRef, DesiredState, DesiredTask, PackageRef};
 use task_proto::envelope::{DESIRED_STATE_TYPE, SigningKey};
 use task_proto::manifest::{TaskKind, TaskManifest};
 use task_proto::report::{HostFacts, Phase, Report, TaskReport};
@@ -134,6 +136,7 @@ impl Robot {
             uptime_ms: 1,
             host: HostFacts::default(),
             conditions: Vec::new(),
+            link: None,
             tasks: self.tasks.values().cloned().collect(),
         }
     }
@@ -150,6 +153,7 @@ pub fn task_report(task: &DesiredTask, phase: Phase) -> TaskReport {
         phase,
         phase_ms: 0,
         progress: None,
+        missing_parts: None,
         attempts: 1,
         restarts: 0,
         failure: None,
@@ -192,7 +196,8 @@ pub fn order_of(package: &PackageView) -> CreateDeployment {
         package: package.package.name.clone(),
         manifest: package.package.manifest.digest,
         selector: "*".parse().expect("a selector"),
-        delivery: Delivery::default(),
+        delivery: DeliveryChoice::default(),
+        priority: 0,
         batch: None,
         max_failures: None,
         expires_in_s: None,

@@ -192,6 +192,7 @@ impl TestRobot {
             uptime_ms: 1_000,
             host: HostFacts { hostname: "host".to_owned(), ..HostFacts::default() },
             conditions: Vec::new(),
+            link: None,
             tasks: state.tasks.iter().map(|task| in_phase(task, phase)).collect(),
         }
     }
@@ -215,6 +216,7 @@ fn in_phase(task: &DesiredTask, phase: Phase) -> TaskReport {
         phase,
         phase_ms: 10,
         progress: None,
+        missing_parts: None,
         attempts: 1,
         restarts: 0,
         failure: None,

@@ -204,7 +204,7 @@ async fn robots_that_are_to_poll_are_not_rung(database: TestDatabase) {
     let robots = fleet.enroll(2).await;
     let poll = fleet.deploy("1", |order| {
         order.selector = "r0".parse().expect("valid");
-        order.delivery = task_proto::desired::Delivery::Poll;
+        order.delivery = task_proto::api::DeliveryChoice::Poll;
     });
     let poll = poll.await;
     fleet.deploy("2", |order| order.selector = "r1".parse().expect("valid")).await;

@@ -85,7 +85,7 @@ impl Session {
                 continue;
             };
             assert_eq!(publish.topic, format!("{}/desired", self.topics));
-            let Ok(Doorbell::State(envelope)) = serde_json::from_slice(&publish.payload) else {
+            let Ok(Doorbell::State { envelope, .. }) = serde_json::from_slice(&publish.payload) else {
                 panic!("the whole state fits into a message");
             };
             let state = opened(server, &envelope).await;

@@ -137,6 +137,7 @@ pub(super) fn order(deployment: u8, package_number: u8, run: u64, wanted: Wanted
         wanted,
         run,
         delivery: Delivery::PushPull,
+        priority: 0,
     }
 }
 

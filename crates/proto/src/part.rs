@@ -1,0 +1,274 @@
+//! Parts of a blob that travels over MQTT: how a blob is cut, what each message holds, and which parts a robot lacks.
+//! A message is a binary header, big endian, and then the part's bytes:
+//!
+//! ```text
+//!  0        1         2              6              10                14
+//!  ┌────────┬─────────┬──────────────┬──────────────┬─────────────────┬─────────────┐
+//!  │ u8 = 1 │ u8 = 0  │ u32 index    │ u32 count    │ u32 part_bytes  │ bytes …     │
+//!  └────────┴─────────┴──────────────┴──────────────┴─────────────────┴─────────────┘
+//!   version  reserved   from 0         of the blob    of all but the last
+//! ```
+//! The header is not signed. A receiver measures it against the blob's size, which comes from the signed state, and the
+//! whole against the digest.
+
+use std::ops::{Range, RangeInclusive};
+
+use serde::{Deserialize, Serialize};
+
+/// The header's length in bytes.
+pub const HEADER_BYTES: usize = 14;
+/// The version that is written, and the only one that is read.
+pub const VERSION: u8 = 1;
+/// The smallest part a blob is cut into.
+pub const MIN_PART_BYTES: u32 = 1024;
+/// The largest: MQTT has no larger messages.
+pub const MAX_PART_BYTES: u32 = 256 * 1024 * 1024 - 1024;
+/// The size of parts unless the server's settings say otherwise.
+pub const DEFAULT_PART_BYTES: u32 = 64 * 1024;
+/// The most parts of one blob: whoever receives them remembers which ones it has.
+pub const MAX_PARTS: u32 = 1 << 20;
+/// The most ranges in a robot's report of what it lacks; it reports more once it has those.
+pub const MAX_MISSING_RANGES: usize = 64;
+
+/// How a blob is cut into parts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Cut {
+    size: u64,
+    part_bytes: u32,
+    count: u32,
+}
+
+/// One part as it travels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Part<'a> {
+    /// Which, from 0.
+    pub index: u32,
+    /// Of how many.
+    pub count: u32,
+    /// The size of every part but the last.
+    pub part_bytes: u32,
+    /// Its bytes.
+    pub bytes: &'a [u8],
+}
+
+/// A run of parts that a robot lacks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub struct PartRange {
+    /// The first, from 0.
+    pub from: u32,
+    /// The last; it is lacking too.
+    pub to: u32,
+}
+
+/// Why something is not a part, or no part of this blob.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum PartError {
+    /// It is shorter than a header.
+    #[error("a part of {0} bytes has no header")]
+    Short(usize),
+    /// It was made by another version.
+    #[error("a part of version {0}, expected {VERSION}")]
+    Version(u8),
+    /// A blob can't be cut so.
+    #[error("{size} bytes can't be cut into parts of {part_bytes}")]
+    Cut {
+        /// The blob's size.
+        size: u64,
+        /// The size of its parts.
+        part_bytes: u32,
+    },
+    /// The header contradicts itself or the blob's size.
+    #[error("part {index} of {count}, {part_bytes} bytes each, with {bytes} bytes does not belong to this blob")]
+    Foreign {
+        /// As in the header.
+        index: u32,
+        /// Likewise.
+        count: u32,
+        /// Likewise.
+        part_bytes: u32,
+        /// What came after the header.
+        bytes: usize,
+    },
+}
+
+impl Cut {
+    /// Cuts a blob of `size` bytes into parts of `part_bytes`. An empty blob has no parts.
+    pub fn new(size: u64, part_bytes: u32) -> Result<Self, PartError> {
+        let is_sized = (MIN_PART_BYTES..=MAX_PART_BYTES).contains(&part_bytes);
+        let count = size.div_ceil(u64::from(part_bytes.max(1)));
+        match u32::try_from(count) {
+            Ok(count) if is_sized && count <= MAX_PARTS => Ok(Self { size, part_bytes, count }),
+            _ => Err(PartError::Cut { size, part_bytes }),
+        }
+    }
+
+    /// How many parts there are.
+    pub fn count(&self) -> u32 {
+        self.count
+    }
+
+    /// The size of every part but the last.
+    pub fn part_bytes(&self) -> u32 {
+        self.part_bytes
+    }
+
+    /// Where in the blob the part with this index lies; empty beyond the last.
+    pub fn range(&self, index: u32) -> Range<u64> {
+        let from = (u64::from(index) * u64::from(self.part_bytes)).min(self.size);
+        from..(from + u64::from(self.part_bytes)).min(self.size)
+    }
+
+    /// The header of the part with this index.
+    pub fn header(&self, index: u32) -> [u8; HEADER_BYTES] {
+        let mut header = [0; HEADER_BYTES];
+        header[0] = VERSION;
+        header[2..6].copy_from_slice(&index.to_be_bytes());
+        header[6..10].copy_from_slice(&self.count.to_be_bytes());
+        header[10..14].copy_from_slice(&self.part_bytes.to_be_bytes());
+        header
+    }
+}
+
+impl<'a> Part<'a> {
+    /// Reads a message that came for a blob of `size` bytes, whatever its sender cut it into.
+    pub fn decode(message: &'a [u8], size: u64) -> Result<Self, PartError> {
+        let (header, bytes) = message.split_first_chunk::<HEADER_BYTES>().ok_or(PartError::Short(message.len()))?;
+        if header[0] != VERSION {
+            return Err(PartError::Version(header[0]));
+        }
+        let number = |at: usize| u32::from_be_bytes([header[at], header[at + 1], header[at + 2], header[at + 3]]);
+        let (index, count, part_bytes) = (number(2), number(6), number(10));
+        let cut = Cut::new(size, part_bytes)?;
+        let range = cut.range(index);
+        if count != cut.count || index >= count || range.end - range.start != bytes.len() as u64 {
+            return Err(PartError::Foreign { index, count, part_bytes, bytes: bytes.len() });
+        }
+        Ok(Self { index, count, part_bytes, bytes })
+    }
+
+    /// The whole message.
+    pub fn encode(&self) -> Vec<u8> {
+        let cut = Cut { size: 0, part_bytes: self.part_bytes, count: self.count };
+        [&cut.header(self.index), self.bytes].concat()
+    }
+}
+
+impl PartRange {
+    /// The first [`MAX_MISSING_RANGES`] runs in `missing`, which ascends.
+    pub fn runs(missing: impl IntoIterator<Item = u32>) -> Vec<Self> {
+        let mut runs: Vec<Self> = Vec::new();
+        for index in missing {
+            match runs.last_mut() {
+                Some(last) if last.to.checked_add(1) == Some(index) => last.to = index,
+                _ => runs.push(Self { from: index, to: index }),
+            }
+            if runs.len() > MAX_MISSING_RANGES {
+                runs.pop();
+                break;
+            }
+        }
+        runs
+    }
+
+    /// The parts meant, of a blob that has `count`: a robot's word is taken only as far as it makes sense.
+    pub fn within(&self, count: u32) -> Option<RangeInclusive<u32>> {
+        let last = count.checked_sub(1)?;
+        (self.from <= self.to && self.from <= last).then(|| self.from..=self.to.min(last))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn all_parts_together_are_the_blob(size in 0usize..20_000, part_bytes in MIN_PART_BYTES..8_192) {
+            let blob: Vec<u8> = (0..size).map(|at| (at % 251) as u8).collect();
+            let cut = Cut::new(size as u64, part_bytes).expect("cut");
+            let mut together = Vec::new();
+            for index in 0..cut.count() {
+                let range = cut.range(index);
+                let bytes = &blob[range.start as usize..range.end as usize];
+                let part = Part { index, count: cut.count(), part_bytes, bytes };
+                let message = part.encode();
+                prop_assert_eq!(&message[..HEADER_BYTES], &cut.header(index));
+                prop_assert_eq!(Part::decode(&message, size as u64), Ok(part));
+                together.extend_from_slice(bytes);
+            }
+            prop_assert_eq!(together, blob);
+            prop_assert!(cut.range(cut.count()).is_empty());
+        }
+
+        /// Whatever comes, what is accepted lies inside of the blob.
+        #[test]
+        fn hostile_messages_never_reach_beyond_the_blob(
+            message in proptest::collection::vec(any::<u8>(), 0..3_000),
+            fields in any::<[u32; 3]>(),
+            small in any::<bool>(),
+            size in any::<u64>(),
+        ) {
+            let mut message = message;
+            let size = if small { size % 4_000 } else { size };
+            if message.len() >= HEADER_BYTES {
+                message[0] = VERSION;
+                for (at, field) in [2, 6, 10].into_iter().zip(fields) {
+                    let field = if small { field % 3_000 } else { field };
+                    message[at..at + 4].copy_from_slice(&field.to_be_bytes());
+                }
+            }
+            if let Ok(part) = Part::decode(&message, size) {
+                let cut = Cut::new(size, part.part_bytes).expect("accepted");
+                let range = cut.range(part.index);
+                prop_assert!(part.index < part.count && part.count <= MAX_PARTS && range.end <= size);
+                prop_assert_eq!(range.end - range.start, part.bytes.len() as u64);
+            }
+        }
+
+        #[test]
+        fn runs_name_what_is_missing_and_nothing_else(missing in proptest::collection::btree_set(0u32..300, 0..200)) {
+            let runs = PartRange::runs(missing.iter().copied());
+            let named: Vec<u32> = runs.iter().flat_map(|run| run.within(300).expect("in order")).collect();
+            prop_assert!(runs.len() <= MAX_MISSING_RANGES);
+            prop_assert!(missing.iter().copied().zip(&named).all(|(lacking, &named)| lacking == named));
+            prop_assert!(named.len() == missing.len() || runs.len() == MAX_MISSING_RANGES);
+        }
+    }
+
+    #[test]
+    fn what_is_no_part_of_the_blob_is_refused_and_says_why() {
+        let part = Part { index: 1, count: 2, part_bytes: 1024, bytes: &[7; 76] };
+        let message = part.encode();
+        assert_eq!(Part::decode(&message, 1100), Ok(part));
+        let foreign = |index, count, bytes| PartError::Foreign { index, count, part_bytes: 1024, bytes };
+        assert_eq!(Part::decode(&message, 1101), Err(foreign(1, 2, 76)));
+        assert_eq!(Part::decode(&message, 3000), Err(foreign(1, 2, 76)));
+        assert_eq!(Part::decode(&Part { index: 2, bytes: &[], ..part }.encode(), 1100), Err(foreign(2, 2, 0)));
+        assert_eq!(Part::decode(&message[..13], 1100), Err(PartError::Short(13)));
+        let newer: Vec<u8> = [&[2], &message[1..]].concat();
+        assert_eq!(Part::decode(&newer, 1100), Err(PartError::Version(2)));
+        let tiny = Part { part_bytes: 0, ..part }.encode();
+        assert_eq!(Part::decode(&tiny, 1100), Err(PartError::Cut { size: 1100, part_bytes: 0 }));
+    }
+
+    #[test]
+    fn a_blob_is_cut_within_the_limits_only() {
+        assert_eq!(Cut::new(0, 1024).map(|cut| cut.count()), Ok(0));
+        assert_eq!(Cut::new(100_000_000, MAX_PART_BYTES).map(|cut| cut.count()), Ok(1));
+        let most = u64::from(MAX_PARTS) * 1024;
+        assert_eq!(Cut::new(most, 1024).map(|cut| cut.count()), Ok(MAX_PARTS));
+        for (size, part_bytes) in [(most + 1, 1024), (u64::MAX, MAX_PART_BYTES), (1, 1023), (1, MAX_PART_BYTES + 1)] {
+            assert_eq!(Cut::new(size, part_bytes), Err(PartError::Cut { size, part_bytes }));
+        }
+    }
+
+    #[test]
+    fn a_range_that_makes_no_sense_means_nothing() {
+        assert_eq!(PartRange { from: 3, to: u32::MAX }.within(5), Some(3..=4));
+        assert_eq!(PartRange { from: 5, to: 9 }.within(5), None);
+        assert_eq!(PartRange { from: 4, to: 3 }.within(5), None);
+        assert_eq!(PartRange { from: 0, to: 0 }.within(0), None);
+    }
+}

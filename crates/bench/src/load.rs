@@ -14,8 +14,8 @@ use task_proto::report::Phase as TaskPhase;
 use task_proto::token::Token;
 use task_proto::{DeploymentId, Digest, MacAddress, TaskName, Version};
 
+use crate::load_report::{Facts, Format, LoadReport};
 use crate::measure::{PHASE_LIMIT, Phase, Sample, every};
-use crate::report::{Facts, Format, LoadReport};
 use crate::robot::{Identity, Robot};
 use crate::server::Server;
 

@@ -1,110 +1,123 @@
-//! What a run says on stdout: a table that grows with each phase, or one JSON document in the end.
+//! A run as one HTML file that needs nothing else: no network, no script, light or dark as the reader's system is.
 
-use std::io::Write as _;
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
 
-use clap::ValueEnum;
-use serde::Serialize;
-use serde_json::json;
+use crate::axis::{unit_of_setting, written};
+use crate::plot::{mark, svg};
+use crate::run::{Point, Run};
 
-use crate::measure::Phase;
+const STYLE: &str = include_str!("report.css");
 
-/// How the result is printed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum Format {
-    /// A row for each phase, as it ends.
-    Table,
-    /// One document in the end.
-    Json,
-}
-
-/// What must be known to compare one run with another.
-#[derive(Serialize)]
-pub struct Facts {
-    /// This program's version.
-    pub taskbench: &'static str,
-    /// The server's version.
-    pub taskd: String,
-    /// The server's URL.
-    pub server: String,
-    /// Robots asked for.
-    pub robots: usize,
-    /// Seconds of steady reports.
-    pub seconds: u64,
-    /// Reports in each of them, of all robots together.
-    pub reports_per_s: u32,
-    /// Cores that this machine lets this program use. The server may be on the same machine.
-    pub cores: usize,
-}
-
-/// The result of a run, as far as it has come.
-pub struct LoadReport {
-    facts: Facts,
-    format: Format,
-    phases: Vec<Phase>,
-}
-
-impl LoadReport {
-    /// Begins with the facts.
-    pub fn begin(facts: Facts, format: Format) -> Self {
-        let Facts { taskbench, taskd, server, robots, seconds, reports_per_s, cores } = &facts;
-        if format == Format::Table {
-            print(&format!(
-                "taskbench {taskbench}, taskd {taskd} at {server}: {robots} robots, \
-                 {reports_per_s} reports/s for {seconds} s, {cores} cores here\n\n\
-                 {:<16} {:>7} {:>8} {:>9} {:>9} {:>9} {:>7}",
-                "phase", "count", "wall s", "p50 ms", "p99 ms", "max ms", "failed"
-            ));
+/// The whole page.
+pub fn page(run: &Run) -> String {
+    let mut names: Vec<&str> = Vec::new();
+    for point in &run.points {
+        if !names.contains(&point.series.as_str()) {
+            names.push(&point.series);
         }
-        Self { facts, format, phases: Vec::new() }
     }
-
-    /// Adds a phase. A phase without any success is an error: what comes after it would measure nothing.
-    pub fn add(&mut self, phase: Phase) -> anyhow::Result<()> {
-        if self.format == Format::Table {
-            print(&row(&phase));
+    let colours: BTreeMap<&str, usize> = names.iter().enumerate().map(|(number, name)| (*name, number % 8)).collect();
+    let title = escaped(&format!("taskbench {}", run.scenario));
+    let mut page = format!(
+        "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><title>{title}</title>\
+         <meta name=\"viewport\" content=\"width=device-width\"><style>{STYLE}</style></head><body><h1>{title}</h1>"
+    );
+    page.push_str(&facts(run));
+    for note in &run.notes {
+        let _ = write!(page, "<p>{}</p>", escaped(note));
+    }
+    for plot in &run.plots {
+        let Some(drawing) = svg(plot, &run.points, &colours) else { continue };
+        let shown: Vec<&str> = plot.points(&run.points).map(|point| point.series.as_str()).collect();
+        let _ = write!(page, "<figure><figcaption>{}</figcaption>{drawing}<p class=\"legend\">", escaped(&plot.title));
+        for name in names.iter().filter(|name| shown.contains(name)) {
+            let (colour, sign) = (colours[name], mark(colours[name], 7.0, 7.0));
+            let _ = write!(
+                page,
+                "<span class=\"s{colour}\"><svg viewBox=\"0 0 14 14\">{sign}</svg>{}</span>",
+                escaped(name)
+            );
         }
-        let failure = phase.failures.keys().next().filter(|_| phase.failed() == phase.count());
-        let outcome = failure.map_or(Ok(()), |text| Err(anyhow::anyhow!("{}: every step failed: {text}", phase.name)));
-        self.phases.push(phase);
-        outcome
+        page.push_str("</p></figure>");
     }
+    page.push_str(&failures(&run.points));
+    page.push_str(&table(&run.points));
+    page.push_str("</body></html>\n");
+    page
+}
 
-    /// Prints what is left to print, and gives the number of failed steps.
-    pub fn finish(&self) -> usize {
-        if self.format == Format::Json {
-            let phases: Vec<_> = self.phases.iter().map(document).collect();
-            print(&format!("{:#}", json!({ "facts": self.facts, "phases": phases })));
+/// Text that stands for itself in HTML and in its attributes.
+pub fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}
+
+fn facts(run: &Run) -> String {
+    let machine = &run.machine;
+    let memory = written(machine.memory_bytes as f64, crate::run::Unit::Bytes);
+    let versions: Vec<String> = run.versions.iter().map(|(name, version)| format!("{name} {version}")).collect();
+    let rows = [
+        ("began", run.began.clone()),
+        ("took", format!("{:.0} s", run.wall_s)),
+        ("command", format!("taskbench {}", run.command_line.join(" "))),
+        ("commit", run.commit.clone()),
+        ("versions", versions.join(", ")),
+        ("machine", format!("{}, {} cores, {memory}", machine.cpu, machine.cores)),
+        ("system", format!("{}, {}", machine.system, machine.kernel)),
+        ("seed", run.seed.to_string()),
+    ];
+    let row = |(name, value): (&str, String)| format!("<dt>{name}</dt><dd>{}</dd>", escaped(&value));
+    format!("<dl>{}</dl>", rows.map(row).concat())
+}
+
+fn failures(points: &[Point]) -> String {
+    let mut text = String::new();
+    for point in points {
+        for (failure, count) in &point.failures {
+            let where_ = escaped(&format!("{}, {}", point.series, settings(point)));
+            let _ = write!(text, "<li>{where_}: {count} × {}</li>", escaped(failure));
         }
-        self.phases.iter().map(Phase::failed).sum()
     }
+    if text.is_empty() { "<p>Nothing failed.</p>".to_owned() } else { format!("<h2>Failures</h2><ul>{text}</ul>") }
 }
 
-fn row(phase: &Phase) -> String {
-    let ms = |percent| phase.percentile_ms(percent).map_or("-".to_owned(), |ms| format!("{ms:.1}"));
-    let (wall, p50, p99, max) = (phase.wall.as_secs_f64(), ms(50), ms(99), ms(100));
-    let mut row =
-        format!("{:<16} {:>7} {wall:>8.2} {p50:>9} {p99:>9} {max:>9} {:>7}", phase.name, phase.count(), phase.failed());
-    for (text, count) in &phase.failures {
-        row.push_str(&format!("\n  {count} × {text}"));
+fn settings(point: &Point) -> String {
+    let one = |(name, value): (&String, &f64)| format!("{name} {}", written(*value, unit_of_setting(name)));
+    point.settings.iter().map(one).collect::<Vec<_>>().join(", ")
+}
+
+fn table(points: &[Point]) -> String {
+    let mut table = "<h2>All points</h2><table><thead><tr><th>series<th>settings<th>quantity<th>n<th>min<th>median<th>\
+                     p99<th>max<th>failed</tr></thead><tbody>"
+        .to_owned();
+    for point in points {
+        let begin = format!("<tr><td>{}<td>{}", escaped(&point.series), escaped(&settings(point)));
+        for (name, quantity) in &point.quantities {
+            let figures = [quantity.min, quantity.median, quantity.p99, quantity.max];
+            let figures = figures.map(|value| format!("<td>{}", written(value, quantity.unit))).concat();
+            let _ =
+                write!(table, "{begin}<td>{}<td>{}{figures}<td>{}</tr>", escaped(name), quantity.count, point.failed());
+        }
+        if point.quantities.is_empty() {
+            let _ = write!(table, "{begin}<td colspan=\"6\"><td>{}</tr>", point.failed());
+        }
     }
-    row
+    table + "</tbody></table>"
 }
 
-fn document(phase: &Phase) -> serde_json::Value {
-    json!({
-        "phase": phase.name,
-        "count": phase.count(),
-        "failed": phase.failed(),
-        "wall_s": phase.wall.as_millis() as f64 / 1000.0,
-        "p50_ms": phase.percentile_ms(50),
-        "p99_ms": phase.percentile_ms(99),
-        "max_ms": phase.percentile_ms(100),
-        "failures": phase.failures,
-    })
-}
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::run::tests::sample;
 
-/// Nobody may be reading; the run goes on, because it has to clean up.
-fn print(text: &str) {
-    let mut stdout = std::io::stdout();
-    let _ = writeln!(stdout, "{text}").and_then(|()| stdout.flush());
+    #[test]
+    fn a_page_needs_nothing_else_and_hides_no_failure() {
+        let page = page(&sample());
+        for outside in ["<script", "http:", "https:", "url(", "@import", "<link"] {
+            assert!(!page.contains(outside), "{outside}");
+        }
+        for inside in ["<figure>", "prefers-color-scheme", "a &lt;note&gt;", "1 × the client", "seed", "abc"] {
+            assert!(page.contains(inside), "{inside}");
+        }
+    }
 }

@@ -46,10 +46,12 @@ impl Server {
         Ok(Self { http, base, token: token.reveal() })
     }
 
+    /// What it is, and what went over it.
     pub async fn info(&self) -> Result<ServerInfo, ServerError> {
         read("the question for its version", self.request(Method::GET, "/api/v1/server")).await
     }
 
+    /// Makes a token that robots register with.
     pub async fn create_enrollment_token(&self, order: &CreateEnrollmentToken) -> Result<EnrollmentToken, ServerError> {
         read("an enrolment token", self.request(Method::POST, "/api/v1/enrollment-tokens").json(order)).await
     }
@@ -60,20 +62,24 @@ impl Server {
         read("an enrolment", post.json(request)).await
     }
 
+    /// The robots that a selector means.
     pub async fn robots(&self, selector: &Selector) -> Result<RobotList, ServerError> {
         let get = self.request(Method::GET, "/api/v1/robots");
         read("the list of robots", get.query(&[("selector", selector.to_string())])).await
     }
 
+    /// Removes a robot.
     pub async fn remove_robot(&self, robot: &RobotId) -> Result<(), ServerError> {
         send("a robot's removal", self.request(Method::DELETE, &format!("/api/v1/robots/{robot}"))).await.map(drop)
     }
 
+    /// Orders a package for robots.
     pub async fn order(&self, order: &CreateDeployment) -> Result<DeploymentView, ServerError> {
         let post = self.request(Method::POST, "/api/v1/deployments").header(IDEMPOTENCY_KEY, order.manifest.hex());
         read("the order", post.json(order)).await
     }
 
+    /// Where a deployment stands, robot by robot.
     pub async fn deployment(&self, id: &DeploymentId) -> Result<DeploymentView, ServerError> {
         read("the deployment", self.request(Method::GET, &format!("/api/v1/deployments/{id}"))).await
     }
@@ -106,6 +112,7 @@ impl Server {
         Ok(digest)
     }
 
+    /// Deletes a package version.
     pub async fn remove_package(&self, name: &TaskName, manifest: &Digest) -> Result<(), ServerError> {
         let delete = self.request(Method::DELETE, &format!("/v2/{name}/manifests/{manifest}"));
         send("the package's removal", delete).await.map(drop)

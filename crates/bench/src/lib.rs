@@ -1,0 +1,17 @@
+//! Measures taskd: scenarios that start real servers and simulated robots, and what they leave behind. Scenarios stand on
+//! top and never call one another; see ARCHITECTURE.md.
+
+pub mod axis;
+pub mod clock;
+pub mod load;
+pub mod load_report;
+pub mod machine;
+pub mod measure;
+pub mod plot;
+pub mod process;
+pub mod progress;
+pub mod report;
+pub mod robot;
+pub mod run;
+pub mod server;
+pub mod taskd;

@@ -1,0 +1,110 @@
+//! What a run says on stdout: a table that grows with each phase, or one JSON document in the end.
+
+use std::io::Write as _;
+
+use clap::ValueEnum;
+use serde::Serialize;
+use serde_json::json;
+
+use crate::measure::Phase;
+
+/// How the result is printed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Format {
+    /// A row for each phase, as it ends.
+    Table,
+    /// One document in the end.
+    Json,
+}
+
+/// What must be known to compare one run with another.
+#[derive(Serialize)]
+pub struct Facts {
+    /// This program's version.
+    pub taskbench: &'static str,
+    /// The server's version.
+    pub taskd: String,
+    /// The server's URL.
+    pub server: String,
+    /// Robots asked for.
+    pub robots: usize,
+    /// Seconds of steady reports.
+    pub seconds: u64,
+    /// Reports in each of them, of all robots together.
+    pub reports_per_s: u32,
+    /// Cores that this machine lets this program use. The server may be on the same machine.
+    pub cores: usize,
+}
+
+/// The result of a run, as far as it has come.
+pub struct LoadReport {
+    facts: Facts,
+    format: Format,
+    phases: Vec<Phase>,
+}
+
+impl LoadReport {
+    /// Begins with the facts.
+    pub fn begin(facts: Facts, format: Format) -> Self {
+        let Facts { taskbench, taskd, server, robots, seconds, reports_per_s, cores } = &facts;
+        if format == Format::Table {
+            print(&format!(
+                "taskbench {taskbench}, taskd {taskd} at {server}: {robots} robots, \
+                 {reports_per_s} reports/s for {seconds} s, {cores} cores here\n\n\
+                 {:<16} {:>7} {:>8} {:>9} {:>9} {:>9} {:>7}",
+                "phase", "count", "wall s", "p50 ms", "p99 ms", "max ms", "failed"
+            ));
+        }
+        Self { facts, format, phases: Vec::new() }
+    }
+
+    /// Adds a phase. A phase without any success is an error: what comes after it would measure nothing.
+    pub fn add(&mut self, phase: Phase) -> anyhow::Result<()> {
+        if self.format == Format::Table {
+            print(&row(&phase));
+        }
+        let failure = phase.failures.keys().next().filter(|_| phase.failed() == phase.count());
+        let outcome = failure.map_or(Ok(()), |text| Err(anyhow::anyhow!("{}: every step failed: {text}", phase.name)));
+        self.phases.push(phase);
+        outcome
+    }
+
+    /// Prints what is left to print, and gives the number of failed steps.
+    pub fn finish(&self) -> usize {
+        if self.format == Format::Json {
+            let phases: Vec<_> = self.phases.iter().map(document).collect();
+            print(&format!("{:#}", json!({ "facts": self.facts, "phases": phases })));
+        }
+        self.phases.iter().map(Phase::failed).sum()
+    }
+}
+
+fn row(phase: &Phase) -> String {
+    let ms = |percent| phase.percentile_ms(percent).map_or("-".to_owned(), |ms| format!("{ms:.1}"));
+    let (wall, p50, p99, max) = (phase.wall.as_secs_f64(), ms(50), ms(99), ms(100));
+    let mut row =
+        format!("{:<16} {:>7} {wall:>8.2} {p50:>9} {p99:>9} {max:>9} {:>7}", phase.name, phase.count(), phase.failed());
+    for (text, count) in &phase.failures {
+        row.push_str(&format!("\n  {count} × {text}"));
+    }
+    row
+}
+
+fn document(phase: &Phase) -> serde_json::Value {
+    json!({
+        "phase": phase.name,
+        "count": phase.count(),
+        "failed": phase.failed(),
+        "wall_s": phase.wall.as_millis() as f64 / 1000.0,
+        "p50_ms": phase.percentile_ms(50),
+        "p99_ms": phase.percentile_ms(99),
+        "max_ms": phase.percentile_ms(100),
+        "failures": phase.failures,
+    })
+}
+
+/// Nobody may be reading; the run goes on, because it has to clean up.
+fn print(text: &str) {
+    let mut stdout = std::io::stdout();
+    let _ = writeln!(stdout, "{text}").and_then(|()| stdout.flush());
+}

@@ -1,0 +1,76 @@
+//! What a figure can't be read without: the machine and the commit it was measured with. What can't be found out is
+//! `unknown`, never an error.
+
+use std::path::Path;
+
+use nix::sys::utsname::uname;
+use serde::{Deserialize, Serialize};
+
+use crate::process::Program;
+
+const UNKNOWN: &str = "unknown";
+
+/// The machine a run was made on.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Machine {
+    /// The processor's model.
+    pub cpu: String,
+    /// Cores this program may use.
+    pub cores: usize,
+    /// Memory in bytes.
+    pub memory_bytes: u64,
+    /// The kernel's name and release.
+    pub kernel: String,
+    /// The system's name.
+    pub system: String,
+}
+
+impl Machine {
+    /// This one.
+    pub fn here() -> Self {
+        let read = |path: &str| std::fs::read_to_string(Path::new(path)).unwrap_or_default();
+        let kilobytes: Option<u64> = field(&read("/proc/meminfo"), "MemTotal", ':')
+            .and_then(|text| text.split_whitespace().next()?.parse().ok());
+        let kernel = uname()
+            .ok()
+            .map(|name| format!("{} {}", name.sysname().to_string_lossy(), name.release().to_string_lossy()));
+        Self {
+            cpu: field(&read("/proc/cpuinfo"), "model name", ':').unwrap_or_else(|| UNKNOWN.to_owned()),
+            cores: std::thread::available_parallelism().map_or(1, usize::from),
+            memory_bytes: kilobytes.unwrap_or(0) * 1024,
+            kernel: kernel.unwrap_or_else(|| UNKNOWN.to_owned()),
+            system: field(&read("/etc/os-release"), "PRETTY_NAME", '=').unwrap_or_else(|| UNKNOWN.to_owned()),
+        }
+    }
+}
+
+/// The commit of the repository this program is run in, `-dirty` if files differ from it.
+pub async fn commit() -> String {
+    let git = Program::named("git").args(["describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]);
+    match git.output().await {
+        Ok(text) => text.trim().to_owned(),
+        Err(_) => UNKNOWN.to_owned(),
+    }
+}
+
+/// The value of the first line `name SEPARATOR value`, without quotes.
+fn field(text: &str, name: &str, separator: char) -> Option<String> {
+    text.lines().find_map(|line| {
+        let (key, value) = line.split_once(separator)?;
+        (key.trim() == name).then(|| value.trim().trim_matches('"').to_owned())
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_machine_says_what_it_is() {
+        let here = Machine::here();
+        assert!(here.cores > 0 && here.memory_bytes > 1 << 20 && here.kernel.starts_with("Linux "), "{here:?}");
+        assert_eq!(field("a : x\nmodel name\t: Fast 9\n", "model name", ':').as_deref(), Some("Fast 9"));
+        assert_eq!(field("PRETTY_NAME=\"A System\"\n", "PRETTY_NAME", '=').as_deref(), Some("A System"));
+        assert_eq!(field("", "x", ':'), None);
+    }
+}

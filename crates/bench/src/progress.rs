@@ -1,0 +1,59 @@
+//! Progress on stderr: a bar with what is being done now, or plain lines where nobody sees a bar move.
+
+use std::io::{IsTerminal as _, Write as _};
+
+use indicatif::{ProgressBar, ProgressFinish, ProgressStyle};
+
+/// How often a line is written at least, in hundredths of all steps, where there is no terminal.
+const LINE_EVERY_PERCENT: u64 = 10;
+
+/// How far a run has come.
+pub struct RunProgress {
+    bar: Option<ProgressBar>,
+    steps: u64,
+    done: u64,
+}
+
+impl RunProgress {
+    /// A run of so many steps.
+    pub fn new(steps: usize) -> Self {
+        let steps = steps as u64;
+        let bar = std::io::stderr().is_terminal().then(|| {
+            let bar = ProgressBar::new(steps).with_finish(ProgressFinish::AndClear);
+            let style = ProgressStyle::with_template("{bar:30} {pos}/{len} {elapsed}, {eta} left  {msg}");
+            if let Ok(style) = style {
+                bar.set_style(style);
+            }
+            bar
+        });
+        Self { bar, steps, done: 0 }
+    }
+
+    /// What is done now.
+    pub fn says(&self, text: &str) {
+        match &self.bar {
+            Some(bar) => bar.set_message(text.to_owned()),
+            None if self.steps <= 100 / LINE_EVERY_PERCENT => say(text),
+            None => {}
+        }
+    }
+
+    /// A step is done.
+    pub fn step(&mut self) {
+        self.done += 1;
+        match &self.bar {
+            Some(bar) => bar.inc(1),
+            None => {
+                let tenth = |done: u64| done * 100 / self.steps.max(1) / LINE_EVERY_PERCENT;
+                if tenth(self.done) != tenth(self.done - 1) {
+                    say(&format!("{} of {}", self.done, self.steps));
+                }
+            }
+        }
+    }
+}
+
+/// A line on stderr; a broken stderr is no reason to stop.
+pub fn say(text: &str) {
+    let _ = writeln!(std::io::stderr(), "{text}");
+}

@@ -1,0 +1,415 @@
+//! The result of a run, whatever it measured: facts, points and the plots that show them, written as JSON, CSV and HTML.
+//! One shape for all, so that runs can be compared and drawn again. A failure is part of a point and never dropped.
+
+use std::collections::BTreeMap;
+use std::io::{self, Write as _};
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use clap::Args;
+use serde::{Deserialize, Serialize};
+use task_proto::time::timestamp;
+
+use crate::clock;
+use crate::machine::{Machine, commit};
+use crate::report;
+
+/// Single values are kept up to this many of a quantity; beyond it only their figures are.
+const MOST_SAMPLES: usize = 100;
+
+/// Where a run's files go, and what makes it repeatable.
+#[derive(Debug, Clone, Args)]
+pub struct RunFlags {
+    /// Directory for the results: NAME.json, NAME.csv and NAME.html
+    #[arg(long, value_name = "DIR", default_value = "taskbench-results")]
+    pub out: PathBuf,
+    /// What random bytes and the order of the runs come from [default: a random number, which the results name]
+    #[arg(long, value_name = "N")]
+    pub seed: Option<u64>,
+}
+
+impl RunFlags {
+    /// The seed given, or one that was not used before.
+    pub fn seed(&self) -> u64 {
+        // 53 bits, so that every reader of JSON reads the same number.
+        self.seed.unwrap_or_else(|| rand::random::<u64>() >> 11)
+    }
+}
+
+/// A run: everything that is needed to read it, compare it and make it again.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Run {
+    /// What was measured: the subcommand.
+    pub scenario: String,
+    /// When it began, UTC.
+    pub began: String,
+    /// How long it took.
+    pub wall_s: f64,
+    /// The commit of the repository it was started in.
+    pub commit: String,
+    /// The machine.
+    pub machine: Machine,
+    /// Programs by name, with their versions.
+    pub versions: BTreeMap<String, String>,
+    /// The command line, this program's path left out.
+    pub command_line: Vec<String>,
+    /// What random bytes and the order of the runs came from.
+    pub seed: u64,
+    /// What a reader should know.
+    #[serde(default)]
+    pub notes: Vec<String>,
+    /// How to show the points.
+    #[serde(default)]
+    pub plots: Vec<Plot>,
+    /// What was measured.
+    pub points: Vec<Point>,
+}
+
+/// One point: what was set, what came of it.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Point {
+    /// What stands side by side: a mechanism, a program.
+    pub series: String,
+    /// What was set, by name with its unit last: `payload_bytes`, `robots`.
+    pub settings: BTreeMap<String, f64>,
+    /// What was measured, by name.
+    pub quantities: BTreeMap<String, Quantity>,
+    /// What failed, and how often.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub failures: BTreeMap<String, u64>,
+}
+
+/// A quantity's unit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Unit {
+    /// Milliseconds.
+    #[serde(rename = "ms")]
+    Milliseconds,
+    /// Seconds.
+    #[serde(rename = "s")]
+    Seconds,
+    /// Bytes.
+    #[serde(rename = "B")]
+    Bytes,
+    /// Bytes per second.
+    #[serde(rename = "B/s")]
+    BytesPerSecond,
+    /// So many each second.
+    #[serde(rename = "1/s")]
+    PerSecond,
+    /// Seconds for each gigabyte (10⁹ bytes).
+    #[serde(rename = "s/GB")]
+    SecondsPerGigabyte,
+    /// Of a hundred.
+    #[serde(rename = "%")]
+    Percent,
+    /// A count or a ratio.
+    #[serde(rename = "")]
+    Number,
+}
+
+impl Unit {
+    /// As it is written behind a number.
+    pub fn symbol(self) -> &'static str {
+        match self {
+            Self::Milliseconds => "ms",
+            Self::Seconds => "s",
+            Self::Bytes => "B",
+            Self::BytesPerSecond => "B/s",
+            Self::PerSecond => "1/s",
+            Self::SecondsPerGigabyte => "s/GB",
+            Self::Percent => "%",
+            Self::Number => "",
+        }
+    }
+}
+
+/// What was measured, once or many times.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Quantity {
+    /// The unit of all of it.
+    pub unit: Unit,
+    /// How many values there were.
+    pub count: usize,
+    /// The smallest.
+    pub min: f64,
+    /// Half of the values were no larger.
+    pub median: f64,
+    /// Of a hundred values ninety-nine were no larger.
+    pub p99: f64,
+    /// The largest.
+    pub max: f64,
+    /// The values as they came, unless they are too many.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub samples: Vec<f64>,
+}
+
+/// Which figure of a quantity.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Figure {
+    /// [`Quantity::median`].
+    #[default]
+    Median,
+    /// [`Quantity::p99`].
+    P99,
+    /// [`Quantity::max`].
+    Max,
+}
+
+/// A plot of some points: one line for each series.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Plot {
+    /// Its heading.
+    pub title: String,
+    /// The setting along the horizontal axis.
+    pub x: String,
+    /// What is written there.
+    pub x_label: String,
+    /// The quantity along the vertical axis.
+    pub y: String,
+    /// What is written there.
+    pub y_label: String,
+    /// Which figure of it. Points of a series with the same `x` are drawn as the median of theirs.
+    #[serde(default)]
+    pub figure: Figure,
+    /// Whether the horizontal axis is logarithmic.
+    pub x_log: bool,
+    /// Whether the vertical one is.
+    pub y_log: bool,
+    /// Only points whose settings lie in these ranges, both ends included.
+    #[serde(default)]
+    pub only: BTreeMap<String, (f64, f64)>,
+    /// Only these series; empty: all.
+    #[serde(default)]
+    pub series: Vec<String>,
+}
+
+impl Plot {
+    /// The points it shows.
+    pub fn points<'a>(&'a self, points: &'a [Point]) -> impl Iterator<Item = &'a Point> {
+        let in_range = |point: &Point, (name, (least, most)): (&String, &(f64, f64))| {
+            point.settings.get(name).is_some_and(|value| value >= least && value <= most)
+        };
+        points.iter().filter(move |point| {
+            (self.series.is_empty() || self.series.contains(&point.series))
+                && point.settings.contains_key(&self.x)
+                && self.only.iter().all(|range| in_range(point, range))
+        })
+    }
+}
+
+impl Quantity {
+    /// The figures of `samples`; `None` without any, or if one is no number.
+    pub fn of(unit: Unit, samples: impl IntoIterator<Item = f64>) -> Option<Self> {
+        let samples: Vec<f64> = samples.into_iter().collect();
+        let mut sorted = samples.clone();
+        sorted.sort_unstable_by(f64::total_cmp);
+        let at = |percent: usize| sorted.get((sorted.len() * percent).div_ceil(100).max(1) - 1).copied();
+        let quantity = Self {
+            unit,
+            count: sorted.len(),
+            min: sorted.first().copied()?,
+            median: at(50)?,
+            p99: at(99)?,
+            max: sorted.last().copied()?,
+            samples: if samples.len() <= MOST_SAMPLES { samples } else { Vec::new() },
+        };
+        sorted.iter().all(|value| value.is_finite()).then_some(quantity)
+    }
+
+    /// One of its figures.
+    pub fn figure(&self, figure: Figure) -> f64 {
+        match figure {
+            Figure::Median => self.median,
+            Figure::P99 => self.p99,
+            Figure::Max => self.max,
+        }
+    }
+}
+
+impl Point {
+    /// A point of `series` at these settings.
+    pub fn new(series: &str, settings: impl IntoIterator<Item = (&'static str, f64)>) -> Self {
+        let settings = settings.into_iter().map(|(name, value)| (name.to_owned(), value)).collect();
+        Self { series: series.to_owned(), settings, ..Self::default() }
+    }
+
+    /// Adds what was measured; nothing, if there were no values.
+    pub fn measure(&mut self, name: &str, unit: Unit, samples: impl IntoIterator<Item = f64>) {
+        if let Some(quantity) = Quantity::of(unit, samples) {
+            self.quantities.insert(name.to_owned(), quantity);
+        }
+    }
+
+    /// Adds a failure.
+    pub fn fail(&mut self, text: impl Into<String>) {
+        *self.failures.entry(text.into()).or_default() += 1;
+    }
+
+    /// How much failed.
+    pub fn failed(&self) -> u64 {
+        self.failures.values().sum()
+    }
+}
+
+impl Run {
+    /// A run that begins now, without points.
+    pub async fn begin(scenario: &str, seed: u64) -> Self {
+        Self {
+            scenario: scenario.to_owned(),
+            began: timestamp(clock::wall_ms()),
+            wall_s: 0.0,
+            commit: commit().await,
+            machine: Machine::here(),
+            versions: [("taskbench".to_owned(), env!("CARGO_PKG_VERSION").to_owned())].into(),
+            command_line: std::env::args().skip(1).collect(),
+            seed,
+            notes: Vec::new(),
+            plots: Vec::new(),
+            points: Vec::new(),
+        }
+    }
+
+    /// How many steps failed.
+    pub fn failed(&self) -> u64 {
+        self.points.iter().map(Point::failed).sum()
+    }
+
+    /// Writes the three files, making the directory if need be; gives their paths. `began` is when the run began.
+    pub fn write(&mut self, dir: &Path, began: Instant) -> io::Result<Vec<PathBuf>> {
+        self.wall_s = (began.elapsed().as_secs_f64() * 1000.0).round() / 1000.0;
+        std::fs::create_dir_all(dir)?;
+        let files = [
+            ("json", format!("{:#}\n", serde_json::to_value(&*self).map_err(io::Error::other)?)),
+            ("csv", self.csv()),
+            ("html", report::page(self)),
+        ];
+        let write = |(extension, text): (&str, String)| {
+            let path = dir.join(format!("{}.{extension}", self.scenario));
+            std::fs::File::create(&path)?.write_all(text.as_bytes())?;
+            Ok(path)
+        };
+        files.into_iter().map(write).collect()
+    }
+
+    /// Reads a run back.
+    pub fn read(path: &Path) -> io::Result<Self> {
+        serde_json::from_slice(&std::fs::read(path)?).map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error))
+    }
+
+    /// A row for each quantity of each point; a point without any has one row, with its failures.
+    pub fn csv(&self) -> String {
+        let settings: std::collections::BTreeSet<&String> =
+            self.points.iter().flat_map(|p| p.settings.keys()).collect();
+        let names = settings.iter().map(|name| cell(name));
+        let head = std::iter::once("series".to_owned()).chain(names);
+        let rest = ["quantity", "unit", "count", "min", "median", "p99", "max", "failed"].map(str::to_owned);
+        let mut text = head.chain(rest).collect::<Vec<_>>().join(",") + "\n";
+        for point in &self.points {
+            let mut begin = vec![cell(&point.series)];
+            begin.extend(settings.iter().map(|name| point.settings.get(*name).map_or(String::new(), f64::to_string)));
+            let mut row = |cells: [String; 7]| {
+                let all: Vec<String> = begin.iter().cloned().chain(cells).chain([point.failed().to_string()]).collect();
+                text.push_str(&(all.join(",") + "\n"));
+            };
+            for (name, q) in &point.quantities {
+                let figures = [q.min, q.median, q.p99, q.max].map(|value| value.to_string());
+                let [min, median, p99, max] = figures;
+                row([cell(name), cell(q.unit.symbol()), q.count.to_string(), min, median, p99, max]);
+            }
+            if point.quantities.is_empty() {
+                row(Default::default());
+            }
+        }
+        text
+    }
+}
+
+/// A value of a CSV, quoted if it has to be.
+fn cell(text: &str) -> String {
+    let is_plain = !text.contains([',', '"', '\n', '\r']);
+    if is_plain { text.to_owned() } else { format!("\"{}\"", text.replace('"', "\"\"")) }
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+
+    /// A run with two series, a failure among them.
+    pub fn sample() -> Run {
+        let point = |series: &str, robots: f64, ms: &[f64]| {
+            let mut point = Point::new(series, [("robots", robots), ("payload_bytes", 1000.0 * robots)]);
+            point.measure("delay", Unit::Milliseconds, ms.iter().copied());
+            point
+        };
+        let mut lost = point("direct-push", 4.0, &[]);
+        lost.fail("the client, \"r1\" <lost> it");
+        let plot = Plot {
+            title: "Delay & robots".to_owned(),
+            x: "robots".to_owned(),
+            x_label: "robots".to_owned(),
+            y: "delay".to_owned(),
+            y_label: "delay".to_owned(),
+            y_log: true,
+            ..Plot::default()
+        };
+        Run {
+            scenario: "sample".to_owned(),
+            began: "2026-01-01T00:00:00.000Z".to_owned(),
+            wall_s: 1.5,
+            commit: "abc".to_owned(),
+            machine: Machine::here(),
+            versions: BTreeMap::new(),
+            command_line: vec!["sample".to_owned(), "--robots=1".to_owned()],
+            seed: 7,
+            notes: vec!["a <note>".to_owned()],
+            plots: vec![plot],
+            points: vec![
+                point("push-pull", 1.0, &[10.0, 30.0, 20.0]),
+                point("push-pull", 4.0, &[300.0]),
+                point("direct-push", 1.0, &[5.0]),
+                lost,
+            ],
+        }
+    }
+
+    #[test]
+    fn figures_are_values_that_occurred() {
+        let of = |n: u32| Quantity::of(Unit::Milliseconds, (1..=n).rev().map(f64::from)).expect("figures");
+        let figures = |q: &Quantity| [q.min, q.median, q.p99, q.max];
+        assert_eq!(figures(&of(200)), [1.0, 100.0, 198.0, 200.0]);
+        assert_eq!(figures(&of(1)), [1.0; 4]);
+        assert_eq!((of(3).samples, of(200).samples), (vec![3.0, 2.0, 1.0], vec![]));
+        assert_eq!(Quantity::of(Unit::Number, []), None);
+        assert_eq!(Quantity::of(Unit::Number, [f64::NAN]), None);
+    }
+
+    #[test]
+    fn a_run_is_written_and_read_back_with_its_failures() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let mut run = sample();
+        let files = run.write(&dir.path().join("new"), Instant::now()).expect("written");
+        assert_eq!(files.len(), 3);
+        let read = Run::read(&files[0]).expect("read");
+        assert_eq!(read.points, run.points);
+        assert_eq!((read.failed(), &read.plots), (1, &run.plots));
+        let csv = std::fs::read_to_string(&files[1]).expect("read");
+        let lines: Vec<&str> = csv.lines().collect();
+        assert_eq!(lines[0], "series,payload_bytes,robots,quantity,unit,count,min,median,p99,max,failed");
+        assert_eq!(lines[1], "push-pull,1000,1,delay,ms,3,10,20,30,30,0");
+        assert_eq!(lines[4], "direct-push,4000,4,,,,,,,,1");
+        assert_eq!(cell("a \"b\", c"), "\"a \"\"b\"\", c\"");
+    }
+
+    #[test]
+    fn a_plot_shows_the_points_in_its_ranges() {
+        let run = sample();
+        let mut plot = run.plots[0].clone();
+        assert_eq!(plot.points(&run.points).count(), 4);
+        plot.only = [("payload_bytes".to_owned(), (0.0, 1000.0))].into();
+        assert_eq!(plot.points(&run.points).count(), 2);
+        plot.series = vec!["push-pull".to_owned()];
+        assert_eq!(plot.points(&run.points).count(), 1);
+    }
+}

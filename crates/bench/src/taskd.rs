@@ -1,0 +1,177 @@
+//! A real `taskd serve` as a child, with a directory of its own, on free ports. It is ended by its pid, and its
+//! directory goes with it.
+
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::{Context as _, bail};
+use clap::Args;
+use reqwest::Url;
+use serde::Deserialize;
+use task_proto::token::Token;
+use tempfile::TempDir;
+use tokio::time::Instant;
+
+use crate::process::{Process, Program, Usage};
+use crate::server::Server;
+
+/// How long it may take to be ready.
+const START_TIMEOUT: Duration = Duration::from_secs(60);
+/// How often it is looked at until then, and how often its memory is.
+const LOOK_INTERVAL: Duration = Duration::from_millis(20);
+/// How much of its log is shown when it does not start.
+const LOG_TAIL_BYTES: usize = 2000;
+
+/// Which server to measure.
+#[derive(Debug, Clone, Args)]
+pub struct TaskdFlags {
+    /// The taskd to measure [default: the one beside taskbench; build both with cargo build --release --bins]
+    #[arg(long, value_name = "PATH")]
+    pub taskd: Option<PathBuf>,
+    /// Where servers have their data; a disk, because they sync to it [default: the system's temporary directory]
+    #[arg(long, value_name = "DIR")]
+    pub data: Option<PathBuf>,
+}
+
+/// How a server is started.
+#[derive(Debug, Clone)]
+pub struct TaskdOrder {
+    /// The address of both listeners.
+    pub listen: IpAddr,
+    /// The configuration file's text.
+    pub configuration: String,
+    /// Further `TASKD_*` settings.
+    pub settings: Vec<(String, String)>,
+}
+
+impl Default for TaskdOrder {
+    fn default() -> Self {
+        Self { listen: Ipv4Addr::LOCALHOST.into(), configuration: String::new(), settings: Vec::new() }
+    }
+}
+
+/// A server that runs. Dropping it kills it.
+pub struct Taskd {
+    process: Process,
+    dir: TempDir,
+    /// Where HTTP listens.
+    pub http: SocketAddr,
+    /// Where MQTT listens.
+    pub mqtt: SocketAddr,
+    /// Its API, as the operator.
+    pub server: Server,
+    /// Its version.
+    pub version: String,
+}
+
+#[derive(Deserialize)]
+struct Addresses {
+    http: SocketAddr,
+    mqtt: SocketAddr,
+}
+
+impl Taskd {
+    /// Starts one and waits until it is ready.
+    pub async fn start(flags: &TaskdFlags, order: &TaskdOrder) -> anyhow::Result<Self> {
+        let mut builder = tempfile::Builder::new();
+        builder.prefix("taskbench-");
+        let dir = match &flags.data {
+            Some(dir) => builder.tempdir_in(dir).with_context(|| format!("--data {}", dir.display()))?,
+            None => builder.tempdir().context("a temporary directory")?,
+        };
+        let (data, log) = (dir.path().join("data"), dir.path().join("taskd.log"));
+        let configuration = dir.path().join("taskd.toml");
+        std::fs::write(&configuration, &order.configuration).context("the server's configuration file")?;
+        let any = SocketAddr::new(order.listen, 0).to_string();
+        let mut program =
+            Program::beside("taskd", flags.taskd.as_deref())?.args(["serve", "--http", &any, "--mqtt", &any]);
+        program = program.args([Path::new("--data"), &data, Path::new("--config"), &configuration]);
+        for (name, value) in &order.settings {
+            program = program.variable(name, value);
+        }
+        let mut process = program.start(&log)?;
+        let addresses = wait_for_addresses(&mut process, &data.join("addresses.json"), &log).await?;
+        let token = std::fs::read_to_string(data.join("operator.token")).context("the server's operator.token")?;
+        let token: Token = token.trim().parse().context("the server's operator.token")?;
+        let base: Url = format!("http://{}", addresses.http).parse().context("the server's address")?;
+        let server = Server::new(base, &token)?;
+        let version = server.info().await.context("the server does not answer")?.version;
+        Ok(Self { process, dir, http: addresses.http, mqtt: addresses.mqtt, server, version })
+    }
+
+    /// What it has used until now.
+    pub fn usage(&self) -> Usage {
+        self.process.usage()
+    }
+
+    /// Begins to watch how much memory it has, until the watch is asked.
+    pub fn watch_memory(&self) -> MemoryWatch {
+        let pid = self.process.pid();
+        let (stop, mut stopped) = tokio::sync::oneshot::channel();
+        let watching = tokio::spawn(async move {
+            let mut most = Usage::default();
+            let mut tick = tokio::time::interval(LOOK_INTERVAL);
+            loop {
+                tokio::select! {
+                    _ = tick.tick() => {}
+                    _ = &mut stopped => return most,
+                }
+                let now = pid.and_then(Usage::of).unwrap_or_default();
+                most.anonymous_bytes = most.anonymous_bytes.max(now.anonymous_bytes);
+                most.resident_bytes = most.resident_bytes.max(now.resident_bytes);
+            }
+        });
+        MemoryWatch { stop, watching }
+    }
+
+    /// Why it is gone, if it is.
+    pub fn ended(&mut self) -> Option<String> {
+        let how = self.process.ended()?;
+        Some(format!("{how}: {}", tail(&self.dir.path().join("taskd.log"))))
+    }
+
+    /// Ends it in good order and removes its directory.
+    pub async fn end(self) -> anyhow::Result<()> {
+        self.process.end().await;
+        self.dir.close().context("the server's directory can't be removed")
+    }
+}
+
+/// Looks at a server's memory until it is asked for the most there was.
+pub struct MemoryWatch {
+    stop: tokio::sync::oneshot::Sender<()>,
+    watching: tokio::task::JoinHandle<Usage>,
+}
+
+impl MemoryWatch {
+    /// The most there was of each kind of memory, by what was seen.
+    pub async fn most(self) -> Usage {
+        let _ = self.stop.send(());
+        self.watching.await.unwrap_or_default()
+    }
+}
+
+async fn wait_for_addresses(process: &mut Process, path: &Path, log: &Path) -> anyhow::Result<Addresses> {
+    let deadline = Instant::now() + START_TIMEOUT;
+    let mut tick = tokio::time::interval(LOOK_INTERVAL);
+    loop {
+        tick.tick().await;
+        if let Some(addresses) = std::fs::read(path).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok()) {
+            return Ok(addresses);
+        }
+        if let Some(how) = process.ended() {
+            bail!("{how}: {}", tail(log));
+        }
+        if Instant::now() >= deadline {
+            bail!("taskd was not ready within {START_TIMEOUT:?}: {}", tail(log));
+        }
+    }
+}
+
+/// The end of a log.
+fn tail(log: &Path) -> String {
+    let text = String::from_utf8_lossy(&std::fs::read(log).unwrap_or_default()).into_owned();
+    let from = text.char_indices().rev().nth(LOG_TAIL_BYTES).map_or(0, |(at, _)| at);
+    text[from..].trim().to_owned()
+}

@@ -277,6 +277,6 @@ async fn a_killed_node_is_not_taken_for_the_one_started_after_it() {
     let owners = Graph::owners(after.clone(), vec![started.pid()]).await;
     let new: Vec<_> = after.nodes.iter().filter(|node| is_new(node)).map(|node| node.participant).collect();
     assert_eq!(owners.theirs.iter().copied().collect::<Vec<_>>(), new);
-    assert_eq!(owners.others.contains(&ghost), after.participants.contains_key(&ghost), "{owners:?}");
+    assert_eq!(owners.gone.contains(&ghost), after.participants.contains_key(&ghost), "{owners:?}");
     started.leave().await;
 }

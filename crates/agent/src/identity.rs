@@ -175,7 +175,7 @@ mod tests {
             token_since_ms: 0,
             server: "http://server".to_owned(),
             server_key: task_proto::envelope::SigningKey::random().public_key(),
-            mqtt: MqttEndpoint { host: None, port: 1883, prefix: Default::default() },
+            mqtt: MqttEndpoint { host: None, port: 1883, prefix: Default::default(), external: None },
             mac: "02:00:00:00:00:01".parse().expect("valid"),
         };
         identity.write(&path).expect("written");

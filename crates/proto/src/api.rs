@@ -3,11 +3,13 @@
 
 mod delivery;
 mod logs;
+mod mqtt;
 
 use serde::{Deserialize, Serialize};
 
 pub use self::delivery::{DeliveryChoice, DeliveryDecision, MAX_PRIORITY, MIN_PRIORITY};
 pub use self::logs::{LogEvent, LogsFrom, LogsQuery, LogsView};
+pub use self::mqtt::{BrokerFiles, ExternalBroker, MqttEndpoint};
 use crate::desired::{PackageRef, Wanted};
 use crate::envelope::PublicKey;
 use crate::id::Labels;
@@ -15,7 +17,6 @@ use crate::manifest::{TaskKind, TaskManifest};
 use crate::output::OutputSet;
 use crate::report::{ActiveVersion, Condition, Failure, HostFacts, LinkFacts, Phase, Progress};
 use crate::selector::Selector;
-use crate::topic::TopicPrefix;
 use crate::{DeploymentId, Digest, Generation, MacAddress, RobotId, RobotName, TaskName, Version};
 
 /// Where the API begins.
@@ -46,7 +47,7 @@ pub struct ServerInfo {
     pub version: String,
     /// The key that signs desired states.
     pub key: PublicKey,
-    /// The MQTT listener's address, `host:port`, as bound.
+    /// Where MQTT is: the listener's address, `host:port`, as bound, or the external broker's.
     pub mqtt: String,
     /// The server's clock.
     pub now_ms: u64,
@@ -55,7 +56,8 @@ pub struct ServerInfo {
     pub traffic: MqttTraffic,
 }
 
-/// What went over MQTT, all connections together, the server's own watchdog excepted.
+/// What went over MQTT, all connections together, the server's own watchdog excepted. With an external broker only the
+/// server's own connection to it is known.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct MqttTraffic {
@@ -126,18 +128,6 @@ pub struct EnrollResponse {
 pub struct RobotToken {
     /// The robot's next bearer token and MQTT password.
     pub token: String,
-}
-
-/// Where a robot's MQTT session goes.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct MqttEndpoint {
-    /// Host; absent means the host of the server's URL.
-    #[serde(default)]
-    pub host: Option<String>,
-    /// TCP port.
-    pub port: u16,
-    /// What all topics start with.
-    pub prefix: TopicPrefix,
 }
 
 /// `POST /enrollment-tokens` (operator).

@@ -289,6 +289,7 @@ fn mqtt_endpoint(config: &Config, bound: SocketAddr) -> MqttEndpoint {
         host: config.public_mqtt_host.clone(),
         port: config.public_mqtt_port.unwrap_or(bound.port()),
         prefix: config.topic_prefix.clone(),
+        external: None,
     }
 }
 

@@ -115,7 +115,7 @@ async fn a_new_token_is_on_the_disk_before_it_is_used_and_the_old_one_until_it_w
         token_since_ms: 1_000,
         server: url.to_string(),
         server_key: SigningKey::random().public_key(),
-        mqtt: task_proto::api::MqttEndpoint { host: None, port: 1, prefix: Default::default() },
+        mqtt: task_proto::api::MqttEndpoint { host: None, port: 1, prefix: Default::default(), external: None },
         mac: "02:00:00:00:00:01".parse().unwrap(),
     };
     identity.write(&path).unwrap();

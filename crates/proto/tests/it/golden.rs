@@ -9,9 +9,9 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 use task_proto::api::{
-    CreateDeployment, DeliveryChoice, DeliveryDecision, EnrollRequest, EnrollResponse, ErrorBody, Event, LogEvent,
-    LogsFrom, LogsView, MqttConnection, MqttEndpoint, MqttTraffic, OutputList, OutputView, ReportReply, RobotToken,
-    ServerInfo, Traffic,
+    CreateDeployment, DeliveryChoice, DeliveryDecision, EnrollRequest, EnrollResponse, ErrorBody, Event,
+    ExternalBroker, LogEvent, LogsFrom, LogsView, MqttConnection, MqttEndpoint, MqttTraffic, OutputList, OutputView,
+    ReportReply, RobotToken, ServerInfo, Traffic,
 };
 use task_proto::desired::{BlobRef, Delivery, DesiredState, DesiredTask, Doorbell, Inline, PackageRef, Wanted};
 use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
@@ -347,8 +347,13 @@ fn documents_of_the_api() {
             robot_id: robot(),
             name: parsed("atlas"),
             token: "tskr_…".to_owned(),
-            mqtt: MqttEndpoint { host: None, port: 1883, prefix: TopicPrefix::default() },
+            mqtt: MqttEndpoint { host: None, port: 1883, prefix: TopicPrefix::default(), external: None },
         },
+    );
+    let external = Some(ExternalBroker { password: "…".to_owned() });
+    check(
+        "mqtt_endpoint.json",
+        &MqttEndpoint { host: Some("broker.lab".to_owned()), port: 1884, prefix: TopicPrefix::default(), external },
     );
     check_text("robot_token.json", &RobotToken { token: "tskr_…".to_owned() });
     check_text(

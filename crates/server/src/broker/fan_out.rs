@@ -1,22 +1,63 @@
-//! Sending a package's parts to many robots at once, on `p/<digest>` through the router: to those it was granted to, as
-//! fast as the slowest of them listens, and no longer than the [`FanOut`] lives. Nothing is retained: who subscribes
-//! late, or falls out, gets the rest in another way.
+//! Sending a package's parts to many robots at once, on `p/<digest>`: to those it was granted to, as fast as the slowest of
+//! them listens, and no longer than the [`FanOut`] lives. A part is held once, and so long as somebody has not taken it.
+//! Nothing is retained: who subscribes late, or falls out, gets the rest in another way.
 
 use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
-use task_proto::{Digest, RobotId};
+use rumqttd::protocol::QoS;
+use task_proto::{Digest, RobotId, part};
+use tokio::time::{Instant, timeout};
 
 use super::front::{Front, Grant, NotGranted};
 
-/// The largest part.
-pub const MAX_PART_BYTES: usize = 128 * 1024;
-/// How long a listener may hold up all others; a session that reads nothing ends sooner by itself.
-const PATIENCE: Duration = Duration::from_secs(30);
-/// For a router that is behind to catch up a little, and how often it gets that chance.
-const ROUTER_PAUSE: Duration = Duration::from_millis(10);
-const ROUTER_PAUSES: u32 = 500;
+/// The largest part, with its header.
+pub const MAX_PART_BYTES: usize = part::MAX_PART_BYTES as usize + part::HEADER_BYTES;
+/// How often it is looked who holds up the others.
+const LOOK_INTERVAL: Duration = Duration::from_millis(100);
+
+/// One message of a fan-out: a few bytes of its own before bytes that nobody copies.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Part {
+    /// What comes first.
+    pub header: Bytes,
+    /// The rest.
+    pub bytes: Bytes,
+}
+
+impl Part {
+    /// The size of the message's payload.
+    pub fn len(&self) -> usize {
+        self.header.len() + self.bytes.len()
+    }
+
+    /// Whether there is nothing to send.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+}
+
+/// How a package is fanned out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct FanOutSettings {
+    /// The size of its parts: few large ones are on their way at a time, more small ones.
+    pub part_bytes: usize,
+    /// The quality of service, if a robot's own subscription does not ask for less.
+    pub qos: PartQos,
+}
+
+/// The quality of service of parts.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum PartQos {
+    /// Sent, and that is all: what is lost is asked for again.
+    AtMostOnce,
+    /// Acknowledged.
+    #[default]
+    AtLeastOnce,
+    /// Acknowledged, released and completed.
+    ExactlyOnce,
+}
 
 /// Why a package, or a part of it, is not fanned out.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -30,9 +71,6 @@ pub enum FanOutError {
     /// The part does not fit into a message.
     #[error("a part of {0} bytes is larger than {MAX_PART_BYTES}")]
     TooLarge(usize),
-    /// The router takes nothing.
-    #[error("the message router does not keep up")]
-    RouterBehind,
 }
 
 /// A package on its way to many. Dropped, it ends: robots hear no further part and can't subscribe any more.
@@ -43,12 +81,28 @@ pub struct FanOut {
 
 impl FanOut {
     /// Lets `robots` subscribe to the package.
-    pub(super) fn begin(front: Arc<Front>, digest: Digest, robots: Vec<RobotId>) -> Result<Self, FanOutError> {
-        let grant = front.grants().open(digest, robots).map_err(|error| match error {
+    pub(super) fn begin(
+        front: Arc<Front>,
+        digest: Digest,
+        settings: FanOutSettings,
+        robots: Vec<RobotId>,
+    ) -> Result<Self, FanOutError> {
+        let qos = match settings.qos {
+            PartQos::AtMostOnce => QoS::AtMostOnce,
+            PartQos::AtLeastOnce => QoS::AtLeastOnce,
+            PartQos::ExactlyOnce => QoS::ExactlyOnce,
+        };
+        let grant = front.grants().open(digest, settings.part_bytes, qos, robots, Instant::now());
+        let grant = grant.map_err(|error| match error {
             NotGranted::UnderWay => FanOutError::UnderWay(digest),
             NotGranted::Full => FanOutError::Busy,
         })?;
         Ok(Self { front, grant })
+    }
+
+    /// Lets further robots subscribe.
+    pub fn admit(&self, robots: impl IntoIterator<Item = RobotId>) {
+        self.grant.admit(robots);
     }
 
     /// How many robots listen now.
@@ -56,33 +110,55 @@ impl FanOut {
         self.grant.listeners()
     }
 
+    /// Whether the robot listens now.
+    pub fn is_listening(&self, robot: &RobotId) -> bool {
+        self.grant.is_listening(robot)
+    }
+
     /// The robot may no longer hear it.
     pub fn withdraw(&self, robot: &RobotId) {
-        self.grant.withdraw(robot);
+        self.grant.withdraw(robot, Instant::now());
+    }
+
+    /// Robots that held up the others and were put out since this was asked last.
+    pub fn take_put_out(&self) -> Vec<RobotId> {
+        self.grant.take_put_out()
+    }
+
+    /// The bytes of the parts that are held for listeners, all listeners together.
+    pub fn queued_bytes(&self) -> usize {
+        self.grant.queued_bytes()
     }
 
     /// Sends the next part to all who listen. Waits while the slowest of them is too far behind; whoever holds up the
     /// others for long is put out. Once this returns the part is on its way, not there: what arrived, robots report.
-    pub async fn publish(&mut self, part: Bytes) -> Result<(), FanOutError> {
+    pub async fn publish(&mut self, part: Part) -> Result<(), FanOutError> {
         if part.len() > MAX_PART_BYTES {
             return Err(FanOutError::TooLarge(part.len()));
         }
-        let number = loop {
-            match tokio::time::timeout(PATIENCE, self.grant.room()).await {
-                Ok(number) => break number,
-                Err(_) => {
-                    let robots = self.grant.put_out_stragglers();
-                    tracing::info!(digest = %self.grant.digest(), ?robots, "robots that did not keep up are put out");
-                }
-            }
-        };
-        for _ in 0..ROUTER_PAUSES {
-            if self.front.publish_part(&self.grant, number, part.clone()) {
-                return Ok(());
-            }
-            tokio::time::sleep(ROUTER_PAUSE).await;
+        while timeout(LOOK_INTERVAL, self.grant.room()).await.is_err() {
+            self.put_out_laggards();
         }
-        Err(FanOutError::RouterBehind)
+        self.grant.send(part, Instant::now());
+        Ok(())
+    }
+
+    /// Waits until every listener has acknowledged all that was sent, or was put out, or `patience` is over.
+    pub async fn settle(&mut self, patience: Duration) {
+        let until = Instant::now() + patience;
+        while Instant::now() < until {
+            if timeout(LOOK_INTERVAL, self.grant.all_idle()).await.is_ok() {
+                return;
+            }
+            self.put_out_laggards();
+        }
+    }
+
+    fn put_out_laggards(&self) {
+        let robots = self.grant.put_out_laggards(Instant::now());
+        if !robots.is_empty() {
+            tracing::info!(digest = %self.grant.digest(), ?robots, "robots that did not keep up are put out");
+        }
     }
 }
 

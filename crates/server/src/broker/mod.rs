@@ -19,7 +19,7 @@ use task_proto::topic::{RobotTopic, TopicPrefix};
 use task_proto::{Digest, RobotId};
 use tokio::sync::watch;
 
-pub use fan_out::{FanOut, FanOutError, MAX_PART_BYTES};
+pub use fan_out::{FanOut, FanOutError, FanOutSettings, MAX_PART_BYTES, Part, PartQos};
 use front::Front;
 use router::Router;
 
@@ -128,8 +128,6 @@ pub struct Limits {
     pub max_silent_per_address: usize,
     /// Operators among them.
     pub max_operators: usize,
-    /// Robots that hear some package's parts at the same time.
-    pub max_part_listeners: usize,
     /// The largest packet of an admitted client, in bytes after the fixed header.
     pub max_packet_bytes: usize,
     /// Filters in one SUBSCRIBE or UNSUBSCRIBE, and subscriptions of one client.
@@ -156,7 +154,6 @@ impl Default for Limits {
             max_connections: 20_000,
             max_silent_per_address: 2048,
             max_operators: 256,
-            max_part_listeners: 512,
             max_packet_bytes: 256 * 1024,
             max_filters: 64,
             connect_timeout: Duration::from_secs(10),
@@ -231,7 +228,7 @@ impl Broker {
         inbox: Arc<dyn Inbox>,
     ) -> Result<Self, BrokerError> {
         let limits = config.limits.clone();
-        let router = Router::start(&config.prefix, limits.max_operators, limits.max_part_listeners).await;
+        let router = Router::start(&config.prefix, limits.max_operators).await;
         let router = router.map_err(|error| BrokerError::Router { reason: error.to_string() })?;
         let front = Front::start(config, gatekeeper, inbox, router.clone()).await?;
         let health = watchdog::start(&front, router, &limits);
@@ -252,8 +249,18 @@ impl Broker {
 
     /// Lets `robots` subscribe to `p/<digest>`, to hear the parts that are published from then on, until the [`FanOut`]
     /// is dropped. Few packages at a time.
-    pub fn fan_out(&self, digest: Digest, robots: Vec<RobotId>) -> Result<FanOut, FanOutError> {
-        FanOut::begin(self.front.clone(), digest, robots)
+    pub fn fan_out(
+        &self,
+        digest: Digest,
+        settings: FanOutSettings,
+        robots: Vec<RobotId>,
+    ) -> Result<FanOut, FanOutError> {
+        FanOut::begin(self.front.clone(), digest, settings, robots)
+    }
+
+    /// The bytes of packages' parts that are held for listeners: the front's backlog.
+    pub fn queued_part_bytes(&self) -> usize {
+        self.front.grants().queued_bytes()
     }
 
     /// Ends the robot's session, if it has one: its token was revoked or it was removed.

@@ -1,8 +1,7 @@
 //! Owns rumqttd's router thread: what is published here reaches every listener. It never sees a client's bytes, topics
 //! or filters unchecked, because its thread dies of some of them; and since the router keeps a log for each filter and a
-//! record for each link name for ever, it gets three filters and a fixed set of names. Listeners pick out what they want.
+//! record for each link name for ever, it gets two filters and a fixed set of names. Listeners pick out what they want.
 
-use std::collections::HashMap;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -11,18 +10,15 @@ use bytes::Bytes;
 use rumqttd::local::{LinkBuilder, LinkError, LinkRx, LinkTx};
 use rumqttd::protocol::{Disconnect, DisconnectReasonCode, Packet, Publish, QoS};
 use rumqttd::{Notification, RouterConfig};
-use task_proto::Digest;
 use task_proto::topic::TopicPrefix;
 use tokio::sync::{Notify, oneshot};
 use tokio_util::sync::CancellationToken;
 
 /// What the watchdog's canary travels on. No prefix can contain a space, so it meets nobody else.
 pub(super) const CANARY_TOPIC: &str = "router canary";
-/// What packages' parts travel on, before the digest and the part's number. Likewise.
-const PARTS: &str = "package parts/";
 /// What the publishing link may have waiting; the router being this far behind, messages to listeners are dropped.
 const MAX_BACKLOG: usize = 1000;
-/// The router's log for each of the three filters: so much may a listener fall behind before it misses messages.
+/// The router's log for each of the two filters: so much may a listener fall behind before it misses messages.
 const SEGMENT_BYTES: usize = 2 * 1024 * 1024;
 const SEGMENTS: usize = 4;
 /// Messages the router hands a listener at a time.
@@ -36,7 +32,7 @@ const LINK_TIMEOUT: Duration = Duration::from_secs(5);
 pub(super) struct Router {
     everything: String,
     /// The names that are free.
-    slots: Mutex<HashMap<Listening, Vec<usize>>>,
+    slots: Mutex<Vec<usize>>,
     max_links: usize,
     listeners: AtomicUsize,
     dropped: AtomicU64,
@@ -60,8 +56,6 @@ type Connect = Arc<dyn Fn(&str) -> Option<(LinkTx, LinkRx)> + Send + Sync>;
 pub(super) enum Listening {
     /// Everything below the prefix.
     Everything,
-    /// The parts of every package.
-    Parts,
     /// Canaries.
     Canary,
 }
@@ -87,19 +81,13 @@ pub(super) enum RouterError {
 
 impl Router {
     /// Starts the router's thread.
-    pub(super) async fn start(
-        prefix: &TopicPrefix,
-        max_listeners: usize,
-        max_part_listeners: usize,
-    ) -> Result<Arc<Self>, RouterError> {
+    pub(super) async fn start(prefix: &TopicPrefix, max_listeners: usize) -> Result<Arc<Self>, RouterError> {
         let everything = format!("{prefix}/#");
-        let max_links = max_listeners + max_part_listeners + OTHER_LINKS;
+        let max_links = max_listeners + OTHER_LINKS;
         let running = Running::start(&everything, max_links).await?;
-        let slots = [(Listening::Everything, max_listeners), (Listening::Parts, max_part_listeners)];
-        let slots = slots.map(|(listening, count)| (listening, (0..count).rev().collect()));
         Ok(Arc::new(Self {
             everything,
-            slots: Mutex::new(slots.into()),
+            slots: Mutex::new((0..max_listeners).rev().collect()),
             max_links,
             listeners: AtomicUsize::new(0),
             dropped: AtomicU64::new(0),
@@ -126,11 +114,6 @@ impl Router {
             self.dropped.fetch_add(1, Ordering::Relaxed);
             tracing::debug!(topic, "the router is behind, a message for listeners is dropped");
         }
-    }
-
-    /// Publishes a package's part; false if the router can't take it now.
-    pub(super) fn publish_part(&self, digest: Digest, number: u64, part: Bytes) -> bool {
-        self.hand_over(&format!("{PARTS}{digest}/{number}"), QoS::AtLeastOnce, part)
     }
 
     fn hand_over(&self, topic: &str, qos: QoS, payload: Bytes) -> bool {
@@ -163,12 +146,8 @@ impl Router {
         let running = lock(&self.current).clone();
         let (filter, name, place) = match listening {
             Listening::Everything => {
-                let place = Place::take(self.clone(), listening)?;
+                let place = Place::take(self.clone())?;
                 (self.everything.clone(), format!("listener-{}", place.slot), Some(place))
-            }
-            Listening::Parts => {
-                let place = Place::take(self.clone(), listening)?;
-                (format!("{PARTS}#"), format!("parts-{}", place.slot), Some(place))
             }
             Listening::Canary => (format!("{CANARY_TOPIC}/#"), "canary".to_owned(), None),
         };
@@ -201,7 +180,7 @@ impl Running {
             max_outgoing_packet_count: MAX_BATCH,
             max_segment_size: SEGMENT_BYTES,
             max_segment_count: SEGMENTS,
-            initialized_filters: Some(vec![everything.to_owned(), format!("{PARTS}#"), format!("{CANARY_TOPIC}/#")]),
+            initialized_filters: Some(vec![everything.to_owned(), format!("{CANARY_TOPIC}/#")]),
             ..RouterConfig::default()
         };
         let sender = rumqttd::Router::new(0, config).spawn();
@@ -254,26 +233,21 @@ impl Drop for Link {
 /// One of the names that listeners' links have, free again when this is dropped.
 struct Place {
     router: Arc<Router>,
-    listening: Listening,
     slot: usize,
 }
 
 impl Place {
-    fn take(router: Arc<Router>, listening: Listening) -> Result<Self, RouterError> {
-        let slot = lock(&router.slots).get_mut(&listening).and_then(Vec::pop).ok_or(RouterError::Full)?;
-        if listening == Listening::Everything {
-            router.listeners.fetch_add(1, Ordering::Relaxed);
-        }
-        Ok(Self { router, listening, slot })
+    fn take(router: Arc<Router>) -> Result<Self, RouterError> {
+        let slot = lock(&router.slots).pop().ok_or(RouterError::Full)?;
+        router.listeners.fetch_add(1, Ordering::Relaxed);
+        Ok(Self { router, slot })
     }
 }
 
 impl Drop for Place {
     fn drop(&mut self) {
-        if self.listening == Listening::Everything {
-            self.router.listeners.fetch_sub(1, Ordering::Relaxed);
-        }
-        lock(&self.router.slots).entry(self.listening).or_default().push(self.slot);
+        self.router.listeners.fetch_sub(1, Ordering::Relaxed);
+        lock(&self.router.slots).push(self.slot);
     }
 }
 
@@ -323,12 +297,6 @@ impl Listener {
             () = self.replaced.cancelled() => Err(RouterError::Gone),
         }
     }
-}
-
-/// The package and the number of the part that came on this topic; `None` if it is none.
-pub(super) fn part_of(topic: &str) -> Option<(Digest, u64)> {
-    let (digest, number) = topic.strip_prefix(PARTS)?.split_once('/')?;
-    Some((digest.parse().ok()?, number.parse().ok()?))
 }
 
 /// Undoes what [`Router::publish`] did to the topic.

@@ -215,7 +215,7 @@ mod tests {
         change(&mut limits);
         let listen = "127.0.0.1:0".parse().expect("an address");
         let config = BrokerConfig { listen, prefix: TopicPrefix::default(), limits: limits.clone() };
-        let router = Router::start(&config.prefix, 4, 4).await.expect("a router");
+        let router = Router::start(&config.prefix, 4).await.expect("a router");
         let front =
             Front::start(config, Arc::new(Nobody), Arc::new(Nobody), router.clone()).await.expect("a free port");
         let health = start(&front, router.clone(), &limits);
@@ -273,7 +273,7 @@ mod tests {
         };
         let (sender, mut health) = watch::channel(Health::Serving);
         let limits = Limits { canary_interval: Duration::from_millis(1), ..Limits::default() };
-        let router = Router::start(&TopicPrefix::default(), 1, 1).await.expect("a router");
+        let router = Router::start(&TopicPrefix::default(), 1).await.expect("a router");
         let watchdog =
             Watchdog { address: dead, pass: front.canary_pass(), router, limits, health: sender, flights: 0 };
         watchdog.run().await;

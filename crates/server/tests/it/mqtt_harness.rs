@@ -293,6 +293,14 @@ impl Raw {
         assert_eq!(got, packet, "{got:02x?} came, not {packet:02x?}");
     }
 
+    /// The same for a packet that is too long to be shown.
+    pub async fn expect_large(&mut self, packet: &[u8]) {
+        let mut got = vec![0; packet.len()];
+        let read = timeout(PATIENCE, self.stream.read_exact(&mut got)).await.expect("the packet should come");
+        read.expect("the packet should come whole");
+        assert!(got == packet, "another packet came");
+    }
+
     /// The other side must close, and say nothing before.
     pub async fn expect_close(&mut self) {
         let mut rest = Vec::new();

@@ -1,11 +1,14 @@
 //! A package's parts, fanned out over real TCP: to whom they are granted, as long as they are, no faster than they listen.
 
 use bytes::Bytes;
+use rumqttc::{AsyncClient, Event, MqttOptions, Packet, QoS, SubscribeReasonCode};
 use task_proto::topic::{Topic, TopicPrefix};
 use task_proto::{Digest, RobotId};
-use taskd::broker::{FanOut, FanOutError, MAX_PART_BYTES};
+use taskd::broker::{FanOut, FanOutError, FanOutSettings, MAX_PART_BYTES, Part, PartQos};
+use tokio::sync::Notify;
+use tokio::time::timeout;
 
-use crate::mqtt_harness::{Raw, TestBroker, publish, subscribe, unsubscribe};
+use crate::mqtt_harness::{PATIENCE, Raw, TestBroker, publish, subscribe, unsubscribe};
 
 fn name_of(digest: Digest) -> String {
     TopicPrefix::default().format(&Topic::Package(digest))
@@ -26,8 +29,21 @@ async fn acknowledge(raw: &mut Raw, id: u8) {
     raw.send(&[0x40, 2, 0, id]).await;
 }
 
+fn settings(part_bytes: usize, qos: PartQos) -> FanOutSettings {
+    FanOutSettings { part_bytes, qos }
+}
+
+fn begin(broker: &TestBroker, digest: Digest, robots: &[RobotId]) -> Result<FanOut, FanOutError> {
+    broker.broker.fan_out(digest, settings(64 * 1024, PartQos::AtLeastOnce), robots.to_vec())
+}
+
+fn part(text: &str) -> Part {
+    let (header, bytes) = text.split_at(text.len() / 2);
+    Part { header: Bytes::copy_from_slice(header.as_bytes()), bytes: Bytes::copy_from_slice(bytes.as_bytes()) }
+}
+
 async fn send(fan_out: &mut FanOut, part: &str) {
-    fan_out.publish(Bytes::copy_from_slice(part.as_bytes())).await.expect("sent");
+    fan_out.publish(self::part(part)).await.expect("sent");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -40,13 +56,11 @@ async fn parts_are_heard_by_whom_they_are_granted_to_and_only_as_long() {
         (broker.robot(&robots[0]).await, broker.robot(&robots[1]).await, broker.robot(&robots[2]).await);
     listen(&mut one, digest, 0x80).await;
 
-    let mut fan_out = broker.broker.fan_out(digest, robots[..2].to_vec()).expect("room");
-    let again = broker.broker.fan_out(digest, Vec::new()).err();
+    let mut fan_out = begin(&broker, digest, &robots[..2]).expect("room");
+    let again = begin(&broker, digest, &[]).err();
     assert_eq!(again, Some(FanOutError::UnderWay(digest)));
-    assert_eq!(
-        fan_out.publish(vec![0; MAX_PART_BYTES + 1].into()).await,
-        Err(FanOutError::TooLarge(MAX_PART_BYTES + 1))
-    );
+    let too_large = Part { header: Bytes::from_static(b"h"), bytes: vec![0; MAX_PART_BYTES].into() };
+    assert_eq!(fan_out.publish(too_large).await, Err(FanOutError::TooLarge(MAX_PART_BYTES + 1)));
     send(&mut fan_out, "unheard").await;
     listen(&mut one, digest, 1).await;
     listen(&mut two, digest, 1).await;
@@ -76,7 +90,7 @@ async fn parts_are_heard_by_whom_they_are_granted_to_and_only_as_long() {
     listen(&mut one, digest, 1).await;
     drop(fan_out);
     listen(&mut one, digest, 0x80).await;
-    let mut fan_out = broker.broker.fan_out(digest, robots.clone()).expect("room");
+    let mut fan_out = begin(&broker, digest, &robots).expect("room");
     send(&mut fan_out, "again").await;
     listen(&mut three, digest, 1).await;
     send(&mut fan_out, "and on").await;
@@ -85,48 +99,198 @@ async fn parts_are_heard_by_whom_they_are_granted_to_and_only_as_long() {
         raw.expect_nothing().await;
     }
     drop(three);
-    let fan_outs: Vec<_> = (0u8..).map_while(|n| broker.broker.fan_out(Digest::of(&[n]), Vec::new()).ok()).collect();
+    let fan_outs: Vec<_> = (0u8..).map_while(|n| begin(&broker, Digest::of(&[n]), &[]).ok()).collect();
     assert_eq!(fan_outs.len(), 3, "four at a time");
     broker.assert_serves().await;
 }
 
+/// Hears part `number`, which is the session's message of that packet id, and acknowledges it.
+async fn take(raw: &mut Raw, digest: Digest, number: u8) {
+    hear(raw, digest, number, &format!("part {number}")).await;
+    acknowledge(raw, number).await;
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_robot_that_is_slow_holds_the_parts_back_and_one_that_goes_lets_them_go() {
-    let broker = TestBroker::with(|limits| limits.max_part_listeners = 2).await;
-    let robots: Vec<RobotId> = (0..3).map(|_| RobotId::random()).collect();
+    let broker = TestBroker::start().await;
+    let robots: Vec<RobotId> = (0..2).map(|_| RobotId::random()).collect();
     let digest = Digest::of(b"package");
-    let mut fan_out = broker.broker.fan_out(digest, robots.clone()).expect("room");
-    let (mut quick, mut slow, mut third) =
-        (broker.robot(&robots[0]).await, broker.robot(&robots[1]).await, broker.robot(&robots[2]).await);
+    let mut fan_out = begin(&broker, digest, &robots).expect("room");
+    let (mut quick, mut slow) = (broker.robot(&robots[0]).await, broker.robot(&robots[1]).await);
     listen(&mut quick, digest, 1).await;
     listen(&mut slow, digest, 1).await;
-    listen(&mut third, digest, 0x80).await;
     let publishing = tokio::spawn(async move {
         for number in 1..=100 {
             send(&mut fan_out, &format!("part {number}")).await;
         }
+        fan_out.settle(PATIENCE).await;
         fan_out
     });
-    // 32 without an acknowledgement, and 8 that wait behind them.
-    for number in 1..=40 {
-        hear(&mut quick, digest, number, &format!("part {number}")).await;
-        acknowledge(&mut quick, number).await;
+    for number in 1..=24 {
+        take(&mut quick, digest, number).await;
     }
     quick.expect_nothing().await;
     assert!(!publishing.is_finished());
     for number in 1..=10 {
-        hear(&mut slow, digest, number, &format!("part {number}")).await;
-        acknowledge(&mut slow, number).await;
+        take(&mut slow, digest, number).await;
     }
-    for number in 41..=50 {
-        hear(&mut quick, digest, number, &format!("part {number}")).await;
-        acknowledge(&mut quick, number).await;
+    for number in 25..=34 {
+        take(&mut quick, digest, number).await;
     }
     quick.expect_nothing().await;
     drop(slow);
-    for number in 51..=100 {
-        hear(&mut quick, digest, number, &format!("part {number}")).await;
-        acknowledge(&mut quick, number).await;
+    for number in 35..=100 {
+        take(&mut quick, digest, number).await;
     }
-    assert_eq!(publishing.await.expect("no panic").listeners(), 1);
+    let fan_out = publishing.await.expect("no panic");
+    assert_eq!((fan_out.listeners(), fan_out.take_put_out()), (1, Vec::new()));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_robot_that_reads_nothing_is_put_out_and_what_is_queued_stays_bounded() {
+    const PART_BYTES: usize = 128 * 1024;
+    let broker = TestBroker::start().await;
+    let robots: Vec<RobotId> = (0..3).map(|_| RobotId::random()).collect();
+    let digest = Digest::of(b"package");
+    let mut fan_out =
+        broker.broker.fan_out(digest, settings(PART_BYTES, PartQos::AtLeastOnce), robots.clone()).expect("room");
+    let mut raws = Vec::new();
+    for robot in &robots {
+        raws.push(broker.robot(robot).await);
+    }
+    for raw in &mut raws {
+        listen(raw, digest, 1).await;
+    }
+    let stalled = raws.pop();
+    let hearing: Vec<_> = raws
+        .into_iter()
+        .map(|mut raw| {
+            tokio::spawn(async move {
+                for number in 1..=200 {
+                    raw.expect_large(&publish(&name_of(digest), 1, number.into(), &vec![number; PART_BYTES])).await;
+                    acknowledge(&mut raw, number).await;
+                }
+                raw
+            })
+        })
+        .collect();
+    for number in 1..=200 {
+        let bytes = vec![number; PART_BYTES].into();
+        fan_out.publish(Part { header: Bytes::new(), bytes }).await.expect("sent");
+        // The window, however many listen and however slow they are.
+        assert!(broker.broker.queued_part_bytes() <= 24 * PART_BYTES);
+    }
+    let mut raws = Vec::new();
+    for hearing in hearing {
+        raws.push(hearing.await.expect("heard all"));
+    }
+    assert_eq!((fan_out.take_put_out(), fan_out.listeners()), (vec![robots[2].clone()], 2));
+    drop(fan_out);
+    assert_eq!(broker.broker.queued_part_bytes(), 0);
+    drop(stalled);
+    broker.assert_serves().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn parts_come_with_the_lower_of_both_qualities_of_service() {
+    let broker = TestBroker::start().await;
+    let robot = RobotId::random();
+    let digest = Digest::of(b"package");
+    let (unsure, sure, exact) = (PartQos::AtMostOnce, PartQos::AtLeastOnce, PartQos::ExactlyOnce);
+    for (ours, its, expected) in [(unsure, 2, 0), (sure, 0, 0), (sure, 2, 1), (exact, 1, 1), (exact, 2, 2)] {
+        let mut fan_out = broker.broker.fan_out(digest, settings(16, ours), vec![robot.clone()]).expect("room");
+        let mut raw = broker.robot(&robot).await;
+        raw.send(&subscribe(9, &[(&name_of(digest), its)])).await;
+        raw.expect(&[0x90, 3, 0, 9, its]).await;
+        let hearing = tokio::spawn(async move {
+            for number in 1..=100 {
+                raw.expect(&publish(&name_of(digest), expected, number, b"sixteen bytes ok")).await;
+                let id = number as u8;
+                match expected {
+                    0 => {}
+                    1 => acknowledge(&mut raw, id).await,
+                    _ => {
+                        raw.send(&[0x50, 2, 0, id]).await;
+                        raw.expect(&[0x62, 2, 0, id]).await;
+                        raw.send(&[0x70, 2, 0, id]).await;
+                    }
+                }
+            }
+            raw
+        });
+        for _ in 0..100 {
+            send(&mut fan_out, "sixteen bytes ok").await;
+            fan_out.settle(PATIENCE).await;
+        }
+        hearing.await.expect("heard all");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_whole_package_is_one_message_that_nobody_copies() {
+    let broker = TestBroker::start().await;
+    let robots: Vec<RobotId> = (0..4).map(|_| RobotId::random()).collect();
+    let digest = Digest::of(b"package");
+    let bytes: Bytes = (0..48 * 1024 * 1024_u32).map(|at| (at % 251) as u8).collect::<Vec<u8>>().into();
+    let settings = settings(bytes.len() + 1, PartQos::AtLeastOnce);
+    let mut fan_out = broker.broker.fan_out(digest, settings, robots.clone()).expect("room");
+    let mut hearing = Vec::new();
+    for robot in &robots {
+        let mut raw = broker.robot(robot).await;
+        listen(&mut raw, digest, 1).await;
+        let expected = publish(&name_of(digest), 1, 1, &[b"h", &bytes[..]].concat());
+        hearing.push(tokio::spawn(async move {
+            raw.expect_large(&expected).await;
+            acknowledge(&mut raw, 1).await;
+            raw
+        }));
+    }
+    fan_out.publish(Part { header: Bytes::from_static(b"h"), bytes: bytes.clone() }).await.expect("sent");
+    assert_eq!(broker.broker.queued_part_bytes(), bytes.len() + 1, "once, for all");
+    fan_out.settle(PATIENCE).await;
+    for hearing in hearing {
+        hearing.await.expect("heard all").expect_nothing().await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_independent_client_hears_every_part_in_order_whatever_the_quality_of_service() {
+    const PARTS: u32 = 300;
+    let (broker, subscribed) = (TestBroker::start().await, Notify::new());
+    for (ours, its) in [
+        (PartQos::AtMostOnce, QoS::AtMostOnce),
+        (PartQos::AtLeastOnce, QoS::AtLeastOnce),
+        (PartQos::ExactlyOnce, QoS::ExactlyOnce),
+    ] {
+        let (robot, digest) = (RobotId::random(), Digest::of(b"package"));
+        let mut fan_out = broker.broker.fan_out(digest, settings(8192, ours), vec![robot.clone()]).expect("room");
+        let mut options = MqttOptions::new(robot.as_str(), "127.0.0.1", broker.address().port());
+        options.set_credentials(robot.as_str(), format!("pw-{robot}"));
+        let (client, mut events) = AsyncClient::new(options, 10);
+        client.subscribe(name_of(digest), its).await.expect("queued");
+        let hearing = async {
+            let mut heard = 0;
+            while heard < PARTS {
+                match events.poll().await.expect("connected") {
+                    Event::Incoming(Packet::Publish(part)) => {
+                        assert_eq!((part.qos, &part.payload[..4]), (its, &heard.to_be_bytes()[..]));
+                        heard += 1;
+                    }
+                    Event::Incoming(Packet::SubAck(ack)) => {
+                        assert_eq!(ack.return_codes, [SubscribeReasonCode::Success(its)]);
+                        subscribed.notify_one();
+                    }
+                    _ => {}
+                }
+            }
+        };
+        let publishing = async {
+            subscribed.notified().await;
+            for number in 0..PARTS {
+                let header = Bytes::copy_from_slice(&number.to_be_bytes());
+                fan_out.publish(Part { header, bytes: vec![0; 8000].into() }).await.expect("sent");
+            }
+        };
+        timeout(PATIENCE, async { tokio::join!(hearing, publishing) }).await.expect("all should arrive");
+    }
 }

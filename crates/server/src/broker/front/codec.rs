@@ -89,21 +89,34 @@ pub(super) fn encode(packet: Packet, output: &mut BytesMut) {
 
 /// Writes a PUBLISH, which rumqttd lets nobody else build with a QoS.
 pub(super) fn encode_publish(publish: &Publish, output: &mut BytesMut) {
-    let (Publish { topic, qos, packet_id, payload }, before) = (publish, output.len());
-    let has_id = *qos != QoS::AtMostOnce;
-    let length = 2 + topic.len() + if has_id { 2 } else { 0 } + payload.len();
-    output.put_u8(0x30 | (*qos as u8) << 1);
+    let Publish { topic, qos, packet_id, payload } = publish;
+    if encode_publish_head(topic, *qos, *packet_id, payload.len(), output) {
+        output.put_slice(payload);
+    }
+}
+
+/// Writes all of a PUBLISH but its payload; false, and nothing is written, if no packet can be as large.
+pub(super) fn encode_publish_head(
+    topic: &str,
+    qos: QoS,
+    packet_id: u16,
+    payload_bytes: usize,
+    output: &mut BytesMut,
+) -> bool {
+    let (has_id, before) = (qos != QoS::AtMostOnce, output.len());
+    let length = 2 + topic.len() + if has_id { 2 } else { 0 } + payload_bytes;
+    output.put_u8(0x30 | (qos as u8) << 1);
     let (Ok(topic_bytes), Ok(_)) = (u16::try_from(topic.len()), write_remaining_length(output, length)) else {
         output.truncate(before);
         tracing::error!(length, "could not encode an MQTT message");
-        return;
+        return false;
     };
     output.put_u16(topic_bytes);
     output.put_slice(topic.as_bytes());
     if has_id {
-        output.put_u16(*packet_id);
+        output.put_u16(packet_id);
     }
-    output.put_slice(payload);
+    true
 }
 
 /// The packet type, and the flags that go with it.

@@ -7,8 +7,10 @@ mod access;
 mod codec;
 mod doorbell;
 mod entrance;
+mod laggard;
 mod listener;
 mod outgoing;
+mod output;
 mod parts;
 mod session;
 mod takeover;
@@ -100,15 +102,6 @@ impl Front {
 
     pub(super) fn grants(&self) -> &Grants {
         &self.context.grants
-    }
-
-    /// Hands a part to the router; false if that is behind.
-    pub(super) fn publish_part(&self, grant: &Grant, number: u64, part: Bytes) -> bool {
-        let is_taken = self.context.router.publish_part(grant.digest(), number, part);
-        if is_taken {
-            grant.sent(number);
-        }
-        is_taken
     }
 
     pub(super) fn disconnect(&self, robot: &RobotId) {

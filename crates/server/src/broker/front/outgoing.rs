@@ -7,6 +7,8 @@ use rumqttd::protocol::QoS;
 
 /// Messages under way at a time.
 const MAX_IN_FLIGHT: usize = 32;
+/// Parts of packages among them: a new desired state never waits behind them.
+pub(super) const MAX_PARTS_IN_FLIGHT: usize = 24;
 
 /// The window of messages under way.
 #[derive(Debug, Default)]
@@ -28,6 +30,11 @@ impl Outgoing {
         self.in_flight.len() < MAX_IN_FLIGHT
     }
 
+    /// Whether another part of a package may be sent.
+    pub(super) fn has_room_for_part(&self) -> bool {
+        self.in_flight.len() < MAX_PARTS_IN_FLIGHT
+    }
+
     /// The packet id for a message that is about to be sent; 0 for QoS 0, which needs none.
     pub(super) fn begin(&mut self, qos: QoS) -> u16 {
         let awaiting = match qos {
@@ -45,9 +52,9 @@ impl Outgoing {
         }
     }
 
-    /// A PUBACK came. Acknowledgements of what was not sent are ignored; they change nothing.
-    pub(super) fn acknowledged(&mut self, id: u16) {
-        self.end(id, Awaiting::Acknowledgement);
+    /// A PUBACK came; true if it ends a message. Acknowledgements of what was not sent change nothing.
+    pub(super) fn acknowledged(&mut self, id: u16) -> bool {
+        self.end(id, Awaiting::Acknowledgement)
     }
 
     /// A PUBREC came; it is answered with PUBREL in any case, as a client may repeat it.
@@ -59,15 +66,17 @@ impl Outgoing {
         }
     }
 
-    /// A PUBCOMP came.
-    pub(super) fn completed(&mut self, id: u16) {
-        self.end(id, Awaiting::Completion);
+    /// A PUBCOMP came; likewise.
+    pub(super) fn completed(&mut self, id: u16) -> bool {
+        self.end(id, Awaiting::Completion)
     }
 
-    fn end(&mut self, id: u16, expected: Awaiting) {
-        if self.in_flight.get(&id) == Some(&expected) {
+    fn end(&mut self, id: u16, expected: Awaiting) -> bool {
+        let is_expected = self.in_flight.get(&id) == Some(&expected);
+        if is_expected {
             self.in_flight.remove(&id);
         }
+        is_expected
     }
 }
 
@@ -102,8 +111,9 @@ mod tests {
     #[test]
     fn the_window_is_bounded() {
         let mut outgoing = Outgoing::default();
-        for _ in 0..MAX_IN_FLIGHT {
+        for number in 0..MAX_IN_FLIGHT {
             assert!(outgoing.has_room());
+            assert_eq!(outgoing.has_room_for_part(), number < MAX_PARTS_IN_FLIGHT);
             outgoing.begin(QoS::ExactlyOnce);
         }
         assert!(!outgoing.has_room());

@@ -1,16 +1,24 @@
-//! Who may hear the parts of which package, and how far each listener has come: a publisher waits for the slowest of
-//! them. It never holds a part and never touches a socket.
+//! Who may hear the parts of which package, the few parts that are on their way, and how far each listener has come. The
+//! parts are held once, whatever the number of listeners, and no more of them than a window; a publisher waits for the
+//! slowest listener, and puts out who holds up the others. It never touches a socket.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
+use rumqttd::protocol::QoS;
 use task_proto::{Digest, RobotId};
 use tokio::sync::Notify;
+use tokio::time::Instant;
 
-/// Packages that are fanned out at the same time. With [`WINDOW`] and the largest part it stays within the router's log.
+use super::laggard::{Hold, Waiting};
+use crate::broker::Part;
+
+/// Packages that are fanned out at the same time.
 const MAX_FAN_OUTS: usize = 4;
-/// Parts that the slowest listener may be behind.
-const WINDOW: u64 = 8;
+/// Parts that the slowest listener may be behind, and the bytes of these parts, if it is not one alone. Fewer than the
+/// messages that a session may have under way, so that there is always room for a new desired state.
+const WINDOW_PARTS: u64 = super::outgoing::MAX_PARTS_IN_FLIGHT as u64;
+const WINDOW_BYTES: u64 = 4 * 1024 * 1024;
 
 /// Every package that is being fanned out.
 #[derive(Default)]
@@ -19,16 +27,48 @@ pub(in crate::broker) struct Grants(Mutex<HashMap<Digest, Arc<Grant>>>);
 /// One package, and the robots that may hear it.
 pub(in crate::broker) struct Grant {
     digest: Digest,
+    qos: QoS,
+    window: u64,
     progress: Mutex<Progress>,
     moved: Notify,
 }
 
-#[derive(Default)]
 struct Progress {
     /// The number of the last part that went out; the first is 1.
     sent: u64,
-    /// The last part that each robot took; `None`: it may listen and does not.
-    robots: HashMap<RobotId, Option<u64>>,
+    /// The last of them, up to a window.
+    parts: VecDeque<Part>,
+    /// Who may listen; `None`: and does not.
+    robots: HashMap<RobotId, Option<Listening>>,
+    listeners: usize,
+    /// Listeners that are a whole window behind.
+    behind: usize,
+    /// Listeners that are done with all that was sent.
+    idle: usize,
+    /// For how long these have waited for those.
+    waiting: Waiting,
+    /// How long all listeners, one after another, have held up the rest.
+    all: Hold,
+    /// Who was put out and not asked for yet.
+    put_out: Vec<RobotId>,
+}
+
+/// How far a listener has come.
+struct Listening {
+    /// The last part that its session took.
+    taken: u64,
+    /// Those that it took and its robot has not acknowledged.
+    open: BTreeSet<u64>,
+    hold: Hold,
+    /// Tells its session that there is something new.
+    news: Arc<Notify>,
+}
+
+impl Listening {
+    /// The parts of `sent` that are not done with.
+    fn lacks(&self, sent: u64) -> u64 {
+        sent - self.open.first().map_or(self.taken, |first| first - 1)
+    }
 }
 
 /// Why there is no grant.
@@ -41,8 +81,15 @@ pub(in crate::broker) enum NotGranted {
 }
 
 impl Grants {
-    /// Opens the package to the robots.
-    pub(in crate::broker) fn open(&self, digest: Digest, robots: Vec<RobotId>) -> Result<Arc<Grant>, NotGranted> {
+    /// Opens the package, in parts of `part_bytes`, to the robots.
+    pub(in crate::broker) fn open(
+        &self,
+        digest: Digest,
+        part_bytes: usize,
+        qos: QoS,
+        robots: Vec<RobotId>,
+        now: Instant,
+    ) -> Result<Arc<Grant>, NotGranted> {
         let mut table = lock(&self.0);
         if table.contains_key(&digest) {
             return Err(NotGranted::UnderWay);
@@ -50,9 +97,9 @@ impl Grants {
         if table.len() >= MAX_FAN_OUTS {
             return Err(NotGranted::Full);
         }
-        let robots = robots.into_iter().map(|robot| (robot, None)).collect();
-        let progress = Mutex::new(Progress { sent: 0, robots });
-        let grant = Arc::new(Grant { digest, progress, moved: Notify::new() });
+        let window = (WINDOW_BYTES / part_bytes.max(1) as u64).clamp(1, WINDOW_PARTS);
+        let progress = Progress::begin(robots, now);
+        let grant = Arc::new(Grant { digest, qos, window, progress: Mutex::new(progress), moved: Notify::new() });
         table.insert(digest, grant.clone());
         Ok(grant)
     }
@@ -60,12 +107,22 @@ impl Grants {
     /// Closes it to everybody.
     pub(in crate::broker) fn close(&self, grant: &Grant) {
         lock(&self.0).remove(&grant.digest);
-        grant.progress().robots.clear();
+        let mut progress = grant.progress();
+        progress.parts.clear();
+        for listening in std::mem::take(&mut progress.robots).into_values().flatten() {
+            listening.news.notify_one();
+        }
+        (progress.listeners, progress.behind, progress.idle) = (0, 0, 0);
     }
 
     /// The package's grant, if `robot` has one.
     pub(super) fn of(&self, digest: &Digest, robot: &RobotId) -> Option<Arc<Grant>> {
         lock(&self.0).get(digest).filter(|grant| grant.progress().robots.contains_key(robot)).cloned()
+    }
+
+    /// The bytes of the parts that are on their way.
+    pub(in crate::broker) fn queued_bytes(&self) -> usize {
+        lock(&self.0).values().map(|grant| grant.queued_bytes()).sum()
     }
 }
 
@@ -74,46 +131,142 @@ impl Grant {
         self.digest
     }
 
+    pub(super) fn qos(&self) -> QoS {
+        self.qos
+    }
+
+    /// Opens it to further robots.
+    pub(in crate::broker) fn admit(&self, robots: impl IntoIterator<Item = RobotId>) {
+        let mut progress = self.progress();
+        for robot in robots {
+            progress.robots.entry(robot).or_default();
+        }
+    }
+
     /// Closes it to one robot.
-    pub(in crate::broker) fn withdraw(&self, robot: &RobotId) {
-        self.progress().robots.remove(robot);
+    pub(in crate::broker) fn withdraw(&self, robot: &RobotId, now: Instant) {
+        self.progress().remove(robot, self.window, now);
         self.moved.notify_one();
     }
 
     /// Robots that listen now.
     pub(in crate::broker) fn listeners(&self) -> usize {
-        self.progress().robots.values().flatten().count()
+        self.progress().listeners
     }
 
-    /// The number of the next part, once no listener is too far behind. For one caller at a time; cancel-safe.
-    pub(in crate::broker) async fn room(&self) -> u64 {
+    /// Whether the robot listens now.
+    pub(in crate::broker) fn is_listening(&self, robot: &RobotId) -> bool {
+        self.progress().robots.get(robot).is_some_and(Option::is_some)
+    }
+
+    /// The bytes of the parts that are held for listeners.
+    pub(in crate::broker) fn queued_bytes(&self) -> usize {
+        self.progress().parts.iter().map(Part::len).sum()
+    }
+
+    /// Waits until no listener is a whole window behind. For one caller at a time; cancel-safe.
+    pub(in crate::broker) async fn room(&self) {
+        while self.progress().behind > 0 {
+            self.moved.notified().await;
+        }
+    }
+
+    /// Waits until no listener lacks any part. Likewise.
+    pub(in crate::broker) async fn all_idle(&self) {
         loop {
             {
                 let progress = self.progress();
-                let slowest = progress.robots.values().flatten().min().copied().unwrap_or(progress.sent);
-                if progress.sent.saturating_sub(slowest) < WINDOW {
-                    return progress.sent + 1;
+                if progress.idle == progress.listeners {
+                    return;
                 }
             }
             self.moved.notified().await;
         }
     }
 
-    /// The part of this number went out.
-    pub(in crate::broker) fn sent(&self, number: u64) {
-        self.progress().sent = number;
+    /// Hands the next part to all who listen. To be called when there is room.
+    pub(in crate::broker) fn send(&self, part: Part, now: Instant) {
+        let mut progress = self.progress();
+        progress.sent += 1;
+        if progress.parts.len() as u64 >= self.window {
+            progress.parts.pop_front();
+        }
+        progress.parts.push_back(part);
+        let Progress { sent, waiting, .. } = *progress;
+        let mut behind = 0;
+        for listening in progress.robots.values_mut().flatten() {
+            listening.news.notify_one();
+            if listening.lacks(sent) >= self.window {
+                listening.hold.set(true, &waiting, now);
+                behind += 1;
+            }
+        }
+        (progress.behind, progress.idle) = (behind, 0);
+        progress.measure(now);
     }
 
-    /// Closes it to those who hold up all others, and says who they were.
-    pub(in crate::broker) fn put_out_stragglers(&self) -> Vec<RobotId> {
+    /// Closes it to those who have held up all others for too long, and says who they were.
+    pub(in crate::broker) fn put_out_laggards(&self, now: Instant) -> Vec<RobotId> {
         let mut progress = self.progress();
-        let sent = progress.sent;
-        let is_straggler = |taken: &Option<u64>| taken.is_some_and(|taken| sent.saturating_sub(taken) >= WINDOW);
-        progress.robots.extract_if(|_, taken| is_straggler(taken)).map(|(robot, _)| robot).collect()
+        let Progress { all, waiting, .. } = *progress;
+        let is_laggard = |listening: &Listening| listening.hold.is_too_long(&all, &waiting, now);
+        let listening = progress.robots.iter().filter(|(_, listening)| listening.as_ref().is_some_and(is_laggard));
+        let laggards: Vec<RobotId> = listening.map(|(robot, _)| robot.clone()).collect();
+        for robot in &laggards {
+            progress.remove(robot, self.window, now);
+        }
+        progress.put_out.extend(laggards.iter().cloned());
+        laggards
+    }
+
+    /// Those put out since this was asked last.
+    pub(in crate::broker) fn take_put_out(&self) -> Vec<RobotId> {
+        std::mem::take(&mut self.progress().put_out)
     }
 
     fn progress(&self) -> MutexGuard<'_, Progress> {
         lock(&self.progress)
+    }
+}
+
+impl Progress {
+    fn begin(robots: Vec<RobotId>, now: Instant) -> Self {
+        let waiting = Waiting::default();
+        let mut all = Hold::new(&waiting, now);
+        all.set(true, &waiting, now);
+        Self {
+            sent: 0,
+            parts: VecDeque::new(),
+            robots: robots.into_iter().map(|robot| (robot, None)).collect(),
+            listeners: 0,
+            behind: 0,
+            idle: 0,
+            waiting,
+            all,
+            put_out: Vec::new(),
+        }
+    }
+
+    /// Takes the robot's right away and tells its session.
+    fn remove(&mut self, robot: &RobotId, window: u64, now: Instant) {
+        if let Some(listening) = self.robots.remove(robot).flatten() {
+            listening.news.notify_one();
+            self.leave(&listening, window, now);
+        }
+    }
+
+    /// The listener counts no longer.
+    fn leave(&mut self, listening: &Listening, window: u64, now: Instant) {
+        let lacks = listening.lacks(self.sent);
+        self.listeners -= 1;
+        self.behind -= usize::from(lacks >= window);
+        self.idle -= usize::from(lacks == 0);
+        self.measure(now);
+    }
+
+    /// Whether the others wait for somebody from now on.
+    fn measure(&mut self, now: Instant) {
+        self.waiting.set(self.behind > 0 && self.idle * 2 >= self.listeners, now);
     }
 }
 
@@ -123,32 +276,86 @@ pub(super) struct Member {
     robot: RobotId,
 }
 
+/// What a member's session should do.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Due {
+    /// Send this part, and say so.
+    Part(u64, Part),
+    /// Forget the package.
+    End,
+    /// Wait.
+    Nothing,
+}
+
 impl Member {
-    /// The robot hears everything from now on. `None` if the grant was withdrawn meanwhile.
-    pub(super) fn join(grant: Arc<Grant>, robot: &RobotId) -> Option<Self> {
-        let mut progress = grant.progress();
-        let sent = progress.sent;
-        *progress.robots.get_mut(robot)? = Some(sent);
+    /// The robot hears everything from now on; `news` tells its session. `None` if the grant was withdrawn meanwhile.
+    pub(super) fn join(grant: Arc<Grant>, robot: &RobotId, news: Arc<Notify>) -> Option<Self> {
+        let (now, mut progress) = (Instant::now(), grant.progress());
+        let hold = Hold::new(&progress.waiting, now);
+        let listening = Listening { taken: progress.sent, open: BTreeSet::new(), hold, news };
+        let before = progress.robots.get_mut(robot)?.replace(listening);
+        (progress.listeners, progress.idle) = (progress.listeners + 1, progress.idle + 1);
+        if let Some(before) = before {
+            progress.leave(&before, grant.window, now);
+        }
         drop(progress);
         Some(Self { grant, robot: robot.clone() })
     }
 
-    /// The robot takes a part; false if it may no longer have it.
-    pub(super) fn take(&self, number: u64) -> bool {
-        let mut progress = self.grant.progress();
-        let Some(taken) = progress.robots.get_mut(&self.robot) else { return false };
-        *taken = (*taken).max(Some(number));
-        drop(progress);
-        self.grant.moved.notify_one();
-        true
+    pub(super) fn qos(&self) -> QoS {
+        self.grant.qos()
+    }
+
+    /// What comes next. It changes nothing.
+    pub(super) fn due(&self) -> Due {
+        let progress = self.grant.progress();
+        let Some(listening) = progress.robots.get(&self.robot).and_then(Option::as_ref) else { return Due::End };
+        let number = listening.taken + 1;
+        let from_the_end = progress.sent.checked_sub(number).and_then(|distance| usize::try_from(distance).ok());
+        let part = from_the_end.and_then(|distance| progress.parts.iter().rev().nth(distance));
+        part.map_or(Due::Nothing, |part| Due::Part(number, part.clone()))
+    }
+
+    /// The session sends the part of this number.
+    pub(super) fn take(&self, number: u64) {
+        if let Some(listening) = self.grant.progress().robots.get_mut(&self.robot).and_then(Option::as_mut) {
+            listening.taken = number;
+            listening.open.insert(number);
+        }
+    }
+
+    /// The robot has it.
+    pub(super) fn acknowledged(&self, number: u64) {
+        let (now, mut progress) = (Instant::now(), self.grant.progress());
+        let (window, sent, waiting) = (self.grant.window, progress.sent, progress.waiting);
+        let Some(listening) = progress.robots.get_mut(&self.robot).and_then(Option::as_mut) else { return };
+        let before = listening.lacks(sent);
+        listening.open.remove(&number);
+        let after = listening.lacks(sent);
+        if before == after {
+            return;
+        }
+        let caught_up = before >= window && after < window;
+        if caught_up {
+            listening.hold.set(false, &waiting, now);
+        }
+        progress.behind -= usize::from(caught_up);
+        progress.idle += usize::from(after == 0);
+        progress.measure(now);
+        if caught_up || progress.idle == progress.listeners {
+            drop(progress);
+            self.grant.moved.notify_one();
+        }
     }
 }
 
 impl Drop for Member {
     fn drop(&mut self) {
-        if let Some(taken) = self.grant.progress().robots.get_mut(&self.robot) {
-            *taken = None;
+        let mut progress = self.grant.progress();
+        if let Some(listening) = progress.robots.get_mut(&self.robot).and_then(Option::take) {
+            progress.leave(&listening, self.grant.window, Instant::now());
         }
+        drop(progress);
         self.grant.moved.notify_one();
     }
 }
@@ -166,26 +373,70 @@ mod tests {
 
     #[test]
     fn the_slowest_listener_holds_the_publisher_up_until_it_goes() {
-        let grants = Grants::default();
+        let (grants, now) = (Grants::default(), Instant::now());
         let (quick, slow) = (RobotId::random(), RobotId::random());
-        let digest = Digest::of(b"package");
-        let grant = grants.open(digest, vec![quick.clone(), slow.clone()]).expect("room");
-        assert_eq!(grants.open(digest, Vec::new()).err(), Some(NotGranted::UnderWay));
-        assert!(grants.of(&digest, &RobotId::random()).is_none());
-        let join = |robot| Member::join(grants.of(&digest, robot).expect("granted"), robot).expect("granted");
+        let (digest, qos) = (Digest::of(b"package"), QoS::AtLeastOnce);
+        let grant = grants.open(digest, 1024 * 1024, qos, vec![quick.clone()], now).expect("room");
+        assert_eq!(grants.open(digest, 1, qos, Vec::new(), now).err(), Some(NotGranted::UnderWay));
+        assert!(grants.of(&digest, &slow).is_none());
+        grant.admit([slow.clone()]);
+        let join = |robot| {
+            let grant = grants.of(&digest, robot).expect("granted");
+            Member::join(grant, robot, Arc::default()).expect("granted")
+        };
+        let part = |number: u8| Part { header: vec![number].into(), bytes: vec![0; 1024 * 1024 - 1].into() };
+        let mut last = 0;
+        let mut send = || {
+            let has_room = grant.room().now_or_never().is_some();
+            if has_room {
+                last += 1;
+                grant.send(part(last), now);
+            }
+            has_room
+        };
         let (first, second) = (join(&quick), join(&slow));
-        let send = || grant.room().now_or_never().map(|number| grant.sent(number)).is_some();
-        assert_eq!((0..WINDOW + 5).filter(|_| send()).count() as u64, WINDOW);
-        assert!(first.take(WINDOW));
-        assert!(!send(), "the slow one has taken nothing");
-        assert!(second.take(1));
+        assert_eq!((0..10).filter(|_| send()).count(), 4, "of a megabyte, four are on their way");
+        for number in 1..=4 {
+            assert_eq!(first.due(), Due::Part(u64::from(number), part(number)));
+            first.take(number.into());
+            first.acknowledged(number.into());
+        }
+        assert_eq!(first.due(), Due::Nothing);
+        second.take(1);
+        assert!(!send(), "the slow one has acknowledged nothing");
+        second.acknowledged(1);
         assert!(send() && !send());
-        assert_eq!(grant.put_out_stragglers(), [slow]);
-        assert!(!second.take(2), "it may no longer have it");
+        assert_eq!(grants.queued_bytes(), 4 * 1024 * 1024);
+        let later = now + std::time::Duration::from_secs(60);
+        first.take(5);
+        first.acknowledged(5);
+        assert_eq!(grant.put_out_laggards(later), std::slice::from_ref(&slow));
+        assert_eq!(grant.take_put_out(), [slow]);
+        assert_eq!(second.due(), Due::End);
         assert!(send());
         drop(first);
         assert_eq!((grant.listeners(), (0..100).filter(|_| send()).count()), (0, 100), "nobody to wait for");
         grants.close(&grant);
         assert!(grants.of(&digest, &quick).is_none());
+        assert_eq!(grants.queued_bytes(), 0);
+    }
+
+    #[test]
+    fn acknowledgements_may_come_in_any_order() {
+        let (grants, now, robot) = (Grants::default(), Instant::now(), RobotId::random());
+        let digest = Digest::of(b"package");
+        let grant = grants.open(digest, 64 * 1024, QoS::ExactlyOnce, vec![robot.clone()], now).expect("room");
+        let member = Member::join(grant.clone(), &robot, Arc::default()).expect("granted");
+        for number in 1..=WINDOW_PARTS {
+            assert!(grant.room().now_or_never().is_some());
+            grant.send(Part { header: Default::default(), bytes: Default::default() }, now);
+            member.take(number);
+        }
+        for number in (2..=WINDOW_PARTS).rev() {
+            member.acknowledged(number);
+            assert!(grant.room().now_or_never().is_none() && grant.all_idle().now_or_never().is_none());
+        }
+        member.acknowledged(1);
+        assert!(grant.room().now_or_never().is_some() && grant.all_idle().now_or_never().is_some());
     }
 }

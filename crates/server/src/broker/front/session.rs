@@ -22,20 +22,20 @@ use super::access::{Hearing, Route, Visitor, may_publish};
 use super::codec::{DecodeError, Publish, Received, Will, decode, encode, encode_publish};
 use super::entrance::{Guest, Rejection, connack, reject, welcome};
 use super::outgoing::Outgoing;
-use super::parts::Member;
+use super::output::{Output, give_back};
+use super::parts::Due;
 use super::takeover::Seat;
 use super::traffic::{Count, Meter, Metered};
 use crate::broker::router::{Heard, Listener, Listening, RouterError};
 use crate::broker::{Inbox, NotStored, RobotMessage};
 
+mod parts;
 mod subscriptions;
 
-use subscriptions::{Opening, opened};
+use parts::{Parts, due};
 
 /// Answers a client may leave unread before nothing more is read from it.
 const MAX_UNREAD_BYTES: usize = 64 * 1024;
-/// Buffers above this are given back when they are empty.
-const MAX_IDLE_BYTES: usize = 8 * 1024;
 /// QoS 2 messages a client may leave unreleased.
 const MAX_UNRELEASED: usize = 64;
 /// How long a connection is kept open for the client to read what was said last.
@@ -61,6 +61,9 @@ enum End {
     NotStored,
     #[error("must leave: a newer session, or the server's decision")]
     Asked,
+    /// In the middle of a part.
+    #[error("may no longer have what it is being sent")]
+    Withdrawn,
     #[error("lost the router")]
     RouterLost,
     #[error("ends with the server")]
@@ -138,8 +141,8 @@ where
 {
     let _attendance = Attendance::begin(context, &guest.visitor, peer, seat.number());
     let (reader, writer) = tokio::io::split(stream);
-    let mut output = BytesMut::new();
-    connack(ConnectReturnCode::Success, &mut output);
+    let mut output = Output::default();
+    connack(ConnectReturnCode::Success, output.packets());
     seat.meter().add(Count::PacketsIn, 1);
     seat.meter().add(Count::PacketsOut, 1);
     let now = Instant::now();
@@ -154,8 +157,7 @@ where
         output,
         listener,
         hearing: HashMap::new(),
-        members: HashMap::new(),
-        opening: None,
+        parts: Parts::default(),
         outgoing: Outgoing::default(),
         unreleased: HashSet::new(),
         storing: None,
@@ -214,12 +216,10 @@ struct Session<'a, S> {
     reader: ReadHalf<&'a mut S>,
     writer: WriteHalf<&'a mut S>,
     input: BytesMut,
-    output: BytesMut,
+    output: Output,
     listener: Option<Listener>,
     hearing: HashMap<String, (Hearing, QoS)>,
-    /// The packages whose parts it hears.
-    members: HashMap<Digest, Member>,
-    opening: Option<Opening>,
+    parts: Parts,
     outgoing: Outgoing,
     unreleased: HashSet<u16>,
     storing: Option<Storing<'a>>,
@@ -244,7 +244,7 @@ enum Woken {
     Rung(Bytes),
     Asked(Bytes),
     Heard(Result<Heard, RouterError>),
-    Opened(Result<Listener, RouterError>),
+    PartDue(Digest, Due),
     Late(End),
 }
 
@@ -264,7 +264,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
                 break end;
             }
         };
-        if end != End::Deaf {
+        if !matches!(end, End::Deaf | End::Withdrawn) {
             // What was answered before the end is still due. If it can't be had any more, the connection is over anyway.
             let _ = timeout(LINGER, self.writer.write_all_buf(&mut self.output)).await;
         }
@@ -277,6 +277,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         let (deadline, lateness) = self.deadline();
         let may_read = self.may_read();
         let may_send = self.output.is_empty() && self.outgoing.has_room();
+        let may_send_part = may_send && self.outgoing.has_room_for_part();
         let hears_desired = self.qos_of(Hearing::Desired).is_some();
         let hears_request = self.qos_of(Hearing::Request).is_some();
         if may_read {
@@ -284,11 +285,11 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         }
         let woken = tokio::select! {
             stored = stored(&mut self.storing) => Woken::Stored(stored),
-            link = opened(&mut self.opening) => Woken::Opened(link),
             wrote = self.writer.write_buf(&mut self.output), if !self.output.is_empty() => Woken::Wrote(wrote),
             read = self.reader.read_buf(&mut self.input), if may_read => Woken::Read(read),
             payload = self.seat.doorbell().answer(), if may_send && hears_desired => Woken::Rung(payload),
             payload = self.seat.doorbell().question(), if may_send && hears_request => Woken::Asked(payload),
+            (digest, due) = due(&self.parts, may_send_part) => Woken::PartDue(digest, due),
             heard = heard(&mut self.listener), if may_send => Woken::Heard(heard),
             () = sleep_until(deadline) => Woken::Late(lateness),
         };
@@ -320,12 +321,12 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
     }
 
     fn may_read(&self) -> bool {
-        !self.is_busy() && self.output.len() < MAX_UNREAD_BYTES
+        !self.is_busy() && self.output.own_bytes() < MAX_UNREAD_BYTES
     }
 
     /// Whether what was read last is still being acted on.
     fn is_busy(&self) -> bool {
-        self.storing.is_some() || self.opening.is_some()
+        self.storing.is_some()
     }
 
     fn act_on(&mut self, woken: Woken) -> Result<(), End> {
@@ -334,12 +335,15 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
             Woken::Read(Ok(_)) => {}
             Woken::Wrote(Ok(_)) => {
                 self.progress_at = Instant::now();
-                give_back(&mut self.output);
+                self.output.give_back();
+                if self.output.is_empty() {
+                    self.parts.written();
+                }
             }
             Woken::Stored(stored) => self.acknowledge_stored(stored)?,
             Woken::Rung(payload) => self.send_own(RobotTopic::Desired, Hearing::Desired, payload),
             Woken::Asked(payload) => self.send_own(RobotTopic::Request, Hearing::Request, payload),
-            Woken::Opened(link) => self.link_opened(link),
+            Woken::PartDue(digest, due) => self.act_on_part(digest, due)?,
             Woken::Heard(heard) => self.pass_on(heard.map_err(|_| End::RouterLost)?),
             Woken::Late(end) => return Err(end),
         }
@@ -363,11 +367,14 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
             Received::Publish(publish) => self.publish(publish)?,
             Received::PubAck(id) => {
                 self.count(Count::AcksIn);
-                self.outgoing.acknowledged(id);
+                if self.outgoing.acknowledged(id) {
+                    self.parts.acknowledged(id);
+                }
                 self.progress_at = self.heard_at;
             }
             Received::PubRec(pkid) => {
                 self.outgoing.received(pkid);
+                self.progress_at = self.heard_at;
                 self.send(Packet::PubRel(PubRel { pkid, reason: PubRelReason::Success }, None));
             }
             Received::PubRel(pkid) => {
@@ -375,7 +382,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
                 self.send(Packet::PubComp(PubComp { pkid, reason: PubCompReason::Success }, None));
             }
             Received::PubComp(id) => {
-                self.outgoing.completed(id);
+                if self.outgoing.completed(id) {
+                    self.parts.acknowledged(id);
+                }
                 self.progress_at = self.heard_at;
             }
             Received::Subscribe { packet_id, filters } => self.subscribe(packet_id, filters)?,
@@ -458,7 +467,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         let packet_id = self.outgoing.begin(qos);
         self.count(Count::PacketsOut);
         self.count(Count::MessagesOut);
-        encode_publish(&Publish { topic, qos, packet_id, payload }, &mut self.output);
+        encode_publish(&Publish { topic, qos, packet_id, payload }, self.output.packets());
     }
 
     fn count(&self, count: Count) {
@@ -467,7 +476,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
 
     fn send(&mut self, packet: Packet) {
         self.count(Count::PacketsOut);
-        encode(packet, &mut self.output);
+        encode(packet, self.output.packets());
     }
 
     fn message(&self, robot: &RobotId, token_number: u64, topic: RobotTopic, payload: Bytes) -> RobotMessage {
@@ -513,11 +522,4 @@ async fn heard(listener: &mut Option<Listener>) -> Result<Heard, RouterError> {
 
 fn lower(a: QoS, b: QoS) -> QoS {
     if (a as u8) < b as u8 { a } else { b }
-}
-
-/// An idle connection holds no large buffer.
-fn give_back(buffer: &mut BytesMut) {
-    if buffer.is_empty() && buffer.capacity() > MAX_IDLE_BYTES {
-        *buffer = BytesMut::new();
-    }
 }

@@ -1,0 +1,134 @@
+//! Who holds up the others of a fan-out for too long: pure functions of how long each has. A listener is slow only compared
+//! with the others: time counts while at least half of them have all there is and wait. Where most are busy, it is
+//! the network that is slow.
+
+use std::time::Duration;
+
+use tokio::time::Instant;
+
+/// How long a listener may hold up the others, on balance.
+const PATIENCE: Duration = Duration::from_secs(2);
+/// When all of them, one after another, have held up the rest for as long as this on balance …
+const PATIENCE_WITH_ALL: Duration = Duration::from_secs(10);
+/// … each is left only so much.
+const LITTLE_PATIENCE: Duration = Duration::from_millis(250);
+/// How long a listener may stay behind without a step forward, whether others wait or not.
+const LONGEST: Duration = Duration::from_secs(30);
+
+/// For how long so far the others have waited for somebody.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Waiting {
+    before: Duration,
+    since: Option<Instant>,
+}
+
+impl Waiting {
+    /// From now on they do, or do not.
+    pub(super) fn set(&mut self, is_waiting: bool, now: Instant) {
+        self.before = self.total(now);
+        self.since = is_waiting.then_some(now);
+    }
+
+    fn total(&self, now: Instant) -> Duration {
+        self.before + self.since.map_or(Duration::ZERO, |since| now.saturating_duration_since(since))
+    }
+}
+
+/// How long the others have waited for one of them, on balance: it grows while they do, and shrinks as fast otherwise.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Hold {
+    balance: Duration,
+    settled_at: Instant,
+    settled_total: Duration,
+    behind_since: Option<Instant>,
+}
+
+impl Hold {
+    /// One that has just come.
+    pub(super) fn new(waiting: &Waiting, now: Instant) -> Self {
+        Self { balance: Duration::ZERO, settled_at: now, settled_total: waiting.total(now), behind_since: None }
+    }
+
+    /// From now on the listener is behind, or is not.
+    pub(super) fn set(&mut self, is_behind: bool, waiting: &Waiting, now: Instant) {
+        let balance = self.balance(waiting, now);
+        *self = Self { balance, behind_since: is_behind.then_some(now), ..Self::new(waiting, now) };
+    }
+
+    fn balance(&self, waiting: &Waiting, now: Instant) -> Duration {
+        let elapsed = now.saturating_duration_since(self.settled_at);
+        let charged = match self.behind_since {
+            Some(_) => waiting.total(now).saturating_sub(self.settled_total).min(elapsed),
+            None => Duration::ZERO,
+        };
+        (self.balance + charged).saturating_sub(elapsed - charged)
+    }
+
+    /// Whether the listener should go; `all` is as if one of them had always been behind.
+    pub(super) fn is_too_long(&self, all: &Self, waiting: &Waiting, now: Instant) -> bool {
+        let Some(since) = self.behind_since else { return false };
+        let is_impatient = all.balance(waiting, now) > PATIENCE_WITH_ALL;
+        let patience = if is_impatient { LITTLE_PATIENCE } else { PATIENCE };
+        self.balance(waiting, now) >= patience || now.saturating_duration_since(since) >= LONGEST
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn ms(number: u64) -> Duration {
+        Duration::from_millis(number)
+    }
+
+    #[test]
+    fn who_holds_up_others_for_two_seconds_is_put_out() {
+        let start = Instant::now();
+        let (mut waiting, quiet) = (Waiting::default(), Waiting::default());
+        let (mut hold, all) = (Hold::new(&waiting, start), Hold::new(&waiting, start));
+        assert!(!hold.is_too_long(&all, &waiting, start + ms(60_000)));
+        hold.set(true, &waiting, start);
+        assert!(!hold.is_too_long(&all, &quiet, start + ms(29_999)), "nobody waits");
+        assert!(hold.is_too_long(&all, &quiet, start + ms(30_000)));
+        waiting.set(true, start);
+        assert!(!hold.is_too_long(&all, &waiting, start + ms(1_999)));
+        assert!(hold.is_too_long(&all, &waiting, start + ms(2_000)));
+        // What it makes good counts for it: 1,500 less 1,000, and 1,500 more.
+        hold.set(false, &waiting, start + ms(1_500));
+        hold.set(true, &waiting, start + ms(2_500));
+        assert!(!hold.is_too_long(&all, &waiting, start + ms(3_999)));
+        assert!(hold.is_too_long(&all, &waiting, start + ms(4_000)));
+    }
+
+    #[test]
+    fn who_is_half_as_fast_as_the_rest_stays_and_who_is_slower_does_not() {
+        let lasts = |busy_ms: u64, waiting_ms: u64| {
+            let (mut now, mut waiting) = (Instant::now(), Waiting::default());
+            let (mut hold, all) = (Hold::new(&waiting, now), Hold::new(&waiting, now));
+            (0..1000).all(|_| {
+                hold.set(true, &waiting, now);
+                now += ms(busy_ms);
+                waiting.set(true, now);
+                now += ms(waiting_ms);
+                let is_in = !hold.is_too_long(&all, &waiting, now);
+                waiting.set(false, now);
+                hold.set(false, &waiting, now);
+                is_in
+            })
+        };
+        assert!(lasts(100, 100));
+        assert!(!lasts(90, 100));
+    }
+
+    #[test]
+    fn many_that_stall_by_turns_find_less_patience() {
+        let start = Instant::now();
+        let mut waiting = Waiting::default();
+        let (mut hold, mut all) = (Hold::new(&waiting, start), Hold::new(&waiting, start));
+        all.set(true, &waiting, start);
+        waiting.set(true, start);
+        hold.set(true, &waiting, start + ms(10_000));
+        assert!(!hold.is_too_long(&all, &waiting, start + ms(10_249)));
+        assert!(hold.is_too_long(&all, &waiting, start + ms(10_250)));
+    }
+}

@@ -2,13 +2,22 @@
 //! One table names every setting, so the three sources can't drift apart. It reads the file it is pointed to and
 //! resolves host names; it never creates anything.
 
+mod settings;
+mod tables;
+
 use std::ffi::OsString;
-use std::net::{SocketAddr, ToSocketAddrs as _};
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::{Arg, ArgAction, ArgMatches};
+use task_proto::id::LabelKey;
+use task_proto::part::DEFAULT_PART_BYTES;
 use task_proto::topic::TopicPrefix;
+
+use self::settings::{SETTINGS, Setting};
+pub use self::tables::{SiteLimits, TransferLimits};
+use crate::delivery::{Rule, Rules};
 
 /// Everything `taskd serve` can be told.
 #[derive(Debug, Clone)]
@@ -47,6 +56,44 @@ pub struct Config {
     pub max_silent_per_address: usize,
     /// The most bytes one blob may have.
     pub max_blob_bytes: u64,
+    /// How packages travel to robots.
+    pub delivery: DeliverySettings,
+    /// What bounds the transfers of packages over HTTP.
+    pub transfers: TransferLimits,
+}
+
+/// `[delivery]`: how packages travel to robots.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct DeliverySettings {
+    /// The size of a part in direct-push. A package that is not larger travels as one message.
+    pub part_bytes: u32,
+    /// The MQTT quality of service of parts: 0, 1 or 2.
+    pub qos: u8,
+    /// The most bytes of a package that ride inside an announcement.
+    pub inline_bytes: u32,
+    /// The label whose value says on which site a robot is.
+    pub site_label: LabelKey,
+    /// The operator's own rules, the first first.
+    pub own_rules: Vec<Rule>,
+}
+
+impl DeliverySettings {
+    /// All rules in their order.
+    pub fn rules(&self) -> Rules {
+        Rules::new(self.own_rules.clone(), self.inline_bytes.into())
+    }
+}
+
+impl Default for DeliverySettings {
+    fn default() -> Self {
+        Self {
+            part_bytes: DEFAULT_PART_BYTES,
+            qos: 1,
+            inline_bytes: 32 * 1024,
+            site_label: "site".parse().expect("a label's key"),
+            own_rules: Vec::new(),
+        }
+    }
 }
 
 /// How the blob handler gets at a file's bytes.
@@ -135,148 +182,6 @@ pub enum ConfigError {
     },
 }
 
-/// One setting. `topic-prefix` is the flag's name; the file's key is `topic_prefix`, the variable `TASKD_TOPIC_PREFIX`.
-struct Setting {
-    name: &'static str,
-    value_name: &'static str,
-    help: &'static str,
-    set: fn(&mut Config, &str) -> Result<(), String>,
-}
-
-impl Setting {
-    fn key(&self) -> String {
-        self.name.replace('-', "_")
-    }
-
-    fn by_key(key: &str) -> Option<&'static Self> {
-        SETTINGS.iter().find(|setting| setting.key() == key)
-    }
-}
-
-const SETTINGS: &[Setting] = &[
-    Setting {
-        name: "data",
-        value_name: "DIR",
-        help: "Directory that holds all state; created on the first start [default: ~/.local/share/taskd]",
-        set: |config, text| {
-            config.data = PathBuf::from(non_empty(text)?);
-            Ok(())
-        },
-    },
-    Setting {
-        name: "http",
-        value_name: "ADDR",
-        help: "Where HTTP listens; port 0 takes a free one [default: 127.0.0.1:8080]",
-        set: |config, text| address(text).map(|address| config.http = address),
-    },
-    Setting {
-        name: "mqtt",
-        value_name: "ADDR",
-        help: "Where MQTT listens; port 0 takes a free one [default: 127.0.0.1:1883]",
-        set: |config, text| address(text).map(|address| config.mqtt = address),
-    },
-    Setting {
-        name: "database",
-        value_name: "URL",
-        help: "sqlite:PATH or postgres://… [default: SQLite in the data directory]",
-        set: |config, text| database_url(text).map(|url| config.database = Some(url)),
-    },
-    Setting {
-        name: "topic-prefix",
-        value_name: "PREFIX",
-        help: "What all MQTT topics start with [default: taskd/v1]",
-        set: |config, text| parsed(text).map(|prefix| config.topic_prefix = prefix),
-    },
-    Setting {
-        name: "allow-plaintext",
-        value_name: "BOOL",
-        help: "Let unencrypted listeners be reached from other machines",
-        set: |config, text| boolean(text).map(|allow| config.allow_plaintext = allow),
-    },
-    Setting {
-        name: "assignment-expiry",
-        value_name: "TIME",
-        help: "How long an assignment may stay undone [default: 7d]",
-        set: |config, text| lifetime(text).map(|time| config.assignment_expiry = time),
-    },
-    Setting {
-        name: "desired-lifetime",
-        value_name: "TIME",
-        help: "How long a signed desired state allows new work to be begun [default: 30d]",
-        set: |config, text| lifetime(text).map(|time| config.desired_lifetime = time),
-    },
-    Setting {
-        name: "public-mqtt-host",
-        value_name: "HOST",
-        help: "MQTT host that robots are told [default: the host of the URL they use]",
-        set: |config, text| {
-            config.public_mqtt_host = Some(non_empty(text)?);
-            Ok(())
-        },
-    },
-    Setting {
-        name: "public-mqtt-port",
-        value_name: "PORT",
-        help: "MQTT port that robots are told [default: the port that is bound]",
-        set: |config, text| match text.parse() {
-            Ok(port) if port > 0 => {
-                config.public_mqtt_port = Some(port);
-                Ok(())
-            }
-            _ => Err(format!("{text:?} is not a port: expected 1 to 65535")),
-        },
-    },
-    Setting {
-        name: "presence-timeout",
-        value_name: "TIME",
-        help: "After how long a silent robot that polls counts as offline [default: 90s]",
-        set: |config, text| lifetime(text).map(|time| config.presence_timeout = time),
-    },
-    Setting {
-        name: "blob-read",
-        value_name: "mmap|pread",
-        help: "How blobs are read [default: mmap]",
-        set: |config, text| {
-            config.blob_read = match text {
-                "mmap" => BlobRead::Mmap,
-                "pread" => BlobRead::Pread,
-                _ => return Err(format!("{text:?} is neither \"mmap\" nor \"pread\"")),
-            };
-            Ok(())
-        },
-    },
-    Setting {
-        name: "blob-grace",
-        value_name: "TIME",
-        help: "How long unfinished uploads and unreferenced blobs are kept [default: 1d]",
-        set: |config, text| lifetime(text).map(|time| config.blob_grace = time),
-    },
-    Setting {
-        name: "max-http-connections",
-        value_name: "N",
-        help: "Most HTTP connections at once [default: 20000]",
-        set: |config, text| count(text, 1_000_000).map(|n| config.max_http_connections = n as usize),
-    },
-    Setting {
-        name: "max-mqtt-connections",
-        value_name: "N",
-        help: "Most MQTT connections at once [default: 20000]",
-        set: |config, text| count(text, 1_000_000).map(|n| config.max_mqtt_connections = n as usize),
-    },
-    Setting {
-        name: "max-silent-per-address",
-        value_name: "N",
-        help: "Most connections of one address that have sent nothing yet [default: 2048]",
-        set: |config, text| count(text, 1_000_000).map(|n| config.max_silent_per_address = n as usize),
-    },
-    Setting {
-        name: "max-blob-bytes",
-        value_name: "BYTES",
-        help: "Most bytes of one blob [default: 17179869184]",
-        set: |config, text| count(text, 1 << 50).map(|n| config.max_blob_bytes = n),
-    },
-];
-
 /// Variables that other commands and tasks use; `serve` is not confused by finding them.
 const FOREIGN_VARIABLES: [&str; 4] = ["TASKD_SERVER", "TASKD_TOKEN", "TASKD_ASSIGNMENT", "TASKD_LOG"];
 /// What the test suite's own variables start with.
@@ -306,6 +211,8 @@ impl Config {
             max_mqtt_connections: 20_000,
             max_silent_per_address: 2048,
             max_blob_bytes: 16 << 30,
+            delivery: DeliverySettings::default(),
+            transfers: TransferLimits::default(),
         }
     }
 
@@ -352,27 +259,33 @@ impl Config {
         let text = std::fs::read_to_string(path).map_err(unreadable)?;
         let table: toml::Table = text.parse().map_err(|error: toml::de::Error| syntax(error.to_string()))?;
         for (key, value) in table {
-            let text = match value {
-                toml::Value::String(text) => text,
-                toml::Value::Integer(number) => number.to_string(),
-                toml::Value::Boolean(yes) => yes.to_string(),
-                other => {
-                    let origin = Origin::File { key: key.clone(), path: path.to_owned() };
-                    if Setting::by_key(&key).is_none() {
-                        return Err(ConfigError::Unknown { hint: nearest(&key), origin });
-                    }
-                    let reason = match other {
-                        toml::Value::Array(_) => "expected a text, a whole number or true or false, not an array",
-                        toml::Value::Table(_) => "expected a text, a whole number or true or false, not a table",
-                        _ => "expected a text, a whole number or true or false",
-                    }
-                    .to_owned();
-                    return Err(ConfigError::Value { origin, reason });
-                }
-            };
-            self.apply(&key, &text, Origin::File { key: key.clone(), path: path.to_owned() })?;
+            match value {
+                toml::Value::Table(table) if tables::is_known(&key) => self.apply_table(path, &key, table)?,
+                value => self.apply_value(&key, value, Origin::File { key: key.clone(), path: path.to_owned() })?,
+            }
         }
         Ok(())
+    }
+
+    /// A setting from a file. `key` is its name all in one, `origin` where it stands.
+    fn apply_value(&mut self, key: &str, value: toml::Value, origin: Origin) -> Result<(), ConfigError> {
+        let text = match value {
+            toml::Value::String(text) => text,
+            toml::Value::Integer(number) => number.to_string(),
+            toml::Value::Boolean(yes) => yes.to_string(),
+            other => {
+                if Setting::by_key(key).is_none() {
+                    return Err(ConfigError::Unknown { hint: nearest(key), origin });
+                }
+                let reason = match other {
+                    toml::Value::Array(_) => "expected a text, a whole number or true or false, not an array",
+                    toml::Value::Table(_) => "expected a text, a whole number or true or false, not a table",
+                    _ => "expected a text, a whole number or true or false",
+                };
+                return Err(ConfigError::Value { origin, reason: reason.to_owned() });
+            }
+        };
+        self.apply(key, &text, origin)
     }
 
     fn apply_environment(&mut self, environment: &[(OsString, OsString)]) -> Result<(), ConfigError> {
@@ -442,40 +355,6 @@ impl clap::FromArgMatches for ServeFlags {
     }
 }
 
-fn non_empty(text: &str) -> Result<String, String> {
-    if text.is_empty() { Err("it is empty".to_owned()) } else { Ok(text.to_owned()) }
-}
-
-fn parsed<T: std::str::FromStr<Err: std::fmt::Display>>(text: &str) -> Result<T, String> {
-    text.parse().map_err(|error: T::Err| error.to_string())
-}
-
-fn boolean(text: &str) -> Result<bool, String> {
-    match text {
-        "true" | "1" | "yes" => Ok(true),
-        "false" | "0" | "no" => Ok(false),
-        _ => Err(format!("{text:?} is neither \"true\" nor \"false\"")),
-    }
-}
-
-fn address(text: &str) -> Result<SocketAddr, String> {
-    let expected = || format!("{text:?} is not an address: expected host:port, for example 127.0.0.1:8080");
-    text.to_socket_addrs().ok().and_then(|mut found| found.next()).ok_or_else(expected)
-}
-
-fn database_url(text: &str) -> Result<String, String> {
-    let known = ["sqlite:", "postgres://", "postgresql://"].iter().any(|scheme| text.starts_with(scheme));
-    // The URL may hold a password: it is not repeated.
-    if known { Ok(text.to_owned()) } else { Err("expected a URL that starts with sqlite: or postgres://".to_owned()) }
-}
-
-fn count(text: &str, most: u64) -> Result<u64, String> {
-    match text.parse() {
-        Ok(number) if (1..=most).contains(&number) => Ok(number),
-        _ => Err(format!("{text:?} is not a whole number from 1 to {most}")),
-    }
-}
-
 /// Reads a time that something may last: not nothing, and at most ten years.
 pub fn lifetime(text: &str) -> Result<Duration, String> {
     const MOST: Duration = Duration::from_secs(3650 * 24 * 60 * 60);
@@ -514,7 +393,11 @@ fn nearest(key: &str) -> String {
 mod tests {
     use super::*;
 
-    fn load(flags: &[(&'static str, &str)], env: &[(&str, &str)], file: Option<&str>) -> Result<Config, String> {
+    pub(super) fn load(
+        flags: &[(&'static str, &str)],
+        env: &[(&str, &str)],
+        file: Option<&str>,
+    ) -> Result<Config, String> {
         let directory = tempfile::tempdir().expect("temp dir");
         let path = directory.path().join("taskd.toml");
         if let Some(text) = file {
@@ -555,6 +438,10 @@ mod tests {
             ("htpt = 1", "htpt in taskd.toml: there is no such setting"),
             ("[limits]\nx = 1", "limits in taskd.toml: there is no such setting"),
             ("http = [1]", "http in taskd.toml: expected a text, a whole number or true or false, not an array"),
+            ("[delivery]\nqos = 3", "delivery.qos in taskd.toml: \"3\" is not a quality of service: 0, 1 or 2"),
+            ("[delivery]\npart_byts = 3", "delivery.part_byts in taskd.toml: there is no such setting; delivery_part_"),
+            ("[delivery]\nqos = [3]", "delivery.qos in taskd.toml: expected a text, a whole number"),
+            ("[transfers]\nmax = 0", "transfers.max in taskd.toml: \"0\" is not a whole number from 1"),
             ("blob_read = \"sendfile\"", "blob_read in taskd.toml: \"sendfile\" is neither"),
             ("assignment_expiry = \"0s\"", "assignment_expiry in taskd.toml: \"0s\" is not a time"),
             ("http =", "taskd.toml is not valid TOML"),

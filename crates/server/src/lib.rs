@@ -12,6 +12,7 @@ pub mod collector;
 pub mod commands;
 pub mod config;
 pub mod data_directory;
+pub mod delivery;
 pub mod deployment;
 pub mod downlink;
 pub mod gatekeeper;

@@ -1,0 +1,356 @@
+//! The tables of the configuration file: `[delivery]` with the operator's rules, `[transfers]` with the limits of each
+//! site. What has one value is a setting like any other; the rest is read here. Every error names the key it is about.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use task_proto::desired::Delivery;
+use task_proto::id::LabelValue;
+
+use super::settings::{Setting, size};
+use super::{Config, ConfigError, Origin, nearest, parse_duration};
+use crate::delivery::{Condition, ConditionKey, MAX_RULES, Quantity, Rule, Rules, Unit};
+
+/// The most sites with limits of their own.
+const MAX_SITES: usize = 4096;
+/// The longest name of a rule.
+const MAX_NAME_CHARS: usize = 64;
+/// What a rule may use, by its word.
+const MECHANISMS: [Delivery; 4] = [Delivery::PushPull, Delivery::DirectPush, Delivery::Inline, Delivery::Poll];
+
+/// What bounds the transfers of packages over HTTP.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct TransferLimits {
+    /// Of all robots together.
+    pub all: SiteLimits,
+    /// Of the robots on one site, by the value of [`super::DeliverySettings::site_label`].
+    pub sites: BTreeMap<LabelValue, SiteLimits>,
+}
+
+/// What some robots may take together; `None`: as much as there is.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct SiteLimits {
+    /// Transfers at the same time.
+    pub max: Option<u64>,
+    /// Bytes per second.
+    pub bytes_per_s: Option<u64>,
+}
+
+/// What is wrong, and with which key below the table.
+struct Wrong {
+    key: String,
+    reason: String,
+}
+
+/// Whether the file may have a table of this name.
+pub(super) fn is_known(name: &str) -> bool {
+    matches!(name, "delivery" | "transfers")
+}
+
+impl Config {
+    pub(super) fn apply_table(&mut self, path: &Path, name: &str, table: toml::Table) -> Result<(), ConfigError> {
+        let origin = |key: String| Origin::File { key: format!("{name}.{key}"), path: path.to_owned() };
+        for (key, value) in table {
+            let setting = format!("{name}_{key}");
+            let read = match (name, key.as_str()) {
+                ("delivery", "rules") => rules(value).map(|rules| self.delivery.own_rules = rules),
+                ("transfers", "sites") => sites(value).map(|sites| self.transfers.sites = sites),
+                _ if Setting::by_key(&setting).is_none() => {
+                    return Err(ConfigError::Unknown { hint: nearest(&setting), origin: origin(key) });
+                }
+                _ => {
+                    self.apply_value(&setting, value, origin(key))?;
+                    continue;
+                }
+            };
+            read.map_err(|wrong| ConfigError::Value { origin: origin(wrong.key), reason: wrong.reason })?;
+        }
+        Ok(())
+    }
+}
+
+/// `[[delivery.rules]]`, counted from 1.
+fn rules(value: toml::Value) -> Result<Vec<Rule>, Wrong> {
+    let wrong = |reason: String| Wrong { key: "rules".to_owned(), reason };
+    let toml::Value::Array(values) = value else {
+        return Err(wrong("expected [[delivery.rules]], a list of tables".to_owned()));
+    };
+    if values.len() > MAX_RULES {
+        return Err(wrong(format!("{} rules, at most {MAX_RULES} are possible", values.len())));
+    }
+    let mut rules: Vec<Rule> = Vec::with_capacity(values.len());
+    for (at, value) in values.into_iter().enumerate() {
+        let below = |wrong: Wrong| {
+            let dot = if wrong.key.is_empty() { "" } else { "." };
+            Wrong { key: format!("rules[{}]{dot}{}", at + 1, wrong.key), reason: wrong.reason }
+        };
+        let own = |key: &str, reason: String| below(Wrong { key: key.to_owned(), reason });
+        let toml::Value::Table(table) = value else { return Err(own("", "expected a table".to_owned())) };
+        let rule = rule(table).map_err(below)?;
+        if Rules::is_reserved(&rule.name) || rules.iter().any(|other| other.name == rule.name) {
+            return Err(own("name", format!("{:?} is the name of another rule", rule.name)));
+        }
+        if let Some(last) = rules.last().filter(|last| last.conditions.is_empty()) {
+            return Err(own("", format!("it can never decide: the rule {:?} before it has no condition", last.name)));
+        }
+        rules.push(rule);
+    }
+    Ok(rules)
+}
+
+fn rule(table: toml::Table) -> Result<Rule, Wrong> {
+    let (mut name, mut mechanism, mut conditions) = (None, None, Vec::new());
+    for (key, value) in table {
+        let read = match (key.as_str(), Condition::by_key(&key)) {
+            ("name", _) => rule_name(&value).map(|read| name = Some(read)),
+            ("use", _) => used(&value).map(|read| mechanism = Some(read)),
+            (_, Some(known)) => condition(known, &value).map(|read| conditions.push((key.clone(), read))),
+            _ => Err("there is no such condition; docs/delivery.md lists them".to_owned()),
+        };
+        read.map_err(|reason| Wrong { key, reason })?;
+    }
+    let missing = |key: &str, what: &str| Wrong { key: key.to_owned(), reason: format!("missing: {what}") };
+    let name = name.ok_or_else(|| missing("name", "what the rule is called where a decision is shown"))?;
+    let mechanism = mechanism.ok_or_else(|| missing("use", "what is used where the rule matches"))?;
+    check_possible(&conditions)?;
+    Ok(Rule { name, conditions: conditions.into_iter().map(|(_, condition)| condition).collect(), mechanism })
+}
+
+fn rule_name(value: &toml::Value) -> Result<String, String> {
+    let is_name = |name: &&str| {
+        (1..=MAX_NAME_CHARS).contains(&name.chars().count())
+            && name.trim() == *name
+            && !name.chars().any(char::is_control)
+    };
+    let name = value.as_str().filter(is_name);
+    name.map(str::to_owned).ok_or_else(|| format!("expected a text of 1 to {MAX_NAME_CHARS} printable characters"))
+}
+
+fn used(value: &toml::Value) -> Result<Delivery, String> {
+    let found = value.as_str().and_then(|word| MECHANISMS.into_iter().find(|known| known.as_str() == word));
+    let words = || MECHANISMS.map(|known| format!("{:?}", known.as_str())).join(", ");
+    found.ok_or_else(|| format!("{value} is none of {}", words()))
+}
+
+fn condition(key: ConditionKey, value: &toml::Value) -> Result<Condition, String> {
+    let (quantity, comparison) = match key {
+        ConditionKey::Flag(flag) => {
+            let wanted = value.as_bool().ok_or_else(|| format!("{value} is neither true nor false"))?;
+            return Ok(Condition::Flag(flag, wanted));
+        }
+        ConditionKey::Measure(quantity, comparison) => (quantity, comparison),
+    };
+    let whole = value.as_integer().and_then(|number| u64::try_from(number).ok());
+    let (read, expected) = match quantity.unit() {
+        Unit::Bytes => (whole.or_else(|| size(value.as_str()?)), "a size, for example \"256 KB\""),
+        Unit::BytesPerSecond => {
+            let rate = |text: &str| size(text.strip_suffix("/s").unwrap_or(text));
+            (whole.or_else(|| rate(value.as_str()?)), "a rate, for example \"500 KB/s\"")
+        }
+        Unit::Milliseconds => {
+            let time = |text: &str| parse_duration(text).and_then(|time| u64::try_from(time.as_millis()).ok());
+            (value.as_str().and_then(time), "a time, for example \"100ms\"")
+        }
+        Unit::Percent => (whole.filter(|percent| *percent <= 100), "a whole number from 0 to 100"),
+        Unit::Count => (whole, "a whole number"),
+    };
+    let read = read.ok_or_else(|| format!("{value} is not {expected}"))?;
+    Ok(Condition::Measure(quantity, comparison, read))
+}
+
+/// Refuses conditions that nothing can satisfy, alone or together.
+fn check_possible(conditions: &[(String, Condition)]) -> Result<(), Wrong> {
+    let mut ranges: BTreeMap<&str, (u64, u64)> = BTreeMap::new();
+    for (key, condition) in conditions {
+        let Condition::Measure(quantity, comparison, value) = condition else { continue };
+        let most = if quantity.unit() == Unit::Percent { 100 } else { u64::MAX };
+        let known = ranges.entry(quantity.key()).or_insert((least_possible(*quantity), most));
+        let range = comparison.range(*value).map(|(least, most)| (least.max(known.0), most.min(known.1)));
+        match range.filter(|(least, most)| least <= most) {
+            Some(range) => *known = range,
+            None => {
+                let shown = quantity.unit().show(*value);
+                let reason = format!("{shown}: no {} can satisfy this and the rule's other conditions", quantity.key());
+                return Err(Wrong { key: key.clone(), reason });
+            }
+        }
+    }
+    Ok(())
+}
+
+/// A robot is never in a deployment, a batch or on a site without itself.
+fn least_possible(quantity: Quantity) -> u64 {
+    u64::from(matches!(quantity, Quantity::Robots | Quantity::Batch | Quantity::SameSite))
+}
+
+/// `[transfers.sites.NAME]`, by the label's value.
+fn sites(value: toml::Value) -> Result<BTreeMap<LabelValue, SiteLimits>, Wrong> {
+    let wrong = |key: String, reason: String| Wrong { key: format!("sites{key}"), reason };
+    let toml::Value::Table(table) = value else {
+        return Err(wrong(String::new(), "expected [transfers.sites.NAME], tables by the label's value".to_owned()));
+    };
+    if table.len() > MAX_SITES {
+        return Err(wrong(String::new(), format!("{} sites, at most {MAX_SITES} are possible", table.len())));
+    }
+    let mut sites = BTreeMap::new();
+    for (name, value) in table {
+        let site: LabelValue = name.parse().map_err(|error| wrong(format!(".{name}"), format!("{error}")))?;
+        let toml::Value::Table(limits) = value else {
+            return Err(wrong(format!(".{name}"), "expected a table with max or bytes_per_s".to_owned()));
+        };
+        let mut read = SiteLimits::default();
+        for (key, value) in limits {
+            let at_least = |least: u64| move |number: &u64| *number >= least;
+            let whole = value.as_integer().and_then(|number| u64::try_from(number).ok());
+            let (limit, found, expected) = match key.as_str() {
+                "max" => (&mut read.max, whole.filter(at_least(1)), "a whole number from 1"),
+                "bytes_per_s" => {
+                    let bytes = whole.or_else(|| size(value.as_str()?)).filter(at_least(1024));
+                    (&mut read.bytes_per_s, bytes, "a size from 1 KB, for example \"10 MB\"")
+                }
+                _ => return Err(wrong(format!(".{name}.{key}"), "there is no such limit".to_owned())),
+            };
+            *limit = Some(found.ok_or_else(|| wrong(format!(".{name}.{key}"), format!("{value} is not {expected}")))?);
+        }
+        sites.insert(site, read);
+    }
+    Ok(sites)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::load;
+    use super::*;
+
+    #[test]
+    fn all_of_both_tables_is_read() {
+        let file = r#"
+            [delivery]
+            part_bytes = "1 MB"
+            qos = 2
+            inline_bytes = 1000
+            site_label = "hall"
+            [[delivery.rules]]
+            name = "slow modems"
+            metered = true
+            throughput_below = "500 KB/s"
+            rtt_above = "100ms"
+            battery_below = 20
+            size_above = "256 KB"
+            size_at_most = 1048576
+            use = "poll"
+            [[delivery.rules]]
+            name = "everyone else"
+            use = "direct-push"
+            [transfers]
+            max = 8
+            bytes_per_s = "20 MB"
+            [transfers.sites.lab]
+            max = 2
+            [transfers.sites.yard]
+            bytes_per_s = "1 MB"
+        "#;
+        let config = load(&[("transfers-max", "9")], &[("TASKD_DELIVERY_QOS", "0")], Some(file)).expect("loads");
+        let delivery = &config.delivery;
+        assert_eq!((delivery.part_bytes, delivery.qos, delivery.inline_bytes), (1 << 20, 0, 1000));
+        assert_eq!(delivery.site_label.as_str(), "hall");
+        let names: Vec<(&str, usize, Delivery)> =
+            delivery.own_rules.iter().map(|rule| (rule.name.as_str(), rule.conditions.len(), rule.mechanism)).collect();
+        assert_eq!(names, [("slow modems", 6, Delivery::Poll), ("everyone else", 0, Delivery::DirectPush)]);
+        let measure = |key: &str, value| match Condition::by_key(key) {
+            Some(ConditionKey::Measure(quantity, comparison)) => Condition::Measure(quantity, comparison, value),
+            other => panic!("{key}: {other:?}"),
+        };
+        for (key, value) in
+            [("throughput_below", 512_000), ("rtt_above", 100), ("size_above", 262_144), ("battery_below", 20)]
+        {
+            assert!(delivery.own_rules[0].conditions.contains(&measure(key, value)), "{key}");
+        }
+        let limits = |max, bytes_per_s| SiteLimits { max, bytes_per_s };
+        assert_eq!(config.transfers.all, limits(Some(9), Some(20 << 20)));
+        assert_eq!(config.transfers.sites[&"lab".parse::<LabelValue>().expect("valid")], limits(Some(2), None));
+        assert_eq!(config.transfers.sites.len(), 2);
+    }
+
+    #[test]
+    fn a_wrong_rule_is_refused_by_its_key() {
+        let good = "[[delivery.rules]]\nname = \"one\"\nrobots_at_least = 2\nuse = \"poll\"\n[[delivery.rules]]\n";
+        for (second, expected) in [
+            ("name = \"two\"", "delivery.rules[2].use in taskd.toml: missing"),
+            ("use = \"poll\"", "delivery.rules[2].name in taskd.toml: missing"),
+            ("name = \"\"\nuse = \"poll\"", "delivery.rules[2].name in taskd.toml: expected a text"),
+            ("name = \"one\"\nuse = \"poll\"", "delivery.rules[2].name in taskd.toml: \"one\" is the name of another"),
+            (
+                "name = \"tiny\"\nuse = \"poll\"",
+                "delivery.rules[2].name in taskd.toml: \"tiny\" is the name of another",
+            ),
+            ("name = \"ordered\"\nuse = \"poll\"", "delivery.rules[2].name in taskd.toml: \"ordered\" is the name"),
+            ("use = \"adaptive\"", "delivery.rules[2].use in taskd.toml: \"adaptive\" is none of \"push-pull\", "),
+            ("use = 1", "delivery.rules[2].use in taskd.toml: 1 is none of"),
+            ("size_over = 1", "delivery.rules[2].size_over in taskd.toml: there is no such condition"),
+            ("size_above = \"9.7 MB\"", "delivery.rules[2].size_above in taskd.toml: \"9.7 MB\" is not a size, for"),
+            ("size_above = -1", "delivery.rules[2].size_above in taskd.toml: -1 is not a size"),
+            ("throughput_below = \"fast\"", "delivery.rules[2].throughput_below in taskd.toml: \"fast\" is not a rate"),
+            ("rtt_above = 100", "delivery.rules[2].rtt_above in taskd.toml: 100 is not a time"),
+            ("battery_below = 101", "delivery.rules[2].battery_below in taskd.toml: 101 is not a whole number from 0"),
+            ("losses_above = \"x\"", "delivery.rules[2].losses_above in taskd.toml: \"x\" is not a whole number"),
+            ("metered = \"yes\"", "delivery.rules[2].metered in taskd.toml: \"yes\" is neither true nor false"),
+        ] {
+            let message = load(&[], &[], Some(&format!("{good}{second}"))).expect_err(expected);
+            assert!(message.starts_with(expected), "{message}");
+        }
+        for (file, expected) in [
+            ("[delivery]\nrules = 1", "delivery.rules in taskd.toml: expected [[delivery.rules]]"),
+            ("[delivery]\nrules = [1]", "delivery.rules[1] in taskd.toml: expected a table"),
+        ] {
+            let message = load(&[], &[], Some(file)).expect_err(expected);
+            assert!(message.starts_with(expected), "{message}");
+        }
+    }
+
+    #[test]
+    fn what_can_never_be_is_refused() {
+        let rule = |conditions: &str| format!("[[delivery.rules]]\nname = \"one\"\nuse = \"poll\"\n{conditions}");
+        for (conditions, key) in [
+            ("size_below = 0", "size_below"),
+            ("battery_above = 100", "battery_above"),
+            ("robots_below = 1", "robots_below"),
+            ("size_above = \"1 MB\"\nsize_at_most = \"1 MB\"", "size_at_most"),
+            ("rtt_above = \"10ms\"\nrtt_below = \"11ms\"", "rtt_below"),
+        ] {
+            let message = load(&[], &[], Some(&rule(conditions))).expect_err(conditions);
+            assert!(message.starts_with(&format!("delivery.rules[1].{key} in taskd.toml: ")), "{message}");
+            assert!(message.contains("can satisfy this"), "{message}");
+        }
+        assert!(load(&[], &[], Some(&rule("rtt_above = \"10ms\"\nrtt_below = \"12ms\""))).is_ok());
+        let dead = format!("{}\n[[delivery.rules]]\nname = \"two\"\nuse = \"poll\"", rule(""));
+        let message = load(&[], &[], Some(&dead)).expect_err("never reached");
+        assert!(
+            message.starts_with("delivery.rules[2] in taskd.toml: it can never decide: the rule \"one\""),
+            "{message}"
+        );
+        let many: String = (0..=MAX_RULES)
+            .map(|n| format!("[[delivery.rules]]\nname = \"n{n}\"\nmetered = true\nuse = \"poll\"\n"))
+            .collect();
+        let message = load(&[], &[], Some(&many)).expect_err("too many");
+        assert!(message.starts_with("delivery.rules in taskd.toml: 65 rules, at most 64"), "{message}");
+    }
+
+    #[test]
+    fn a_wrong_site_is_refused_by_its_key() {
+        for (file, expected) in [
+            ("[transfers]\nsites = 1", "transfers.sites in taskd.toml: expected [transfers.sites.NAME]"),
+            ("[transfers.sites]\nlab = 1", "transfers.sites.lab in taskd.toml: expected a table"),
+            ("[transfers.sites.lab]\nmax = 0", "transfers.sites.lab.max in taskd.toml: 0 is not a whole number from 1"),
+            (
+                "[transfers.sites.lab]\nbytes_per_s = 1",
+                "transfers.sites.lab.bytes_per_s in taskd.toml: 1 is not a size",
+            ),
+            ("[transfers.sites.lab]\nmix = 1", "transfers.sites.lab.mix in taskd.toml: there is no such limit"),
+            ("[transfers.sites.\"a b\"]\nmax = 1", "transfers.sites.a b in taskd.toml: \"a b\" is not a valid label"),
+        ] {
+            let message = load(&[], &[], Some(file)).expect_err(expected);
+            assert!(message.starts_with(expected), "{message}");
+        }
+    }
+}

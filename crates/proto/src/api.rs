@@ -54,6 +54,23 @@ pub struct ServerInfo {
     /// What went over MQTT since the server started.
     #[serde(default)]
     pub traffic: MqttTraffic,
+    /// What went over HTTP since then.
+    #[serde(default)]
+    pub http: HttpTraffic,
+}
+
+/// What went over HTTP, all connections together, counted at the sockets. In is towards the server.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct HttpTraffic {
+    /// Connections that were taken.
+    pub connections: u64,
+    /// Requests whose head was read.
+    pub requests: u64,
+    /// Bytes, heads and bodies.
+    pub bytes_in: u64,
+    /// Likewise.
+    pub bytes_out: u64,
 }
 
 /// What went over MQTT, all connections together, the server's own watchdog excepted. With an external broker only the

@@ -23,6 +23,7 @@ use crate::data_directory::{Addresses, DataDirectory, DataError};
 use crate::downlink::Downlink;
 use crate::gatekeeper::StoreGatekeeper;
 use crate::http::events::{EventFeed, EventSource};
+use crate::http::traffic::HttpTotals;
 use crate::http::{App, listener};
 use crate::presence::Presence;
 use crate::report_writer::ReportWriter;
@@ -106,6 +107,7 @@ impl Server {
         let broker = Broker::start(broker_config(&config), Arc::new(gatekeeper), Arc::new(uplink)).await?;
 
         let (stop, tasks) = (CancellationToken::new(), TaskTracker::new());
+        let http_traffic = Arc::new(HttpTotals::default());
         let app = App {
             clock,
             store: store.clone(),
@@ -122,12 +124,13 @@ impl Server {
             events: EventFeed::new(),
             key: public_key,
             mqtt: mqtt_endpoint(&config, broker.local_addr()),
+            http_traffic: http_traffic.clone(),
             data: data.path().to_owned(),
             stop: stop.clone(),
         };
         start_tasks(&tasks, &app, config.blob_grace);
         let router = crate::http::router(app);
-        let http = listener::serve(http, router, http_limits(&config), stop.clone(), REQUEST_PATIENCE);
+        let http = listener::serve(http, router, http_limits(&config), http_traffic, stop.clone(), REQUEST_PATIENCE);
         let addresses =
             Addresses { http: reachable(http_address).to_string(), mqtt: reachable(broker.local_addr()).to_string() };
         data.publish(&addresses)?;

@@ -10,8 +10,8 @@ use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 use task_proto::api::{
     CreateDeployment, DeliveryChoice, DeliveryDecision, EnrollRequest, EnrollResponse, ErrorBody, Event,
-    ExternalBroker, LogEvent, LogsFrom, LogsView, MqttConnection, MqttEndpoint, MqttTraffic, OutputList, OutputView,
-    ReportReply, RobotToken, ServerInfo, Traffic,
+    ExternalBroker, HttpTraffic, LogEvent, LogsFrom, LogsView, MqttConnection, MqttEndpoint, MqttTraffic, OutputList,
+    OutputView, ReportReply, RobotToken, ServerInfo, Traffic,
 };
 use task_proto::desired::{BlobRef, Delivery, DesiredState, DesiredTask, Doorbell, Inline, PackageRef, Wanted};
 use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
@@ -461,6 +461,7 @@ fn documents_about_the_traffic() {
             messages_dropped: 5,
             all: traffic,
         },
+        http: HttpTraffic { connections: 6, requests: 7, bytes_in: 8, bytes_out: 9 },
     };
     check_text("server_info.json", &info);
 }

@@ -24,7 +24,7 @@ pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, Co
 }
 
 fn describe(info: &ServerInfo) -> String {
-    let traffic = &info.traffic;
+    let (traffic, http) = (&info.traffic, &info.http);
     let facts = [
         ("version", info.version.clone()),
         ("time", time(info.now_ms)),
@@ -34,6 +34,9 @@ fn describe(info: &ServerInfo) -> String {
         ("messages", format!("{} refused, {} dropped", traffic.messages_refused, traffic.messages_dropped)),
         ("in", inward(&traffic.all)),
         ("out", outward(&traffic.all)),
+        ("http", format!("{} connections, {} requests", http.connections, http.requests)),
+        ("http in", bytes(http.bytes_in)),
+        ("http out", bytes(http.bytes_out)),
     ];
     facts.iter().map(|(key, value)| format!("{key:<12}{value}\n")).collect()
 }

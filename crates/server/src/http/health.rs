@@ -63,5 +63,6 @@ pub(super) async fn server(State(app): State<App>) -> Json<ServerInfo> {
         mqtt: app.broker.local_addr().to_string(),
         now_ms: app.clock.now_ms(),
         traffic: app.broker.traffic(),
+        http: app.http_traffic.read(),
     })
 }

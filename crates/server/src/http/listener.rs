@@ -26,6 +26,7 @@ use tokio::time::Sleep;
 use tokio_util::sync::CancellationToken;
 use tower::ServiceExt as _;
 
+use super::traffic::HttpTotals;
 use crate::anteroom::{Anteroom, Place};
 
 /// How long a request's head may take, also the first one of a connection, and how long one is kept without a request.
@@ -49,7 +50,14 @@ pub struct Limits {
 }
 
 /// Serves until `stop`, then lets requests under way end, for at most `patience`.
-pub async fn serve(listener: TcpListener, router: Router, limits: Limits, stop: CancellationToken, patience: Duration) {
+pub async fn serve(
+    listener: TcpListener,
+    router: Router,
+    limits: Limits,
+    traffic: Arc<HttpTotals>,
+    stop: CancellationToken,
+    patience: Duration,
+) {
     let places = Arc::new(Semaphore::new(limits.max_connections));
     let anteroom = Anteroom::new(limits.max_silent_per_address);
     let graceful = GracefulShutdown::new();
@@ -62,6 +70,7 @@ pub async fn serve(listener: TcpListener, router: Router, limits: Limits, stop: 
         let (stream, peer, place) = accepted;
         let silent = anteroom.enter(peer.ip(), Instant::now());
         let leave = silent.leave().clone();
+        let stream = PatientStream { stream, stalled: None, traffic: traffic.clone() };
         let connection = graceful.watch(connection(stream, peer, silent, router.clone()));
         let abort = abort.clone();
         tokio::spawn(async move {
@@ -105,7 +114,7 @@ fn is_the_clients_fault(error: &io::Error) -> bool {
 }
 
 fn connection(
-    stream: TcpStream,
+    stream: PatientStream,
     peer: SocketAddr,
     silent: Place,
     router: Router,
@@ -114,10 +123,13 @@ fn connection(
     impl hyper::service::Service<Request<Incoming>, Response = http::Response<Body>, Error = Infallible, Future: Send>,
 > {
     // Answers are small and wanted at once; a failure here costs only latency.
-    let _ = stream.set_nodelay(true);
+    let _ = stream.stream.set_nodelay(true);
+    let traffic = stream.traffic.clone();
+    traffic.connection();
     let silent = Mutex::new(Some(silent));
     let service = hyper::service::service_fn(move |request: Request<Incoming>| {
         drop(silent.lock().unwrap_or_else(PoisonError::into_inner).take());
+        traffic.request();
         let mut request = request.map(|body| Body::new(PatientBody::new(body)));
         request.extensions_mut().insert(ConnectInfo(peer));
         router.clone().oneshot(request)
@@ -126,18 +138,20 @@ fn connection(
         .timer(TokioTimer::new())
         .header_read_timeout(HEAD_TIMEOUT)
         .max_buf_size(MOST_HEAD_BYTES)
-        .serve_connection(TokioIo::new(PatientStream { stream, stalled: None }), service)
+        .serve_connection(TokioIo::new(stream), service)
 }
 
-/// A socket whose writes fail once the other side has read nothing for [`WRITE_PAUSE`].
+/// A socket whose writes fail once the other side has read nothing for [`WRITE_PAUSE`], and whose bytes are counted.
 struct PatientStream {
     stream: TcpStream,
     stalled: Option<Pin<Box<Sleep>>>,
+    traffic: Arc<HttpTotals>,
 }
 
 impl PatientStream {
-    fn watch_write<T>(&mut self, context: &mut Context<'_>, polled: Poll<io::Result<T>>) -> Poll<io::Result<T>> {
-        if polled.is_ready() {
+    fn watch_write(&mut self, context: &mut Context<'_>, polled: Poll<io::Result<usize>>) -> Poll<io::Result<usize>> {
+        if let Poll::Ready(written) = &polled {
+            self.traffic.bytes_out(*written.as_ref().unwrap_or(&0));
             self.stalled = None;
             return polled;
         }
@@ -152,7 +166,10 @@ impl AsyncRead for PatientStream {
         context: &mut Context<'_>,
         buffer: &mut ReadBuf<'_>,
     ) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_read(context, buffer)
+        let before = buffer.filled().len();
+        let polled = Pin::new(&mut self.stream).poll_read(context, buffer);
+        self.traffic.bytes_in(buffer.filled().len() - before);
+        polled
     }
 }
 

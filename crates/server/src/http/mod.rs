@@ -19,6 +19,7 @@ mod packages;
 mod robots;
 pub mod session;
 mod tasks;
+pub mod traffic;
 mod views;
 
 use std::path::PathBuf;
@@ -83,6 +84,8 @@ pub struct App {
     pub key: PublicKey,
     /// Where robots reach MQTT.
     pub mqtt: MqttEndpoint,
+    /// What went over HTTP.
+    pub http_traffic: Arc<traffic::HttpTotals>,
     /// The data directory, which must be writable.
     pub data: PathBuf,
     /// Cancelled when the server stops.

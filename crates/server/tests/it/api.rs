@@ -3,7 +3,9 @@
 use futures_util::StreamExt as _;
 use reqwest::{Method, StatusCode};
 use serde_json::{Value, json};
-use task_proto::api::{DeploymentState, DeploymentView, MatchedRobots, PackageList, ReportReply, RobotList};
+use task_proto::api::{
+    DeploymentState, DeploymentView, MatchedRobots, PackageList, ReportReply, RobotList, ServerInfo,
+};
 use task_proto::report::Phase;
 
 use crate::harness::{TestServer, answer, refusal};
@@ -28,6 +30,18 @@ async fn an_order_travels_to_the_robot_and_its_report_back() {
     assert_eq!((view.tasks[0].phase, view.observed_generation), (Phase::Running, state.generation));
     let settled: DeploymentView = server.get(&format!("/api/v1/deployments/{}", ordered.id)).await;
     assert_eq!(settled.state, DeploymentState::Settled);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_goes_over_http_is_counted_at_the_sockets() {
+    let server = TestServer::start().await;
+    let before: ServerInfo = server.get("/api/v1/server").await;
+    let body: PackageList = server.get("/api/v1/packages").await;
+    let after: ServerInfo = server.get("/api/v1/server").await;
+    assert_eq!(after.http.requests, before.http.requests + 2);
+    let answers = serde_json::to_vec(&before).expect("json").len() + serde_json::to_vec(&body).expect("json").len();
+    assert!(after.http.bytes_out > before.http.bytes_out + answers as u64, "{before:?} {after:?}");
+    assert!(after.http.bytes_in > before.http.bytes_in, "{before:?} {after:?}");
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -316,6 +316,8 @@ async fn the_server_says_what_went_over_it() {
     assert!(told.stdout.contains("0 accepted, 0 refused"), "{}", told.stdout);
     let told = bench.taskd(&["server", "info", "-o", "json"]).await.expect(0, "").json();
     assert_eq!(told["traffic"]["all"]["bytes_in"], 0);
+    let requests = told["http"]["requests"].as_u64().expect("a count");
+    assert!(requests >= 2 && told["http"]["bytes_in"].as_u64() > Some(requests * 40), "{told}");
 }
 
 #[tokio::test(flavor = "multi_thread")]

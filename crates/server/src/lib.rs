@@ -25,5 +25,6 @@ pub mod robot_logs;
 pub mod rollout;
 pub mod serve;
 pub mod store;
+pub mod transfers;
 pub mod uplink;
 pub mod web;

@@ -30,6 +30,7 @@ use crate::report_writer::ReportWriter;
 use crate::requests::Requests;
 use crate::robot_logs::RobotLogs;
 use crate::store::{Store, StoreError, sqlite_url};
+use crate::transfers::Transfers;
 use crate::uplink::Uplink;
 
 /// How long requests under way may take to end; the whole stop is to take less than ten seconds.
@@ -106,6 +107,7 @@ impl Server {
         let gatekeeper = StoreGatekeeper { store: store.clone(), clock: clock.clone() };
         let broker = Broker::start(broker_config(&config), Arc::new(gatekeeper), Arc::new(uplink)).await?;
 
+        let transfers = Transfers::new(&config.transfers, config.delivery.site_label.clone());
         let (stop, tasks) = (CancellationToken::new(), TaskTracker::new());
         let http_traffic = Arc::new(HttpTotals::default());
         let app = App {
@@ -119,6 +121,7 @@ impl Server {
             requests,
             logs,
             blobs,
+            transfers,
             sessions: Arc::default(),
             attempts: Arc::default(),
             events: EventFeed::new(),

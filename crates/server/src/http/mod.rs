@@ -47,6 +47,7 @@ use crate::report_writer::ReportWriter;
 use crate::requests::Requests;
 use crate::robot_logs::RobotLogs;
 use crate::store::Store;
+use crate::transfers::Transfers;
 use crate::web;
 use auth::{Access, Gate, guard};
 use error::ApiError;
@@ -74,6 +75,8 @@ pub struct App {
     pub logs: RobotLogs,
     /// The packages' bytes.
     pub blobs: Blobs,
+    /// Whose turn it is to pull them.
+    pub transfers: Transfers,
     /// Who is signed in at the page.
     pub sessions: Arc<session::Sessions>,
     /// Failed authentications.
@@ -94,7 +97,12 @@ pub struct App {
 
 impl FromRef<App> for oci::Registry {
     fn from_ref(app: &App) -> Self {
-        Self { store: app.store.clone(), blobs: app.blobs.clone(), clock: app.clock.clone() }
+        Self {
+            store: app.store.clone(),
+            blobs: app.blobs.clone(),
+            clock: app.clock.clone(),
+            transfers: app.transfers.clone(),
+        }
     }
 }
 

@@ -39,6 +39,17 @@ pub struct DesiredTasks {
     pub tasks: Vec<DesiredTask>,
 }
 
+/// An order for which a robot fetches something.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct FetchedBy {
+    /// The deployment's priority.
+    pub priority: i32,
+    /// The deployment's number: later ones have higher ones.
+    pub number: u64,
+    /// The robot's labels.
+    pub labels: Labels,
+}
+
 const KNOWN: &str = "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL";
 
 impl Store {
@@ -128,22 +139,25 @@ impl Store {
         Ok(found)
     }
 
-    /// Whether `digest` belongs to a package that `robot` should have.
-    pub async fn may_fetch(&self, robot: &RobotId, digest: &Digest) -> Result<bool, StoreError> {
-        let packages: Vec<String> = sqlx::query_scalar(
-            "SELECT d.package FROM assignments a JOIN deployments d ON d.id = a.deployment_id
-             WHERE a.robot_id = $1 AND a.desired = 1",
+    /// By which order `robot` may fetch the blob, the one that comes first; `None`: by none, as it belongs to no package that
+    /// the robot should have.
+    pub async fn fetched_by(&self, robot: &RobotId, digest: &Digest) -> Result<Option<FetchedBy>, StoreError> {
+        let rows = sqlx::query(
+            "SELECT d.package, d.number, r.labels FROM assignments a JOIN deployments d ON d.id = a.deployment_id
+             JOIN robots r ON r.id = a.robot_id
+             WHERE a.robot_id = $1 AND a.desired = 1 ORDER BY d.number",
         )
         .bind(robot.as_str())
         .fetch_all(&self.reads)
         .await?;
-        for package in packages {
-            let package: PackageRef = from_json("deployments.package", &package)?;
+        for row in rows {
+            let package: PackageRef = from_json("deployments.package", row.try_get("package")?)?;
             if [package.manifest, package.config, package.content].iter().any(|blob| blob.digest == *digest) {
-                return Ok(true);
+                let labels = from_json("robots.labels", row.try_get("labels")?)?;
+                return Ok(Some(FetchedBy { priority: 0, number: number(row.try_get("number")?), labels }));
             }
         }
-        Ok(false)
+        Ok(None)
     }
 }
 

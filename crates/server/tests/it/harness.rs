@@ -111,7 +111,11 @@ impl TestServer {
 
     /// Pushes a package that no robot could unpack, but every robot can be told of.
     pub async fn push(&self, name: &str, version: &str) -> PackageRef {
-        let content = format!("content of {name} {version}").into_bytes();
+        self.push_content(name, version, format!("content of {name} {version}").into_bytes()).await
+    }
+
+    /// The same, with this content.
+    pub async fn push_content(&self, name: &str, version: &str, content: Vec<u8>) -> PackageRef {
         let content_ref = BlobRef { digest: Digest::of(&content), size: content.len() as u64 };
         let config = json!({
             "name": name,

@@ -22,4 +22,5 @@ mod registry;
 mod serve;
 mod story;
 mod tokens;
+mod transfers;
 mod uplink;

@@ -14,10 +14,12 @@ use task_proto::oci::MANIFEST_TYPE;
 use taskd::blobs::{BlobSettings, Blobs};
 use taskd::clock::Clock;
 use taskd::collector::{self, Collected};
+use taskd::config::TransferLimits;
 use taskd::http::auth::Caller;
 use taskd::http::drain::drain_unread;
 use taskd::http::oci::{self, Registry};
 use taskd::store::{Store, sqlite_url};
+use taskd::transfers::Transfers;
 use tempfile::TempDir;
 
 pub const GRACE: Duration = Duration::from_secs(3600);
@@ -45,7 +47,9 @@ impl TestRegistry {
 
     pub async fn start_on(store: Store, data: TempDir, settings: BlobSettings, caller: Option<Caller>) -> Self {
         let blobs = Blobs::open(data.path(), settings).expect("a blob store");
-        let registry = Registry { store, blobs, clock: Clock::fixed(NOW_MS) };
+        let site_label = "site".parse().expect("a label's key");
+        let transfers = Transfers::new(&TransferLimits::default(), site_label);
+        let registry = Registry { store, blobs, clock: Clock::fixed(NOW_MS), transfers };
         Self { base: serve(registry.clone(), caller).await, client: client(), registry, data }
     }
 

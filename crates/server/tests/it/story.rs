@@ -72,8 +72,9 @@ async fn an_order_reaches_all_that_match_and_settles(database: TestDatabase) {
     assert!(fleet.desired(&robots[1]).await.expect("state").tasks.is_empty());
     let content = package("1", TaskKind::Service).package.content.digest;
     let store = fleet.database.store.clone();
-    assert!(store.may_fetch(&robots[0].id, &content).await.expect("reads"));
-    assert!(!store.may_fetch(&robots[1].id, &content).await.expect("reads"));
+
+    assert!(store.fetched_by(&robots[0].id, &content).await.expect("reads").is_some());
+    assert_eq!(store.fetched_by(&robots[1].id, &content).await.expect("reads"), None);
     for robot in [0, 2] {
         fleet.follow(&mut robots[robot], Phase::Running).await;
     }

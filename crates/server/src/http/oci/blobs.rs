@@ -13,6 +13,7 @@ use task_proto::{Digest, RepositoryName, RobotId};
 
 use super::{Answer, OciError, Registry, empty};
 use crate::blobs::Blob;
+use crate::transfers::Claim;
 
 /// `GET /v2/<name>/blobs/<digest>` by an operator.
 pub(super) async fn get(registry: &Registry, repository: &RepositoryName, digest: Digest, request: &Parts) -> Answer {
@@ -29,12 +30,19 @@ pub(super) async fn head(registry: &Registry, repository: &RepositoryName, diges
     get(registry, repository, digest, request).await
 }
 
-/// `GET` or `HEAD` by a robot. Its packages count, whatever repository they came from and whether it still has them.
+/// `GET` or `HEAD` by a robot. Its packages count, whatever repository they came from and whether it still has them. It may
+/// have to wait for its turn to get bytes, not to ask for their size.
 pub(super) async fn get_for_robot(registry: &Registry, robot: &RobotId, digest: Digest, request: &Parts) -> Answer {
-    if !registry.store.may_fetch(robot, &digest).await? {
+    let Some(order) = registry.store.fetched_by(robot, &digest).await? else {
         return Err(OciError::denied("the blob is not part of a package this robot should have"));
+    };
+    if request.method == Method::HEAD {
+        return read(registry, digest, request).await;
     }
-    read(registry, digest, request).await
+    let site = registry.transfers.site_of(&order.labels);
+    let claim = Claim { priority: order.priority, deployment: order.number, site };
+    let transfer = registry.transfers.admit(robot, digest, &claim).await?;
+    Ok(read(registry, digest, request).await?.map(|body| Body::new(transfer.carry(body))))
 }
 
 /// `DELETE /v2/<name>/blobs/<digest>`: out of this repository; the bytes go when nothing needs them.

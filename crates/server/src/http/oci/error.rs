@@ -3,13 +3,14 @@
 
 use axum::Json;
 use axum::response::{IntoResponse, Response};
-use http::header::{ALLOW, WWW_AUTHENTICATE};
+use http::header::{ALLOW, RETRY_AFTER, WWW_AUTHENTICATE};
 use http::{HeaderValue, StatusCode};
 use serde_json::{Value, json};
 use task_proto::Digest;
 
 use crate::blobs::BlobError;
 use crate::store::StoreError;
+use crate::transfers::NotYet;
 
 /// An answer that is not the one hoped for.
 #[derive(Debug)]
@@ -18,11 +19,12 @@ pub struct OciError {
     code: &'static str,
     messages: Vec<(String, Value)>,
     allow: Option<&'static str>,
+    retry_after_s: Option<u64>,
 }
 
 impl OciError {
     fn new(status: StatusCode, code: &'static str, message: impl Into<String>) -> Self {
-        Self { status, code, messages: vec![(message.into(), Value::Null)], allow: None }
+        Self { status, code, messages: vec![(message.into(), Value::Null)], allow: None, retry_after_s: None }
     }
 
     /// 401: nobody known is asking.
@@ -111,7 +113,13 @@ impl OciError {
     pub fn parts_unknown(parts: &[Digest]) -> Self {
         let message = "the manifest needs a blob that is not in the repository";
         let messages = parts.iter().map(|part| (message.to_owned(), json!({ "digest": part }))).collect();
-        Self { status: StatusCode::BAD_REQUEST, code: "MANIFEST_BLOB_UNKNOWN", messages, allow: None }
+        Self {
+            status: StatusCode::BAD_REQUEST,
+            code: "MANIFEST_BLOB_UNKNOWN",
+            messages,
+            allow: None,
+            retry_after_s: None,
+        }
     }
 
     /// 400: the query of a list makes no sense.
@@ -128,6 +136,13 @@ impl OciError {
 impl From<StoreError> for OciError {
     fn from(error: StoreError) -> Self {
         Self::internal(&error)
+    }
+}
+
+impl From<NotYet> for OciError {
+    fn from(not_yet: NotYet) -> Self {
+        let error = Self::new(StatusCode::TOO_MANY_REQUESTS, "TOOMANYREQUESTS", not_yet.to_string());
+        Self { retry_after_s: Some(not_yet.retry_after_s), ..error }
     }
 }
 
@@ -164,6 +179,9 @@ impl IntoResponse for OciError {
         }
         if let Some(allow) = self.allow {
             response.headers_mut().insert(ALLOW, HeaderValue::from_static(allow));
+        }
+        if let Some(seconds) = self.retry_after_s {
+            response.headers_mut().insert(RETRY_AFTER, HeaderValue::from(seconds));
         }
         response
     }

@@ -21,6 +21,7 @@ use super::auth::Caller;
 use crate::blobs::Blobs;
 use crate::clock::Clock;
 use crate::store::{Reference, Store};
+use crate::transfers::Transfers;
 
 /// What the registry works on.
 #[derive(Clone)]
@@ -31,6 +32,8 @@ pub struct Registry {
     pub blobs: Blobs,
     /// When things were pushed.
     pub clock: Clock,
+    /// Whose turn it is to pull.
+    pub transfers: Transfers,
 }
 
 /// How every handler here ends.

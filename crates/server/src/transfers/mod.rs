@@ -1,0 +1,194 @@
+//! Robots that pull blobs over HTTP: how many at once, how fast together, and who is next. A robot that has to wait does so
+//! for a moment; then it is told when to come back, and keeps its place. It knows no blobs and no answers.
+
+mod body;
+mod pace;
+mod queue;
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use task_proto::id::{LabelKey, LabelValue, Labels};
+use task_proto::{Digest, RobotId};
+use tokio::sync::oneshot;
+use tokio::time::{Instant, timeout};
+
+pub use body::TransferBody;
+use pace::Pace;
+pub use queue::Claim;
+use queue::{Asking, Place, Queue, jittered};
+
+use crate::config::TransferLimits;
+
+/// How long a request waits for its turn.
+const PATIENCE: Duration = Duration::from_secs(2);
+/// When a robot should come back for which there was no place.
+const NO_PLACE_MS: u64 = 30_000;
+
+/// All transfers of robots. Clones are the same.
+#[derive(Clone)]
+pub struct Transfers {
+    shared: Arc<Shared>,
+}
+
+struct Shared {
+    started: Instant,
+    site_label: LabelKey,
+    turns: Mutex<Turns>,
+    paces: Mutex<Paces>,
+}
+
+struct Turns {
+    queue: Queue,
+    /// Whom to tell that it is their turn.
+    asking: HashMap<Asking, oneshot::Sender<Transfer>>,
+}
+
+struct Paces {
+    all: Option<Pace>,
+    sites: HashMap<LabelValue, Pace>,
+}
+
+/// It is not this robot's turn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("other robots come first; come back in {retry_after_s} s")]
+pub struct NotYet {
+    /// When to come back.
+    pub retry_after_s: u64,
+}
+
+/// A robot's turn; it ends when this is dropped.
+pub struct Transfer {
+    shared: Arc<Shared>,
+    site: Option<LabelValue>,
+    begun_ms: u64,
+}
+
+impl Transfers {
+    /// None yet, and no more than `limits` allow. The value of `site_label` says on which site a robot is.
+    pub fn new(limits: &TransferLimits, site_label: LabelKey) -> Self {
+        let now = Instant::now();
+        let pace = |bytes_per_s: Option<u64>| bytes_per_s.map(|bytes_per_s| Pace::new(bytes_per_s, now));
+        let sites = limits.sites.iter().filter_map(|(site, limits)| Some((site.clone(), pace(limits.bytes_per_s)?)));
+        let paces = Paces { all: pace(limits.all.bytes_per_s), sites: sites.collect() };
+        let turns = Turns { queue: Queue::new(limits), asking: HashMap::new() };
+        let (turns, paces) = (Mutex::new(turns), Mutex::new(paces));
+        Self { shared: Arc::new(Shared { started: now, site_label, turns, paces }) }
+    }
+
+    /// Where a robot with these labels is.
+    pub fn site_of(&self, labels: &Labels) -> Option<LabelValue> {
+        labels.get(&self.shared.site_label).cloned()
+    }
+
+    /// How many run now.
+    pub fn running(&self) -> u64 {
+        self.shared.turns().queue.running()
+    }
+
+    /// Waits for `robot`'s turn to pull `blob`, for a moment.
+    pub async fn admit(&self, robot: &RobotId, blob: Digest, claim: &Claim) -> Result<Transfer, NotYet> {
+        let place = Place { robot: robot.clone(), blob };
+        let (tell, mut told) = oneshot::channel();
+        let asking = {
+            let mut turns = self.shared.turns();
+            let Some(asking) = turns.queue.ask(place, claim, self.shared.now_ms()) else {
+                return Err(come_back(jittered(NO_PLACE_MS, rand::random())));
+            };
+            turns.asking.insert(asking, tell);
+            asking
+        };
+        let mut request = Request { shared: &self.shared, asking: Some(asking) };
+        self.shared.begin_what_may();
+        if let Ok(Ok(transfer)) = timeout(PATIENCE, &mut told).await {
+            request.asking = None;
+            return Ok(transfer);
+        }
+        match request.leave() {
+            Some(away_ms) => Err(come_back(away_ms)),
+            // Its turn has come just now, or it asked a second time meanwhile.
+            None => told.await.map_err(|_| come_back(jittered(0, rand::random()))),
+        }
+    }
+}
+
+fn come_back(away_ms: u64) -> NotYet {
+    NotYet { retry_after_s: away_ms.div_ceil(1000) }
+}
+
+/// A request that waits. Dropped, because its client has gone, it waits no longer.
+struct Request<'a> {
+    shared: &'a Arc<Shared>,
+    asking: Option<Asking>,
+}
+
+impl Request<'_> {
+    /// For how long the robot should stay away; `None` if it does not wait any more.
+    fn leave(&mut self) -> Option<u64> {
+        let asking = self.asking.take()?;
+        let mut turns = self.shared.turns();
+        turns.asking.remove(&asking);
+        turns.queue.send_away(asking, self.shared.now_ms(), rand::random())
+    }
+}
+
+impl Drop for Request<'_> {
+    fn drop(&mut self) {
+        self.leave();
+    }
+}
+
+impl Shared {
+    /// Begins what may begin. Whoever is told and has gone meanwhile gives the turn back by dropping it.
+    fn begin_what_may(self: &Arc<Self>) {
+        let now_ms = self.now_ms();
+        let told: Vec<_> = {
+            let mut turns = self.turns();
+            let Turns { queue, asking } = &mut *turns;
+            let begun = queue.begin(now_ms).into_iter();
+            begun.map(|(request, site)| (asking.remove(&request), site)).collect()
+        };
+        for (tell, site) in told {
+            let transfer = Transfer { shared: self.clone(), site, begun_ms: now_ms };
+            // Without anybody to tell it is dropped, and its turn is another's.
+            drop(tell.map(|tell| tell.send(transfer)));
+        }
+    }
+
+    fn now_ms(&self) -> u64 {
+        u64::try_from(self.started.elapsed().as_millis()).unwrap_or(u64::MAX)
+    }
+
+    fn turns(&self) -> MutexGuard<'_, Turns> {
+        // Every change under these locks is complete in itself, so a panic elsewhere leaves nothing half-done.
+        self.turns.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn paces(&self) -> MutexGuard<'_, Paces> {
+        self.paces.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Transfer {
+    /// How many of `bytes` may go next, and when; `None`: all, and now.
+    fn reserve(&self, bytes: u64) -> Option<(u64, Instant)> {
+        let mut paces = self.shared.paces();
+        let Paces { all, sites } = &mut *paces;
+        let site = self.site.as_ref().and_then(|site| sites.get_mut(site));
+        let mut limits: Vec<&mut Pace> = all.as_mut().into_iter().chain(site).collect();
+        let running = self.shared.turns().queue.running();
+        let piece = limits.iter().map(|pace| pace.piece(running)).min()?.min(bytes);
+        let now = Instant::now();
+        let at = limits.iter_mut().map(|pace| pace.reserve(piece, now)).max()?;
+        Some((piece, at))
+    }
+}
+
+impl Drop for Transfer {
+    fn drop(&mut self) {
+        let lasted_ms = self.shared.now_ms().saturating_sub(self.begun_ms);
+        self.shared.turns().queue.end(self.site.as_ref(), lasted_ms);
+        self.shared.begin_what_may();
+    }
+}

@@ -1,0 +1,389 @@
+//! Who pulls next: transfers that run, robots that wait for one, and in which order. It decides only; time and chance are
+//! given to it, and it neither waits nor sends.
+//!
+//! A place in the queue belongs to a robot and a blob, whether the robot asks just now or was told to come back later. Where
+//! the next in line is away, one behind it that is there goes first; after a few times its transfer is kept free.
+
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, HashMap};
+
+use task_proto::id::LabelValue;
+use task_proto::{Digest, RobotId};
+
+use crate::config::{SiteLimits, TransferLimits};
+
+/// Robots that have a place; a further one is told to come back later without one.
+const MAX_PLACES: usize = 20_000;
+/// How often others may go before one that is away.
+const MAX_PASSED: u32 = 8;
+/// How much later than it was told a robot may come back before its place is lost.
+const GRACE_MS: u64 = 30_000;
+/// How often it is looked whose place is lost.
+const LOOK_INTERVAL_MS: u64 = 1_000;
+/// The shortest and the longest time to stay away.
+const MIN_AWAY_MS: u64 = 1_000;
+const MAX_AWAY_MS: u64 = 60_000;
+/// What a transfer is taken to last before any has ended.
+const FIRST_GUESS_MS: u64 = 1_000;
+
+/// Who wants what.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub(super) struct Place {
+    pub(super) robot: RobotId,
+    pub(super) blob: Digest,
+}
+
+/// What decides when it is somebody's turn.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Claim {
+    /// The deployment's: the higher comes first.
+    pub priority: i32,
+    /// The deployment's number: the older comes first.
+    pub deployment: u64,
+    /// Where the robot is, if it says.
+    pub site: Option<LabelValue>,
+}
+
+/// A request that waits for its turn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(super) struct Asking(u64);
+
+/// The order of places: priority, age of the deployment, arrival.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+struct Rank {
+    priority: Reverse<i32>,
+    deployment: u64,
+    arrival: u64,
+}
+
+#[derive(Debug)]
+struct Waiting {
+    place: Place,
+    site: Option<LabelValue>,
+    /// The request that is there; `None`: away.
+    asking: Option<Asking>,
+    /// When an absent robot's place is lost.
+    lost_at_ms: u64,
+    /// How often others went first.
+    passed: u32,
+}
+
+/// What runs, of all or on one site.
+#[derive(Debug, Clone, Copy, Default)]
+struct Load {
+    limits: SiteLimits,
+    running: u64,
+}
+
+impl Load {
+    fn free(&self) -> u64 {
+        self.limits.max.map_or(u64::MAX, |max| max.saturating_sub(self.running))
+    }
+}
+
+/// All transfers of robots.
+#[derive(Debug)]
+pub(super) struct Queue {
+    all: Load,
+    /// Sites that have limits.
+    sites: HashMap<LabelValue, Load>,
+    waiting: BTreeMap<Rank, Waiting>,
+    ranks: HashMap<Place, Rank>,
+    /// Where those stand that are there.
+    asking: HashMap<Asking, Rank>,
+    /// When it was last looked whose place is lost.
+    looked_at_ms: u64,
+    numbers: u64,
+    /// Moving average of what transfers last.
+    lasts_ms: u64,
+}
+
+impl Queue {
+    pub(super) fn new(limits: &TransferLimits) -> Self {
+        let load = |limits: &SiteLimits| Load { limits: *limits, running: 0 };
+        Self {
+            all: load(&limits.all),
+            sites: limits.sites.iter().map(|(site, limits)| (site.clone(), load(limits))).collect(),
+            waiting: BTreeMap::new(),
+            ranks: HashMap::new(),
+            asking: HashMap::new(),
+            looked_at_ms: 0,
+            numbers: 0,
+            lasts_ms: FIRST_GUESS_MS,
+        }
+    }
+
+    /// Transfers that run.
+    pub(super) fn running(&self) -> u64 {
+        self.all.running
+    }
+
+    /// A robot asks. Its request waits from now on, in the place that it has if it was here before; an earlier request of
+    /// the same place waits no longer. `None`: there are as many places as there may be.
+    pub(super) fn ask(&mut self, place: Place, claim: &Claim, now_ms: u64) -> Option<Asking> {
+        self.forget_lost(now_ms);
+        let before = self.ranks.remove(&place);
+        if before.is_none() && self.waiting.len() >= MAX_PLACES {
+            return None;
+        }
+        let asking = Asking(self.next_number());
+        let waited = before.and_then(|rank| self.waiting.remove(&rank));
+        if let Some(earlier) = waited.as_ref().and_then(|waited| waited.asking) {
+            self.asking.remove(&earlier);
+        }
+        let arrival = before.map_or(asking.0, |rank| rank.arrival);
+        let rank = Rank { priority: Reverse(claim.priority), deployment: claim.deployment, arrival };
+        self.ranks.insert(place.clone(), rank);
+        self.asking.insert(asking, rank);
+        let passed = waited.map_or(0, |waited| waited.passed);
+        let site = claim.site.clone();
+        self.waiting.insert(rank, Waiting { place, site, asking: Some(asking), lost_at_ms: u64::MAX, passed });
+        Some(asking)
+    }
+
+    /// Begins the transfers that may begin now. To be called after whatever may have made room.
+    pub(super) fn begin(&mut self, now_ms: u64) -> Vec<(Asking, Option<LabelValue>)> {
+        let mut free = self.all.free();
+        if free == 0 {
+            return Vec::new();
+        }
+        self.forget_lost(now_ms);
+        let mut free_on: HashMap<&LabelValue, u64> =
+            self.sites.iter().map(|(site, load)| (site, load.free())).collect();
+        let (mut begun, mut away) = (Vec::new(), Vec::new());
+        for (rank, waiting) in &self.waiting {
+            let on_site = waiting.site.as_ref().and_then(|site| free_on.get_mut(site));
+            if free == 0 {
+                break;
+            }
+            if on_site.as_deref() == Some(&0) {
+                continue;
+            }
+            match waiting.asking {
+                Some(_) => begun.push((*rank, away.len())),
+                // One that others have passed too often is waited for.
+                None if waiting.passed >= MAX_PASSED => {}
+                None => {
+                    away.push(*rank);
+                    continue;
+                }
+            }
+            free -= 1;
+            on_site.into_iter().for_each(|free| *free -= 1);
+        }
+        for (index, rank) in away.iter().enumerate() {
+            let overtakers = begun.iter().filter(|(_, away_before)| *away_before > index).count();
+            if let Some(waiting) = self.waiting.get_mut(rank) {
+                waiting.passed = waiting.passed.saturating_add(u32::try_from(overtakers).unwrap_or(u32::MAX));
+            }
+        }
+        begun.into_iter().filter_map(|(rank, _)| self.start(rank)).collect()
+    }
+
+    /// The request waits no longer. For how long its robot should stay away, with its place kept; `None` if it does not
+    /// wait. `chance` is from 0 to 1.
+    pub(super) fn send_away(&mut self, asking: Asking, now_ms: u64, chance: f64) -> Option<u64> {
+        let rank = self.asking.remove(&asking)?;
+        let on_site = self.waiting.get(&rank)?.site.as_ref().and_then(|site| self.sites.get(site));
+        let at_once = [Some(&self.all), on_site].into_iter().flatten().filter_map(|load| load.limits.max).min();
+        let (at_once, lasts_ms) = (at_once.unwrap_or(1).max(1), self.lasts_ms.max(1));
+        // Beyond the longest time to stay away it does not matter how many there are.
+        let enough = usize::try_from((MAX_AWAY_MS / lasts_ms + 1).saturating_mul(at_once)).unwrap_or(usize::MAX);
+        let ahead = self.waiting.range(..rank).take(enough).count() as u64;
+        let away_ms = jittered((ahead + 1).div_ceil(at_once).saturating_mul(lasts_ms), chance);
+        let waiting = self.waiting.get_mut(&rank)?;
+        waiting.asking = None;
+        waiting.lost_at_ms = now_ms + away_ms + GRACE_MS;
+        Some(away_ms)
+    }
+
+    /// A transfer has ended after so long.
+    pub(super) fn end(&mut self, site: Option<&LabelValue>, lasted_ms: u64) {
+        self.all.running -= 1;
+        if let Some(load) = site.and_then(|site| self.sites.get_mut(site)) {
+            load.running -= 1;
+        }
+        self.lasts_ms = (self.lasts_ms * 7 + lasted_ms) / 8;
+    }
+
+    fn start(&mut self, rank: Rank) -> Option<(Asking, Option<LabelValue>)> {
+        let waiting = self.waiting.remove(&rank)?;
+        self.ranks.remove(&waiting.place);
+        if let Some(asking) = waiting.asking {
+            self.asking.remove(&asking);
+        }
+        self.all.running += 1;
+        if let Some(load) = waiting.site.as_ref().and_then(|site| self.sites.get_mut(site)) {
+            load.running += 1;
+        }
+        Some((waiting.asking?, waiting.site))
+    }
+
+    fn forget_lost(&mut self, now_ms: u64) {
+        if now_ms < self.looked_at_ms + LOOK_INTERVAL_MS {
+            return;
+        }
+        self.looked_at_ms = now_ms;
+        let ranks = &mut self.ranks;
+        self.waiting.retain(|_, waiting| {
+            let is_kept = waiting.asking.is_some() || now_ms < waiting.lost_at_ms;
+            if !is_kept {
+                ranks.remove(&waiting.place);
+            }
+            is_kept
+        });
+    }
+
+    fn next_number(&mut self) -> u64 {
+        self.numbers += 1;
+        self.numbers
+    }
+}
+
+/// A time to stay away: at least what is expected, up to half as much again, so that those sent away together come back
+/// one by one.
+pub(super) fn jittered(expected_ms: u64, chance: f64) -> u64 {
+    let expected_ms = expected_ms.clamp(MIN_AWAY_MS, MAX_AWAY_MS);
+    expected_ms + (expected_ms as f64 / 2.0 * chance.clamp(0.0, 1.0)) as u64
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn limits(max: u64) -> TransferLimits {
+        TransferLimits { all: SiteLimits { max: Some(max), bytes_per_s: None }, ..TransferLimits::default() }
+    }
+
+    fn place(number: u8) -> Place {
+        Place { robot: format!("r{number:016x}").parse().expect("valid"), blob: Digest::of(b"x") }
+    }
+
+    fn claim(priority: i32) -> Claim {
+        Claim { priority, ..Claim::default() }
+    }
+
+    #[test]
+    fn priority_comes_before_age_and_age_before_arrival() {
+        let mut queue = Queue::new(&limits(1));
+        let first = queue.ask(place(0), &claim(0), 0);
+        assert_eq!(queue.begin(0), [(first.expect("room"), None)]);
+        let mut ask = |number, priority, deployment| {
+            queue.ask(place(number), &Claim { priority, deployment, site: None }, 0).expect("room")
+        };
+        let (late, early, old, high) = (ask(1, 0, 7), ask(2, 0, 7), ask(3, 0, 6), ask(4, 1, 9));
+        for next in [high, old, late, early] {
+            assert_eq!(queue.begin(0), []);
+            queue.end(None, 1_000);
+            assert_eq!(queue.begin(0), [(next, None)]);
+        }
+    }
+
+    #[test]
+    fn a_site_has_its_own_limit_and_holds_up_no_other() {
+        let site: LabelValue = "hall-3".parse().expect("valid");
+        let mut queue = Queue::new(&TransferLimits {
+            sites: [(site.clone(), SiteLimits { max: Some(1), bytes_per_s: None })].into(),
+            ..limits(3)
+        });
+        let there = Claim { site: Some(site.clone()), ..Claim::default() };
+        for number in 0..3 {
+            queue.ask(place(number), &there, 0);
+        }
+        for number in 3..6 {
+            queue.ask(place(number), &claim(-1), 0);
+        }
+        let begun: Vec<_> = queue.begin(0).into_iter().map(|(_, site)| site).collect();
+        assert_eq!(begun, [Some(site.clone()), None, None]);
+        queue.end(Some(&site), 1_000);
+        assert_eq!(queue.begin(0).len(), 1);
+    }
+
+    #[test]
+    fn who_is_sent_away_is_told_a_time_by_its_place_and_keeps_that() {
+        let mut queue = Queue::new(&limits(2));
+        let asked: Vec<Asking> = (0..8).map(|number| queue.ask(place(number), &claim(0), 0).expect("room")).collect();
+        assert_eq!(queue.begin(0).len(), 2);
+        assert_eq!(queue.send_away(asked[0], 0, 0.0), None, "it is under way");
+        assert_eq!(queue.send_away(asked[2], 0, 0.0), Some(1_000));
+        assert_eq!(queue.send_away(asked[7], 0, 0.0), Some(3_000));
+        assert_eq!(queue.send_away(asked[7], 0, 0.0), None, "it is away already");
+        assert_eq!(queue.send_away(asked[6], 0, 1.0), Some(4_500));
+        queue.ask(place(7), &claim(0), 3_000);
+        let again = queue.ask(place(2), &claim(0), 3_000).expect("room");
+        queue.end(None, 1_000);
+        assert_eq!(queue.begin(3_000), [(again, None)], "first in its old place");
+        // Who does not come back loses its place.
+        queue.end(None, 1_000);
+        queue.end(None, 1_000);
+        assert_eq!(queue.begin(3_000).len(), 2);
+        assert_eq!(queue.waiting.len(), 3);
+        queue.forget_lost(4_500 + GRACE_MS);
+        assert_eq!((queue.waiting.len(), queue.ranks.len()), (2, 2));
+    }
+
+    #[test]
+    fn places_are_bounded() {
+        let mut queue = Queue::new(&limits(1));
+        let place =
+            |number: usize| Place { robot: format!("r{number:016x}").parse().expect("valid"), blob: Digest::of(b"x") };
+        for number in 0..MAX_PLACES {
+            assert!(queue.ask(place(number), &claim(0), 0).is_some());
+        }
+        assert_eq!(queue.ask(place(MAX_PLACES), &claim(9), 0), None);
+        assert!(queue.ask(place(0), &claim(0), 0).is_some(), "it has one");
+    }
+
+    proptest! {
+        /// However robots come and go, and however many newcomers ask meanwhile: never more transfers than the limit, and
+        /// one that keeps coming back when it was told gets its turn after at most those before it, each of which may be
+        /// passed a few times.
+        #[test]
+        fn nobody_starves(max in 1u64..5, others in 1u8..20, newcomers in proptest::collection::vec(0u64..3, 300), seed in any::<u64>()) {
+            let mut queue = Queue::new(&limits(max));
+            let mut chance = seed;
+            let mut random = move |below: u64| {
+                chance = chance.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+                (chance >> 33) % below
+            };
+            for number in 0..others {
+                queue.ask(place(number), &claim(0), 0);
+            }
+            let mut mine = queue.ask(place(100), &claim(0), 0);
+            let (mut now_ms, mut back_at_ms, mut begun_in_all) = (0, u64::MAX, 0_u64);
+            let mut is_done = false;
+            let mut running = Vec::new();
+            for (turn, count) in newcomers.iter().enumerate() {
+                now_ms += 1_000;
+                for index in 0..*count {
+                    let robot = format!("r{:016x}", 1_000 + turn as u64 * 10 + index).parse().expect("valid");
+                    queue.ask(Place { robot, blob: Digest::of(b"x") }, &claim(0), now_ms);
+                }
+                if mine.is_none() && now_ms >= back_at_ms {
+                    mine = queue.ask(place(100), &claim(0), now_ms);
+                }
+                for _ in 0..random(max + 1).min(running.len() as u64) {
+                    running.pop();
+                    queue.end(None, 1_000);
+                }
+                for (asking, _) in queue.begin(now_ms) {
+                    is_done |= Some(asking) == mine;
+                    running.push(asking);
+                    begun_in_all += u64::from(!is_done);
+                }
+                prop_assert!(running.len() as u64 <= max && queue.running() == running.len() as u64);
+                if is_done {
+                    break;
+                }
+                // Sometimes it is not there when its turn could have come.
+                if let Some(asking) = mine.filter(|_| random(2) == 0) {
+                    back_at_ms = now_ms + queue.send_away(asking, now_ms, 0.5).expect("waits");
+                    mine = None;
+                }
+            }
+            prop_assert!(begun_in_all <= u64::from(others) + u64::from(MAX_PASSED) + max);
+        }
+    }
+}

@@ -44,8 +44,17 @@ pub struct Changes {
 /// Robots to ring: a set, so however often a robot's desired state changes it waits here once.
 #[derive(Debug, Default)]
 struct Bells {
-    waiting: Mutex<BTreeSet<RobotId>>,
+    waiting: Mutex<Rings>,
     rung: Notify,
+}
+
+/// Who is to be rung.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub struct Rings {
+    /// All there are, these among them.
+    pub everyone: bool,
+    /// These.
+    pub robots: BTreeSet<RobotId>,
 }
 
 impl Changes {
@@ -78,18 +87,24 @@ impl Changes {
     /// Asks that `robots` be told of their new desired state.
     pub fn ring(&self, robots: impl IntoIterator<Item = RobotId>) {
         let mut waiting = self.bells.waiting.lock().unwrap_or_else(PoisonError::into_inner);
-        waiting.extend(robots);
-        if !waiting.is_empty() {
+        waiting.robots.extend(robots);
+        if !waiting.robots.is_empty() {
             self.bells.rung.notify_one();
         }
     }
 
+    /// Asks that every robot be told of its desired state.
+    pub fn ring_everyone(&self) {
+        self.bells.waiting.lock().unwrap_or_else(PoisonError::into_inner).everyone = true;
+        self.bells.rung.notify_one();
+    }
+
     /// Waits until there are robots to ring and takes them all. Made for one caller, the downlink; dropping the future
     /// loses none.
-    pub async fn take_rings(&self) -> BTreeSet<RobotId> {
+    pub async fn take_rings(&self) -> Rings {
         loop {
             let taken = std::mem::take(&mut *self.bells.waiting.lock().unwrap_or_else(PoisonError::into_inner));
-            if !taken.is_empty() {
+            if taken != Rings::default() {
                 return taken;
             }
             self.bells.rung.notified().await;
@@ -113,12 +128,16 @@ mod tests {
         let robot = RobotId::random();
         changes.ring([robot.clone()]);
         changes.ring([robot.clone()]);
-        assert_eq!(changes.take_rings().await, BTreeSet::from([robot.clone()]));
+        assert_eq!(changes.take_rings().await.robots, BTreeSet::from([robot.clone()]));
         let waiting = tokio::spawn({
             let changes = changes.clone();
             async move { changes.take_rings().await }
         });
         changes.ring([robot.clone()]);
-        assert_eq!(waiting.await.expect("no panic"), BTreeSet::from([robot]));
+        let taken = waiting.await.expect("no panic");
+        assert_eq!(taken, Rings { everyone: false, robots: BTreeSet::from([robot.clone()]) });
+        changes.ring_everyone();
+        changes.ring([robot.clone()]);
+        assert_eq!(changes.take_rings().await, Rings { everyone: true, robots: BTreeSet::from([robot]) });
     }
 }

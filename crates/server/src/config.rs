@@ -17,6 +17,7 @@ use task_proto::topic::TopicPrefix;
 
 use self::settings::{SETTINGS, Setting};
 pub use self::tables::{SiteLimits, TransferLimits};
+use crate::broker_url::BrokerUrl;
 use crate::delivery::{Rule, Rules};
 
 /// Everything `taskd serve` can be told.
@@ -28,6 +29,8 @@ pub struct Config {
     pub http: SocketAddr,
     /// Where MQTT listens; port 0 takes a free one.
     pub mqtt: SocketAddr,
+    /// The MQTT broker to be a client of; absent: the server's own, which listens at `mqtt`.
+    pub broker: Option<BrokerUrl>,
     /// The database's URL; absent: SQLite in the data directory.
     pub database: Option<String>,
     /// What all MQTT topics start with.
@@ -169,6 +172,21 @@ pub enum ConfigError {
     /// No data directory is given and there is no home to put it in.
     #[error("--data: no directory is given, and neither XDG_DATA_HOME nor HOME says where to put one")]
     NoDataDirectory,
+    /// The broker's password stands where every user of the machine can read it.
+    #[error(
+        "--broker: everybody on this machine can read a command line, so the broker's URL with its password belongs in \
+         the configuration file (broker = \"mqtt://…\") or in TASKD_BROKER"
+    )]
+    PasswordInSight,
+    /// The broker's password would cross the network readable.
+    #[error(
+        "broker = {address}: an unencrypted connection to another machine is refused; use a broker on this machine or \
+         give --allow-plaintext"
+    )]
+    PlaintextBroker {
+        /// Where the broker is.
+        address: String,
+    },
     /// An unencrypted listener would be reachable from other machines.
     #[error(
         "{key} = {address}: unencrypted connections from other machines are refused; bind a loopback address or \
@@ -197,6 +215,7 @@ impl Config {
             data,
             http: SocketAddr::from(([127, 0, 0, 1], 8080)),
             mqtt: SocketAddr::from(([127, 0, 0, 1], 1883)),
+            broker: None,
             database: None,
             topic_prefix: TopicPrefix::default(),
             allow_plaintext: false,
@@ -230,12 +249,20 @@ impl Config {
         }
         config.apply_environment(&environment)?;
         for (name, text) in &flags.settings {
+            if *name == "broker" && text != "embedded" {
+                return Err(ConfigError::PasswordInSight);
+            }
             config.apply(&name.replace('-', "_"), text, Origin::Flag(format!("--{name}")))?;
         }
         if config.data.as_os_str().is_empty() {
             config.data = default_data_directory(variable).ok_or(ConfigError::NoDataDirectory)?;
         }
-        for (key, address) in [("http", config.http), ("mqtt", config.mqtt)] {
+        if let Some(broker) = config.broker.as_ref().filter(|broker| !broker.is_loopback() && !config.allow_plaintext) {
+            return Err(ConfigError::PlaintextBroker { address: broker.address() });
+        }
+        // Nothing listens for MQTT beside an external broker.
+        let mqtt = config.broker.is_none().then_some(("mqtt", config.mqtt));
+        for (key, address) in [("http", config.http)].into_iter().chain(mqtt) {
             if !address.ip().is_loopback() && !config.allow_plaintext {
                 return Err(ConfigError::Plaintext { key, address });
             }
@@ -459,6 +486,26 @@ mod tests {
         assert!(message.starts_with("mqtt = 0.0.0.0:1883: unencrypted"), "{message}");
         let flags = [("mqtt", "0.0.0.0:1883"), ("allow-plaintext", "true")];
         assert!(load(&flags, &[], None).expect("allowed").allow_plaintext);
+    }
+
+    #[test]
+    fn an_external_broker_and_its_password_stay_out_of_sight() {
+        let url = "mqtt://taskd:secret@localhost:1884";
+        let config = load(&[], &[("TASKD_BROKER", url), ("TASKD_MQTT", "0.0.0.0:1883")], None).expect("loads");
+        assert!(!format!("{config:?}").contains("secret"));
+        assert_eq!(config.broker.expect("external").address(), "localhost:1884");
+        let back = load(&[("broker", "embedded")], &[("TASKD_BROKER", url)], None).expect("loads");
+        assert_eq!(back.broker, None);
+        let elsewhere = Some("broker = \"mqtt://taskd:secret@broker.lab\"");
+        for message in [
+            load(&[("broker", url)], &[], None).expect_err("readable by everybody"),
+            load(&[], &[("TASKD_BROKER", "tcp://taskd:secret@localhost")], None).expect_err("no such scheme"),
+            load(&[], &[], elsewhere).expect_err("readable on the way"),
+        ] {
+            assert!(message.contains("broker") || message.contains("BROKER"), "{message}");
+            assert!(!message.contains("secret"), "{message}");
+        }
+        assert!(load(&[("allow-plaintext", "true")], &[], elsewhere).is_ok());
     }
 
     #[test]

@@ -1,5 +1,6 @@
-//! The server's directory: made on the first start, locked while a server runs, home of the signing key, the first
-//! operator's token and the addresses that are bound. It never touches the database or the blobs in it.
+//! The server's directory: made on the first start, locked while a server runs, home of the signing key, the secret
+//! behind robots' passwords at an external broker, the first operator's token and the addresses that are bound. It never
+//! touches the database or the blobs in it.
 
 use std::fs::{DirBuilder, File, OpenOptions, TryLockError};
 use std::io::{self, Write as _};
@@ -13,6 +14,7 @@ use task_proto::token::{Token, TokenKind};
 
 const LOCK: &str = "taskd.lock";
 const SIGNING_KEY: &str = "signing.key";
+const BROKER_SECRET: &str = "broker.secret";
 const OPERATOR_TOKEN: &str = "operator.token";
 const ADDRESSES: &str = "addresses.json";
 
@@ -86,17 +88,14 @@ impl DataDirectory {
 
     /// The key that signs desired states, made on the first start. Robots pin it, so it is never replaced by itself.
     pub fn signing_key(&self) -> Result<SigningKey, DataError> {
-        let path = self.path.join(SIGNING_KEY);
-        let text = self.read_or_make(&path, || {
-            let seed = SigningKey::random().to_bytes();
-            // A digest's text form is as good as any for 32 bytes, and its parser is at hand.
-            Digest::from_bytes(seed).hex()
-        })?;
-        let seed: Result<Digest, _> = format!("sha256:{}", text.trim()).parse();
-        match seed {
-            Ok(seed) => Ok(SigningKey::from_bytes(seed.to_bytes())),
-            Err(_) => Err(DataError::Content { path, expected: "a signing key" }),
-        }
+        let seed = self.secret(SIGNING_KEY, "a signing key", || SigningKey::random().to_bytes())?;
+        Ok(SigningKey::from_bytes(seed))
+    }
+
+    /// What robots' passwords at an external broker are derived from, made when it is first needed. With another one they
+    /// all have new passwords.
+    pub fn broker_secret(&self) -> Result<[u8; 32], DataError> {
+        self.secret(BROKER_SECRET, "a secret of 64 hex digits", rand::random)
     }
 
     /// The token of the first operator, made on the first start.
@@ -121,6 +120,15 @@ impl DataDirectory {
     pub fn unpublish(&self) {
         // At worst someone finds the old addresses and nobody behind them.
         let _ = std::fs::remove_file(self.path.join(ADDRESSES));
+    }
+
+    /// 32 bytes in a file of their own, made on the first call.
+    fn secret(&self, name: &str, expected: &'static str, make: fn() -> [u8; 32]) -> Result<[u8; 32], DataError> {
+        let path = self.path.join(name);
+        // A digest's text form is as good as any for 32 bytes, and its parser is at hand.
+        let text = self.read_or_make(&path, || Digest::from_bytes(make()).hex())?;
+        let bytes: Result<Digest, _> = format!("sha256:{}", text.trim()).parse();
+        bytes.map(|bytes| bytes.to_bytes()).map_err(|_| DataError::Content { path, expected })
     }
 
     fn read_or_make(&self, path: &Path, make: impl FnOnce() -> String) -> Result<String, DataError> {

@@ -10,7 +10,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::actions::{Actions, Desired};
 use crate::broker::Broker;
-use crate::changes::Changes;
+use crate::changes::{Changes, Rings};
 use crate::clock::Clock;
 use crate::presence::Presence;
 
@@ -34,9 +34,10 @@ impl Downlink {
     pub async fn run(self, changes: Changes, stop: CancellationToken) {
         let ringing = async {
             loop {
-                let mut robots: Vec<RobotId> = changes.take_rings().await.into_iter().collect();
+                let mut robots = self.who(changes.take_rings().await).await;
                 robots.retain(|robot| self.is_to_be_told(robot));
                 for robots in robots.chunks(AT_ONCE) {
+                    self.broker.room().await;
                     self.ring(robots).await;
                 }
             }
@@ -48,10 +49,21 @@ impl Downlink {
         }
     }
 
+    async fn who(&self, rings: Rings) -> Vec<RobotId> {
+        if rings.everyone {
+            match self.actions.every_robot().await {
+                Ok(robots) => return robots,
+                Err(error) => tracing::warn!(
+                    error = &error as &dyn std::error::Error,
+                    "the robots could not be read; they are rung when they ask"
+                ),
+            }
+        }
+        rings.robots.into_iter().collect()
+    }
+
     fn is_to_be_told(&self, robot: &RobotId) -> bool {
-        let now_ms = self.clock.now_ms();
-        let is_connected = self.presence.get(robot, now_ms).is_some_and(|sighting| sighting.connection.is_some());
-        is_connected && !self.presence.is_duplicate(robot, now_ms)
+        self.broker.may_reach(robot) && !self.presence.is_duplicate(robot, self.clock.now_ms())
     }
 
     async fn ring(&self, robots: &[RobotId]) {

@@ -25,8 +25,8 @@ pub struct Presence {
 pub struct Sighting {
     /// Connected over MQTT, or heard over HTTP within the window.
     pub online: bool,
-    /// Where it was last heard from.
-    pub address: SocketAddr,
+    /// Where it was last heard from, as far as that is known.
+    pub address: Option<SocketAddr>,
     /// Since when it is connected over MQTT, if it is.
     pub connected_since_ms: Option<u64>,
     /// The number of that connection.
@@ -38,7 +38,7 @@ pub struct Sighting {
 }
 
 struct Sightings {
-    address: SocketAddr,
+    address: Option<SocketAddr>,
     connection: Option<Connection>,
     last_seen_ms: u64,
     /// When it was last heard over HTTP. The end of a connection takes it back: who hangs up is away until it asks.
@@ -59,7 +59,7 @@ impl Presence {
     }
 
     /// The robot's MQTT session number `connection` began.
-    pub fn connected(&self, robot: &RobotId, address: SocketAddr, connection: u64, now_ms: u64) {
+    pub fn connected(&self, robot: &RobotId, address: Option<SocketAddr>, connection: u64, now_ms: u64) {
         let mut robots = self.robots();
         let sightings = heard(&mut robots, robot, address, now_ms);
         if sightings.connection.is_none_or(|known| known.number < connection) {
@@ -80,11 +80,17 @@ impl Presence {
 
     /// The robot was heard over HTTP.
     pub fn seen(&self, robot: &RobotId, address: SocketAddr, now_ms: u64) {
-        heard(&mut self.robots(), robot, address, now_ms).polled_ms = Some(now_ms);
+        heard(&mut self.robots(), robot, Some(address), now_ms).polled_ms = Some(now_ms);
     }
 
     /// The robot named its instance. Returns whether it is a duplicate identity now.
-    pub fn instance_seen(&self, robot: &RobotId, address: SocketAddr, instance: &InstanceId, now_ms: u64) -> bool {
+    pub fn instance_seen(
+        &self,
+        robot: &RobotId,
+        address: Option<SocketAddr>,
+        instance: &InstanceId,
+        now_ms: u64,
+    ) -> bool {
         let mut robots = self.robots();
         let sightings = heard(&mut robots, robot, address, now_ms);
         sightings.instances.observe(instance, now_ms);
@@ -131,7 +137,7 @@ impl Presence {
 fn heard<'a>(
     robots: &'a mut HashMap<RobotId, Sightings>,
     robot: &RobotId,
-    address: SocketAddr,
+    address: Option<SocketAddr>,
     now_ms: u64,
 ) -> &'a mut Sightings {
     if robots.len() >= MAX_ROBOTS && !robots.contains_key(robot) {
@@ -144,7 +150,7 @@ fn heard<'a>(
         polled_ms: None,
         instances: InstanceHistory::default(),
     });
-    sightings.address = address;
+    sightings.address = address.or(sightings.address);
     sightings.last_seen_ms = sightings.last_seen_ms.max(now_ms);
     sightings
 }
@@ -284,12 +290,16 @@ mod tests {
         presence.seen(&robot, address(), 10);
         assert!(presence.is_online(&robot, 1009));
         assert!(!presence.is_online(&robot, 1010));
-        presence.connected(&robot, address(), 7, 2000);
+        presence.connected(&robot, Some(address()), 7, 2000);
         let sighting = presence.get(&robot, 90_000).expect("seen");
         assert!(sighting.online);
         assert_eq!((sighting.connection, sighting.connected_since_ms), (Some(7), Some(2000)));
         presence.disconnected(&robot, 7, 100_000);
         assert!(!presence.is_online(&robot, 100_000), "who hangs up is away at once");
+        presence.connected(&robot, None, 8, 100_000);
+        let sighting = presence.get(&robot, 100_000).expect("seen");
+        assert_eq!((sighting.connection, sighting.address), (Some(8), Some(address())), "known from before");
+        presence.disconnected(&robot, 8, 100_000);
         presence.seen(&robot, address(), 100_001);
         assert!(presence.is_online(&robot, 100_500));
         presence.forget(&robot);
@@ -302,7 +312,7 @@ mod tests {
         let (polls, connected) = (RobotId::random(), RobotId::random());
         presence.seen(&polls, address(), 500);
         presence.seen(&connected, address(), 500);
-        presence.connected(&connected, address(), 1, 600);
+        presence.connected(&connected, Some(address()), 1, 600);
         assert!(presence.fell_silent(0, 1499).is_empty());
         assert_eq!(presence.fell_silent(1499, 1500), [polls]);
         assert!(presence.fell_silent(1500, 9000).is_empty());
@@ -312,8 +322,8 @@ mod tests {
     fn a_late_end_of_the_old_connection_leaves_the_new_one() {
         let presence = Presence::new(1000);
         let robot = RobotId::random();
-        presence.connected(&robot, address(), 2, 0);
-        presence.connected(&robot, address(), 1, 1);
+        presence.connected(&robot, Some(address()), 2, 0);
+        presence.connected(&robot, Some(address()), 1, 1);
         presence.disconnected(&robot, 1, 2);
         assert_eq!(presence.get(&robot, 50_000).and_then(|sighting| sighting.connection), Some(2));
     }
@@ -322,9 +332,9 @@ mod tests {
     fn memory_is_bounded() {
         let mut robots = HashMap::new();
         let silent = RobotId::random();
-        heard(&mut robots, &silent, address(), 1);
+        heard(&mut robots, &silent, Some(address()), 1);
         for at_ms in 2..=MAX_ROBOTS as u64 + 1 {
-            heard(&mut robots, &RobotId::random(), address(), at_ms);
+            heard(&mut robots, &RobotId::random(), Some(address()), at_ms);
         }
         assert!(robots.len() <= MAX_ROBOTS);
         assert!(!robots.contains_key(&silent));

@@ -5,7 +5,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use task_proto::api::MqttEndpoint;
+use task_proto::envelope::PublicKey;
 use tokio::task::JoinHandle;
 use tokio::time::{Interval, MissedTickBehavior};
 use tokio_util::sync::CancellationToken;
@@ -14,7 +14,7 @@ use tokio_util::task::TaskTracker;
 use crate::actions::{ActionSettings, Actions};
 use crate::backlog::listen;
 use crate::blobs::{BlobError, BlobSettings, Blobs};
-use crate::broker::{Broker, BrokerConfig, BrokerError, Health, Limits};
+use crate::broker::{Broker, BrokerConfig, BrokerError, ExternalConfig, Gatekeeper, Health, Inbox, Limits};
 use crate::changes::{Change, Changes};
 use crate::clock::Clock;
 use crate::collector;
@@ -25,6 +25,7 @@ use crate::gatekeeper::StoreGatekeeper;
 use crate::http::events::{EventFeed, EventSource};
 use crate::http::traffic::HttpTotals;
 use crate::http::{App, listener};
+use crate::mqtt_access::MqttAccess;
 use crate::presence::Presence;
 use crate::report_writer::ReportWriter;
 use crate::requests::Requests;
@@ -105,7 +106,7 @@ impl Server {
         let (heard, said) = (requests.clone(), logs.clone());
         let uplink = Uplink::new(writer.clone(), heard, said, presence.clone(), changes.clone(), clock.clone());
         let gatekeeper = StoreGatekeeper { store: store.clone(), clock: clock.clone() };
-        let broker = Broker::start(broker_config(&config), Arc::new(gatekeeper), Arc::new(uplink)).await?;
+        let (broker, mqtt) = start_broker(&config, &data, &public_key, Arc::new(gatekeeper), Arc::new(uplink)).await?;
 
         let transfers = Transfers::new(&config.transfers, config.delivery.site_label.clone());
         let (stop, tasks) = (CancellationToken::new(), TaskTracker::new());
@@ -126,7 +127,7 @@ impl Server {
             attempts: Arc::default(),
             events: EventFeed::new(),
             key: public_key,
-            mqtt: mqtt_endpoint(&config, broker.local_addr()),
+            mqtt: Arc::new(mqtt),
             http_traffic: http_traffic.clone(),
             data: data.path().to_owned(),
             stop: stop.clone(),
@@ -134,8 +135,11 @@ impl Server {
         start_tasks(&tasks, &app, config.blob_grace);
         let router = crate::http::router(app);
         let http = listener::serve(http, router, http_limits(&config), http_traffic, stop.clone(), REQUEST_PATIENCE);
-        let addresses =
-            Addresses { http: reachable(http_address).to_string(), mqtt: reachable(broker.local_addr()).to_string() };
+        let mqtt_address = broker.local_addr().map(|bound| reachable(bound).to_string());
+        let addresses = Addresses {
+            http: reachable(http_address).to_string(),
+            mqtt: mqtt_address.unwrap_or_else(|| broker.address()),
+        };
         data.publish(&addresses)?;
         Ok(Self { data, addresses, store, broker, stop, tasks, http: tokio::spawn(http), reports })
     }
@@ -281,6 +285,26 @@ fn http_limits(config: &Config) -> listener::Limits {
     }
 }
 
+/// The broker, and what robots and an external broker are told about each other.
+async fn start_broker(
+    config: &Config,
+    data: &DataDirectory,
+    key: &PublicKey,
+    gatekeeper: Arc<dyn Gatekeeper>,
+    inbox: Arc<dyn Inbox>,
+) -> Result<(Broker, MqttAccess), ServeError> {
+    let (host, prefix) = (config.public_mqtt_host.clone(), config.topic_prefix.clone());
+    let Some(url) = &config.broker else {
+        let broker = Broker::start(broker_config(config), gatekeeper, inbox).await?;
+        let bound = broker.local_addr().map_or(0, |bound| bound.port());
+        return Ok((broker, MqttAccess::embedded(host, config.public_mqtt_port.unwrap_or(bound), prefix)));
+    };
+    let access = MqttAccess::external(url, host, config.public_mqtt_port, prefix.clone(), data.broker_secret()?);
+    // The same over restarts, so that a session which the network forgot ends when the next begins.
+    let client_id = format!("taskd-{}", key.id());
+    Ok((Broker::connect(ExternalConfig { url: url.clone(), client_id, prefix }, inbox), access))
+}
+
 fn broker_config(config: &Config) -> BrokerConfig {
     let limits = Limits {
         max_connections: config.max_mqtt_connections,
@@ -288,15 +312,6 @@ fn broker_config(config: &Config) -> BrokerConfig {
         ..Limits::default()
     };
     BrokerConfig { listen: config.mqtt, prefix: config.topic_prefix.clone(), limits }
-}
-
-fn mqtt_endpoint(config: &Config, bound: SocketAddr) -> MqttEndpoint {
-    MqttEndpoint {
-        host: config.public_mqtt_host.clone(),
-        port: config.public_mqtt_port.unwrap_or(bound.port()),
-        prefix: config.topic_prefix.clone(),
-        external: None,
-    }
 }
 
 /// An address that works from this machine: "all interfaces" is none that one could connect to.

@@ -1,5 +1,6 @@
 //! What robots say over MQTT: reports go to the writer, replies to whoever asked, log lines to memory, connections to
-//! presence. The broker has proven who speaks; what is said is checked here. It never answers by itself: robots that are behind are put on the list of those to ring.
+//! presence. The broker has proven who speaks; what is said is checked here. It never answers by itself: robots that
+//! are behind are put on the list of those to ring.
 
 use std::collections::HashMap;
 use std::net::SocketAddr;
@@ -59,9 +60,13 @@ impl Uplink {
             tracing::warn!(robot = %message.robot, claimed = %report.robot_id, "a report in another robot's name is dropped");
             return Ok(());
         }
+        let Some(token_number) = message.token_number else {
+            tracing::warn!(robot = %message.robot, "a report that no token vouches for is dropped");
+            return Ok(());
+        };
         self.saw_instance(message, &report.instance);
         let observed = report.observed_generation;
-        match self.reports.submit(report, message.token_number).await {
+        match self.reports.submit(report, token_number).await {
             Ok(reply) => {
                 if reply.generation > observed {
                     self.remind(&message.robot);
@@ -138,7 +143,7 @@ impl Inbox for Uplink {
         .boxed()
     }
 
-    fn connected(&self, robot: &RobotId, peer: SocketAddr, connection: u64) {
+    fn connected(&self, robot: &RobotId, peer: Option<SocketAddr>, connection: u64) {
         self.presence.connected(robot, peer, connection, self.clock.now_ms());
         self.changes.announce(Change::Robot(robot.clone()));
         self.changes.ring([robot.clone()]);
@@ -149,6 +154,10 @@ impl Inbox for Uplink {
         self.presence.disconnected(robot, connection, self.clock.now_ms());
         self.reminded_ms.lock().unwrap_or_else(PoisonError::into_inner).remove(robot);
         self.changes.announce(Change::Robot(robot.clone()));
+    }
+
+    fn everyone_may_be_there(&self) {
+        self.changes.ring_everyone();
     }
 }
 

@@ -47,6 +47,11 @@ impl Envelopes {
 }
 
 impl Actions {
+    /// Everybody who may have a desired state.
+    pub async fn every_robot(&self) -> Result<Vec<RobotId>, ActionError> {
+        Ok(self.store.robot_ids().await?)
+    }
+
     /// What `robot` should be running, signed. Refused as `diverged` while the robot is ahead of the database.
     pub async fn desired(&self, robot: &RobotId) -> Result<Desired, ActionError> {
         let found = self.store.desired_tasks(std::slice::from_ref(robot)).await?.pop();

@@ -43,7 +43,11 @@ impl Actions {
             return Err(ActionError::TokenRefused);
         }
         let robot = match known {
-            Some(known) if is_retry || terms.robot.as_ref() == Some(&known.id) => known,
+            Some(known) if is_retry || terms.robot.as_ref() == Some(&known.id) => {
+                // A disk that was lost or copied holds the old one.
+                write.renew_broker_credential(&known.id).await?;
+                known
+            }
             Some(known) => return Err(ActionError::MacKnown { mac: known.mac, name: known.name }),
             None => register(&mut write, terms, request, now_ms).await?,
         };

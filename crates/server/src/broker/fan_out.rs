@@ -10,6 +10,7 @@ use rumqttd::protocol::QoS;
 use task_proto::{Digest, RobotId, part};
 use tokio::time::{Instant, timeout};
 
+use super::external::Crowd;
 use super::front::{Front, Grant, NotGranted};
 
 /// The largest part, with its header.
@@ -71,10 +72,22 @@ pub enum FanOutError {
     /// The part does not fit into a message.
     #[error("a part of {0} bytes is larger than {MAX_PART_BYTES}")]
     TooLarge(usize),
+    /// There is no session at the external broker, or it takes nothing.
+    #[error("the external broker takes no parts")]
+    BrokerAway,
 }
 
 /// A package on its way to many. Dropped, it ends: robots hear no further part and can't subscribe any more.
-pub struct FanOut {
+pub struct FanOut(Way);
+
+enum Way {
+    /// From our own front, to those it was granted to.
+    Embedded(Granted),
+    /// Through another broker, to whoever subscribed there.
+    External(Crowd),
+}
+
+struct Granted {
     front: Arc<Front>,
     grant: Arc<Grant>,
 }
@@ -97,37 +110,68 @@ impl FanOut {
             NotGranted::UnderWay => FanOutError::UnderWay(digest),
             NotGranted::Full => FanOutError::Busy,
         })?;
-        Ok(Self { front, grant })
+        Ok(Self(Way::Embedded(Granted { front, grant })))
+    }
+
+    /// At an external broker, whose access control list alone says who may listen.
+    pub(super) fn at(crowd: Crowd) -> Self {
+        Self(Way::External(crowd))
     }
 
     /// Lets further robots subscribe.
     pub fn admit(&self, robots: impl IntoIterator<Item = RobotId>) {
-        self.grant.admit(robots);
+        if let Way::Embedded(Granted { grant, .. }) = &self.0 {
+            grant.admit(robots);
+        }
+    }
+
+    /// A report says whether the robot listens. Our own front knows by itself, an external broker does not tell.
+    pub fn told(&self, robot: &RobotId, is_listening: bool) {
+        if let Way::External(crowd) = &self.0 {
+            crowd.told(robot, is_listening);
+        }
     }
 
     /// How many robots listen now.
     pub fn listeners(&self) -> usize {
-        self.grant.listeners()
+        match &self.0 {
+            Way::Embedded(Granted { grant, .. }) => grant.listeners(),
+            Way::External(crowd) => crowd.listeners(),
+        }
     }
 
     /// Whether the robot listens now.
     pub fn is_listening(&self, robot: &RobotId) -> bool {
-        self.grant.is_listening(robot)
+        match &self.0 {
+            Way::Embedded(Granted { grant, .. }) => grant.is_listening(robot),
+            Way::External(crowd) => crowd.is_listening(robot),
+        }
     }
 
     /// The robot may no longer hear it.
     pub fn withdraw(&self, robot: &RobotId) {
-        self.grant.withdraw(robot, Instant::now());
+        match &self.0 {
+            Way::Embedded(Granted { grant, .. }) => grant.withdraw(robot, Instant::now()),
+            // It may go on listening, which is not counted any more.
+            Way::External(crowd) => crowd.told(robot, false),
+        }
     }
 
     /// Robots that held up the others and were put out since this was asked last.
     pub fn take_put_out(&self) -> Vec<RobotId> {
-        self.grant.take_put_out()
+        match &self.0 {
+            Way::Embedded(Granted { grant, .. }) => grant.take_put_out(),
+            // What a slow robot does not take the broker drops; its report says so.
+            Way::External(_) => Vec::new(),
+        }
     }
 
     /// The bytes of the parts that are held for listeners, all listeners together.
     pub fn queued_bytes(&self) -> usize {
-        self.grant.queued_bytes()
+        match &self.0 {
+            Way::Embedded(Granted { grant, .. }) => grant.queued_bytes(),
+            Way::External(crowd) => crowd.queued_bytes(),
+        }
     }
 
     /// Sends the next part to all who listen. Waits while the slowest of them is too far behind; whoever holds up the
@@ -136,15 +180,32 @@ impl FanOut {
         if part.len() > MAX_PART_BYTES {
             return Err(FanOutError::TooLarge(part.len()));
         }
+        match &self.0 {
+            Way::Embedded(granted) => granted.publish(part).await,
+            Way::External(crowd) => return crowd.publish(part).await,
+        }
+        Ok(())
+    }
+
+    /// Waits until every listener, or the external broker, has acknowledged all that was sent, or was put out, or `patience`
+    /// is over.
+    pub async fn settle(&mut self, patience: Duration) {
+        match &self.0 {
+            Way::Embedded(granted) => granted.settle(patience).await,
+            Way::External(crowd) => crowd.settle(patience).await,
+        }
+    }
+}
+
+impl Granted {
+    async fn publish(&self, part: Part) {
         while timeout(LOOK_INTERVAL, self.grant.room()).await.is_err() {
             self.put_out_laggards();
         }
         self.grant.send(part, Instant::now());
-        Ok(())
     }
 
-    /// Waits until every listener has acknowledged all that was sent, or was put out, or `patience` is over.
-    pub async fn settle(&mut self, patience: Duration) {
+    async fn settle(&self, patience: Duration) {
         let until = Instant::now() + patience;
         while Instant::now() < until {
             if timeout(LOOK_INTERVAL, self.grant.all_idle()).await.is_ok() {
@@ -162,7 +223,7 @@ impl FanOut {
     }
 }
 
-impl Drop for FanOut {
+impl Drop for Granted {
     fn drop(&mut self) {
         self.front.grants().close(&self.grant);
     }

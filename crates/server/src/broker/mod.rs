@@ -1,7 +1,9 @@
 //! The MQTT broker as the rest of the server sees it: ring a robot, receive what robots send, know who is there.
 //! It asks a [`Gatekeeper`] who may come in and hands messages to an [`Inbox`]; it never stores anything and knows no
-//! payloads. An external broker would be another start function that returns the same [`Broker`].
+//! payloads. [`Broker::start`] serves MQTT itself, [`Broker::connect`] makes the server a client of another broker; behind
+//! the handle both are the same to the rest of the server.
 
+mod external;
 mod fan_out;
 mod front;
 mod router;
@@ -19,6 +21,8 @@ use task_proto::topic::{RobotTopic, TopicPrefix};
 use task_proto::{Digest, RobotId};
 use tokio::sync::watch;
 
+pub use external::{CANARY_LEVEL, ExternalConfig};
+use external::{Crowd, External};
 pub use fan_out::{FanOut, FanOutError, FanOutSettings, MAX_PART_BYTES, Part, PartQos};
 use front::Front;
 use router::Router;
@@ -74,18 +78,19 @@ pub trait Gatekeeper: Send + Sync + 'static {
 /// A message from a robot on its `report`, `status`, `reply` or `log` topic.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RobotMessage {
-    /// Who sent it; proven by the connection.
+    /// Who sent it: proven by the connection, or as far as an external broker's access control list does.
     pub robot: RobotId,
     /// Which of these topics.
     pub topic: RobotTopic,
     /// The bytes, unread.
     pub payload: Bytes,
-    /// The peer's address.
-    pub peer: SocketAddr,
+    /// The peer's address; an external broker does not tell it.
+    pub peer: Option<SocketAddr>,
     /// The connection it came by, as in [`Inbox::connected`].
     pub connection: u64,
-    /// The token the connection was let in by, as in [`Principal::Robot`].
-    pub token_number: u64,
+    /// The token the connection was let in by, as in [`Principal::Robot`]. An external broker is shown no token, so what
+    /// comes from there can't speak for one, and no report does.
+    pub token_number: Option<u64>,
 }
 
 /// The message could not be stored; the robot keeps it and sends it again.
@@ -102,10 +107,15 @@ pub trait Inbox: Send + Sync + 'static {
 
     /// A robot's session is live: [`Broker::ring`] reaches it from now on, so this is the moment to send its state.
     /// `connection` grows with every connection of this process. Any earlier session of this robot has fully ended.
-    fn connected(&self, robot: &RobotId, peer: SocketAddr, connection: u64);
+    /// An external broker does not tell the peer.
+    fn connected(&self, robot: &RobotId, peer: Option<SocketAddr>, connection: u64);
 
     /// The robot's session with this number has ended. Comes exactly once for each `connected`, after it.
     fn disconnected(&self, robot: &RobotId, connection: u64);
+
+    /// The external broker is back, and any robot may be at it already: [`Broker::ring`] each, so that those who are there
+    /// have their state and say so.
+    fn everyone_may_be_there(&self);
 }
 
 /// Where the broker listens and what bounds it.
@@ -216,8 +226,14 @@ pub enum NotAsked {
 /// A handle on the running broker; clones are cheap.
 #[derive(Clone)]
 pub struct Broker {
-    front: Arc<Front>,
+    kind: Kind,
     health: watch::Receiver<Health>,
+}
+
+#[derive(Clone)]
+enum Kind {
+    Embedded(Arc<Front>),
+    External(Arc<External>),
 }
 
 impl Broker {
@@ -232,60 +248,121 @@ impl Broker {
         let router = router.map_err(|error| BrokerError::Router { reason: error.to_string() })?;
         let front = Front::start(config, gatekeeper, inbox, router.clone()).await?;
         let health = watchdog::start(&front, router, &limits);
-        Ok(Self { front, health })
+        Ok(Self { kind: Kind::Embedded(front), health })
     }
 
-    /// Sends `payload` on the robot's `desired` topic, QoS 1, straight into its session. Never waits: a session holds
-    /// one undelivered payload, and a newer one takes its place, also before the robot has subscribed.
+    /// Becomes a client of another broker, now or as soon as that can be reached. Its health is never
+    /// [`Health::Failed`]: it mends by itself.
+    pub fn connect(config: ExternalConfig, inbox: Arc<dyn Inbox>) -> Self {
+        let (external, health) = External::start(config, inbox);
+        Self { kind: Kind::External(external), health }
+    }
+
+    /// Sends `payload` on the robot's `desired` topic, QoS 1. Never waits: one undelivered payload is held for a robot, and
+    /// a newer one takes its place, also before the robot has subscribed.
     pub fn ring(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotConnected> {
-        self.front.ring(robot, payload)
+        match &self.kind {
+            Kind::Embedded(front) => front.ring(robot, payload),
+            Kind::External(external) => external.ring(robot, payload),
+        }
     }
 
-    /// Sends `payload` on the robot's `request` topic, QoS 1, straight into its session. Never waits; questions that the
-    /// session has not taken when it ends are lost.
+    /// Whether [`Broker::ring`] may reach the robot. An external broker does not say who listens: all of them may.
+    pub fn may_reach(&self, robot: &RobotId) -> bool {
+        match &self.kind {
+            Kind::Embedded(front) => front.has_session(robot),
+            Kind::External(external) => external.is_up(),
+        }
+    }
+
+    /// Waits until many more may be rung.
+    pub async fn room(&self) {
+        match &self.kind {
+            // Each session holds its own one, so there always is.
+            Kind::Embedded(_) => {}
+            Kind::External(external) => external.room().await,
+        }
+    }
+
+    /// Sends `payload` on the robot's `request` topic, QoS 1. Never waits; questions that have not gone out when the
+    /// session ends are lost.
     pub fn ask(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotAsked> {
-        self.front.ask(robot, payload)
+        match &self.kind {
+            Kind::Embedded(front) => front.ask(robot, payload),
+            Kind::External(external) => external.ask(robot, payload),
+        }
     }
 
     /// Lets `robots` subscribe to `p/<digest>`, to hear the parts that are published from then on, until the [`FanOut`]
-    /// is dropped. Few packages at a time.
+    /// is dropped. Few packages at a time. At an external broker every robot may subscribe at any time.
     pub fn fan_out(
         &self,
         digest: Digest,
         settings: FanOutSettings,
         robots: Vec<RobotId>,
     ) -> Result<FanOut, FanOutError> {
-        FanOut::begin(self.front.clone(), digest, settings, robots)
+        match &self.kind {
+            Kind::Embedded(front) => FanOut::begin(front.clone(), digest, settings, robots),
+            Kind::External(external) => Ok(FanOut::at(Crowd::new(external.clone(), digest, settings.qos))),
+        }
     }
 
-    /// The bytes of packages' parts that are held for listeners: the front's backlog.
+    /// The bytes of packages' parts that are held for listeners: the front's backlog. Those on their way to an external
+    /// broker are as few as its window.
     pub fn queued_part_bytes(&self) -> usize {
-        self.front.grants().queued_bytes()
+        match &self.kind {
+            Kind::Embedded(front) => front.grants().queued_bytes(),
+            Kind::External(external) => external.queued_part_bytes(),
+        }
     }
 
-    /// Ends the robot's session, if it has one: its token was revoked or it was removed.
+    /// Ends the robot's session, if it has one: its token was revoked or it was removed. At an external broker nobody can
+    /// be put out; the robot just counts as gone.
     pub fn disconnect(&self, robot: &RobotId) {
-        self.front.disconnect(robot);
+        match &self.kind {
+            Kind::Embedded(front) => front.disconnect(robot),
+            Kind::External(external) => external.disconnect(robot),
+        }
     }
 
-    /// What went over MQTT so far.
+    /// What went over MQTT so far; with an external broker only over our own connection.
     pub fn traffic(&self) -> MqttTraffic {
-        self.front.traffic()
+        match &self.kind {
+            Kind::Embedded(front) => front.traffic(),
+            Kind::External(external) => external.traffic(),
+        }
     }
 
-    /// What went over the robot's connection, if it has one.
+    /// What went over the robot's connection, if it has one and it is ours.
     pub fn traffic_of(&self, robot: &RobotId) -> Option<Traffic> {
-        self.front.traffic_of(robot)
+        match &self.kind {
+            Kind::Embedded(front) => front.traffic_of(robot),
+            Kind::External(_) => None,
+        }
     }
 
     /// How many robots are connected.
     pub fn connected_count(&self) -> usize {
-        self.front.connected_count()
+        match &self.kind {
+            Kind::Embedded(front) => front.connected_count(),
+            Kind::External(external) => external.connected_count(),
+        }
     }
 
-    /// The listener's address as bound.
-    pub fn local_addr(&self) -> SocketAddr {
-        self.front.local_addr()
+    /// The listener's address as bound; none with an external broker.
+    pub fn local_addr(&self) -> Option<SocketAddr> {
+        match &self.kind {
+            Kind::Embedded(front) => Some(front.local_addr()),
+            Kind::External(_) => None,
+        }
+    }
+
+    /// Where the broker is, `host:port`.
+    pub fn address(&self) -> String {
+        match &self.kind {
+            Kind::Embedded(front) => front.local_addr().to_string(),
+            Kind::External(external) => external.address(),
+        }
     }
 
     /// How the broker is, now and from now on.
@@ -293,9 +370,12 @@ impl Broker {
         self.health.clone()
     }
 
-    /// Stops accepting, ends every session and waits until all have ended, at most for `patience`.
+    /// Stops accepting, ends every session of ours and waits until all have ended, at most for `patience`.
     pub async fn shutdown(&self, patience: Duration) {
-        self.front.shutdown(patience).await;
+        match &self.kind {
+            Kind::Embedded(front) => front.shutdown(patience).await,
+            Kind::External(external) => external.shutdown(patience).await,
+        }
     }
 }
 
@@ -311,6 +391,6 @@ impl fmt::Debug for Login {
 
 impl fmt::Debug for Broker {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Broker").field("local_addr", &self.local_addr()).finish_non_exhaustive()
+        f.debug_struct("Broker").field("address", &self.address()).finish_non_exhaustive()
     }
 }

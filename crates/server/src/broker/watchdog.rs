@@ -206,8 +206,9 @@ mod tests {
         fn receive(&self, _: RobotMessage) -> BoxFuture<'_, Result<(), NotStored>> {
             Box::pin(async { Err(NotStored) })
         }
-        fn connected(&self, _: &RobotId, _: SocketAddr, _: u64) {}
+        fn connected(&self, _: &RobotId, _: Option<SocketAddr>, _: u64) {}
         fn disconnected(&self, _: &RobotId, _: u64) {}
+        fn everyone_may_be_there(&self) {}
     }
 
     async fn watched(change: impl FnOnce(&mut Limits)) -> (Arc<Front>, Arc<Router>, watch::Receiver<Health>) {

@@ -11,6 +11,7 @@ use crate::package::PackageError;
 use client::{Client, ClientError};
 use output::{Format, Output};
 
+mod broker;
 mod client;
 mod confirm;
 mod deploy;
@@ -44,6 +45,12 @@ pub enum Command {
         /// What to do.
         #[command(subcommand)]
         action: server::Action,
+    },
+    /// Print what an external broker's own files must say
+    Broker {
+        /// Which file.
+        #[command(subcommand)]
+        action: broker::Action,
     },
     /// Make the tokens that robots enrol with
     EnrollToken {
@@ -198,6 +205,7 @@ async fn dispatch(connection: &Connection, command: Command) -> Result<Outcome, 
         Command::Pack(pack) => push::pack(&Output::new(connection.output), pack).await,
         Command::Robot { action } => robot::run(&connection.open()?, action).await,
         Command::Server { action } => server::run(&connection.open()?, action).await,
+        Command::Broker { action } => broker::run(&connection.open()?, action).await,
         Command::EnrollToken { action } => enroll_token::run(&connection.open()?, action).await,
         Command::Push(push) => push::run(&connection.open()?, push).await,
         Command::Deploy { action } => deploy::run(&connection.open()?, action).await,

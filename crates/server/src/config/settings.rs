@@ -49,6 +49,16 @@ pub(super) const SETTINGS: &[Setting] = &[
         set: |config, text| address(text).map(|address| config.mqtt = address),
     },
     Setting {
+        name: "broker",
+        value_name: "URL",
+        help: "mqtt://USER:PASSWORD@HOST[:PORT] of a broker to use instead of the server's own; in the file or TASKD_BROKER \
+               only, since everybody on the machine can read this command line [default: embedded]",
+        set: |config, text| {
+            config.broker = if text == "embedded" { None } else { Some(parsed(text)?) };
+            Ok(())
+        },
+    },
+    Setting {
         name: "database",
         value_name: "URL",
         help: "sqlite:PATH or postgres://… [default: SQLite in the data directory]",

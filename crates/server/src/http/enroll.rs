@@ -7,6 +7,7 @@ use task_proto::api::{CreateEnrollmentToken, EnrollRequest, EnrollResponse, Enro
 
 use super::App;
 use super::auth::Caller;
+use super::broker::endpoint_of;
 use super::error::ApiError;
 use super::extract::{JsonBody, TolerantJson};
 
@@ -20,12 +21,9 @@ pub(super) async fn enroll(
         return Err(ApiError::forbidden("an enrolment token is needed"));
     };
     let enrolled = app.actions.enroll(&token, &request).await?;
-    let answer = EnrollResponse {
-        robot_id: enrolled.robot_id,
-        name: enrolled.name,
-        token: enrolled.token.reveal(),
-        mqtt: app.mqtt.clone(),
-    };
+    let mqtt = endpoint_of(&app, &enrolled.robot_id).await?;
+    let answer =
+        EnrollResponse { robot_id: enrolled.robot_id, name: enrolled.name, token: enrolled.token.reveal(), mqtt };
     Ok((StatusCode::CREATED, Json(answer)))
 }
 

@@ -60,7 +60,7 @@ pub(super) async fn server(State(app): State<App>) -> Json<ServerInfo> {
     Json(ServerInfo {
         version: env!("CARGO_PKG_VERSION").to_owned(),
         key: app.key.clone(),
-        mqtt: app.broker.local_addr().to_string(),
+        mqtt: app.broker.address(),
         now_ms: app.clock.now_ms(),
         traffic: app.broker.traffic(),
         http: app.http_traffic.read(),

@@ -4,6 +4,7 @@
 mod ask;
 pub mod attempts;
 pub mod auth;
+mod broker;
 mod deployments;
 pub mod drain;
 mod enroll;
@@ -33,7 +34,6 @@ use axum::middleware;
 use axum::response::{IntoResponse, Response};
 use axum::routing::{MethodFilter, MethodRouter, any, on};
 use http::{HeaderValue, Method, StatusCode, header};
-use task_proto::api::MqttEndpoint;
 use task_proto::envelope::PublicKey;
 use tokio_util::sync::CancellationToken;
 
@@ -42,6 +42,7 @@ use crate::blobs::Blobs;
 use crate::broker::Broker;
 use crate::changes::Changes;
 use crate::clock::Clock;
+use crate::mqtt_access::MqttAccess;
 use crate::presence::Presence;
 use crate::report_writer::ReportWriter;
 use crate::requests::Requests;
@@ -85,8 +86,8 @@ pub struct App {
     pub events: events::EventFeed,
     /// The key that verifies desired states.
     pub key: PublicKey,
-    /// Where robots reach MQTT.
-    pub mqtt: MqttEndpoint,
+    /// Where robots reach MQTT, and with which password.
+    pub mqtt: Arc<MqttAccess>,
     /// What went over HTTP.
     pub http_traffic: Arc<traffic::HttpTotals>,
     /// The data directory, which must be writable.
@@ -168,6 +169,7 @@ pub fn routes() -> Vec<Route> {
         Route::new(get.clone(), "/healthz", Anyone, health::healthz),
         Route::new(get.clone(), "/readyz", Anyone, health::readyz),
         Route::new(get.clone(), "/api/v1/server", Operator, health::server),
+        Route::new(get.clone(), "/api/v1/broker", Operator, broker::files),
         Route::new(get.clone(), "/api/v1/session", Anyone, session::show),
         Route::new(post.clone(), "/api/v1/session", Anyone, session::sign_in),
         Route::new(delete.clone(), "/api/v1/session", Operator, session::sign_out),
@@ -178,6 +180,7 @@ pub fn routes() -> Vec<Route> {
         Route::new(patch, "/api/v1/robots/{robot}", Operator, robots::edit),
         Route::new(delete, "/api/v1/robots/{robot}", Operator, robots::remove),
         Route::new(get.clone(), "/api/v1/robots/{robot}/desired", OwnRobot, robots::desired),
+        Route::new(get.clone(), "/api/v1/robots/{robot}/mqtt", OwnRobot, broker::endpoint),
         Route::new(post.clone(), "/api/v1/robots/{robot}/token", OwnRobot, robots::next_token),
         Route::new(post.clone(), "/api/v1/robots/{robot}/report", OwnRobot, robots::report)
             .body_bytes(REPORT_BODY_BYTES),

@@ -115,7 +115,7 @@ pub(super) async fn report(
     }
     let now_ms = app.clock.now_ms();
     uplink::heard(&app.presence, &app.changes, &robot, peer, now_ms);
-    app.presence.instance_seen(&robot, peer, &report.instance, now_ms);
+    app.presence.instance_seen(&robot, Some(peer), &report.instance, now_ms);
     Ok(Json(app.reports.submit(report, token_number).await?))
 }
 

@@ -9,7 +9,7 @@ use crate::presence::Presence;
 pub fn complete_robot(view: &mut RobotView, presence: &Presence, now_ms: u64) {
     let Some(sighting) = presence.get(&view.id, now_ms) else { return };
     view.online = sighting.online;
-    view.address = Some(sighting.address.to_string());
+    view.address = sighting.address.map(|address| address.to_string());
     view.last_seen_ms = view.last_seen_ms.max(Some(sighting.last_seen_ms));
     if sighting.duplicate {
         let text = "two agents use this robot's identity and keep displacing each other; enrol one of them again";

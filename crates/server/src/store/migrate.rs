@@ -12,6 +12,7 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[
     (2, "packages", include_str!("../migrations/0002_packages.sql")),
     (3, "token_rotation", include_str!("../migrations/0003_token_rotation.sql")),
     (4, "outputs", include_str!("../migrations/0004_outputs.sql")),
+    (5, "broker_credentials", include_str!("../migrations/0005_broker_credentials.sql")),
 ];
 
 /// Applies what has not been applied yet.

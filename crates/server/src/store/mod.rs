@@ -26,7 +26,7 @@ pub use deployments::NewDeployment;
 pub use orders::PastOrder;
 pub use packages::{NewManifest, PutManifest, Reference, StoredManifest};
 pub use reports::{OpenAssignment, ReportedRobot};
-pub use robots::{DesiredTasks, FetchedBy, KnownRobot};
+pub use robots::{BrokerCredential, DesiredTasks, FetchedBy, KnownRobot};
 pub use tokens::{Admitted, EnrolmentTerms, TokenHolder};
 
 /// Connections that read at the same time.

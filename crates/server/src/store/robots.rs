@@ -26,6 +26,15 @@ pub struct KnownRobot {
     pub labels: Labels,
 }
 
+/// Which password a robot has at an external broker.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct BrokerCredential {
+    /// Whose.
+    pub robot: RobotId,
+    /// The password's number; a higher one comes with each further enrolment.
+    pub number: u64,
+}
+
 /// What a robot should have, read at one moment.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DesiredTasks {
@@ -95,6 +104,25 @@ impl Store {
     /// The robots that `selector` means now, sorted by name.
     pub async fn matching_robots(&self, selector: &Selector) -> Result<Vec<KnownRobot>, StoreError> {
         matching(sqlx::query(KNOWN).fetch_all(&self.reads).await?, selector)
+    }
+
+    /// Every robot.
+    pub async fn robot_ids(&self) -> Result<Vec<RobotId>, StoreError> {
+        let known = "SELECT id FROM robots WHERE removed_at_ms IS NULL";
+        let rows: Vec<String> = sqlx::query_scalar(known).fetch_all(&self.reads).await?;
+        rows.iter().map(|row| id("robots.id", row)).collect()
+    }
+
+    /// The robots' credentials at an external broker, sorted by robot.
+    pub async fn broker_credentials(&self) -> Result<Vec<BrokerCredential>, StoreError> {
+        let rows = sqlx::query(CREDENTIALS).bind("");
+        rows.fetch_all(&self.reads).await?.iter().map(broker_credential).collect()
+    }
+
+    /// One robot's; `None` if it is not registered.
+    pub async fn broker_credential(&self, robot: &RobotId) -> Result<Option<BrokerCredential>, StoreError> {
+        let row = sqlx::query(CREDENTIALS).bind(robot.as_str());
+        row.fetch_optional(&self.reads).await?.as_ref().map(broker_credential).transpose()
     }
 
     /// The robots that should have `task`.
@@ -228,6 +256,15 @@ impl Write {
         Ok(())
     }
 
+    /// Gives a robot another password at an external broker.
+    pub async fn renew_broker_credential(&mut self, robot: &RobotId) -> Result<(), StoreError> {
+        sqlx::query("UPDATE robots SET broker_credential = broker_credential + 1 WHERE id = $1")
+            .bind(robot.as_str())
+            .execute(self.connection())
+            .await?;
+        Ok(())
+    }
+
     /// Marks a robot as removed: its MAC and name are free, its id is not.
     pub async fn remove_robot(&mut self, robot: &RobotId, now_ms: u64) -> Result<(), StoreError> {
         sqlx::query("UPDATE robots SET removed_at_ms = $2, report = NULL WHERE id = $1")
@@ -238,6 +275,9 @@ impl Write {
         Ok(())
     }
 }
+
+const CREDENTIALS: &str =
+    "SELECT id, broker_credential FROM robots WHERE removed_at_ms IS NULL AND (id = $1 OR $1 = '') ORDER BY id";
 
 const WITH_TASK: &str = "SELECT robot_id FROM assignments WHERE task = $1 AND desired = 1";
 
@@ -266,6 +306,11 @@ fn known_robot(row: &sqlx::any::AnyRow) -> Result<KnownRobot, StoreError> {
         mac: id("robots.mac", row.try_get("mac")?)?,
         labels: from_json("robots.labels", row.try_get("labels")?)?,
     })
+}
+
+fn broker_credential(row: &sqlx::any::AnyRow) -> Result<BrokerCredential, StoreError> {
+    let number = number(row.try_get("broker_credential")?);
+    Ok(BrokerCredential { robot: id("robots.id", row.try_get("id")?)?, number })
 }
 
 fn desired_task(row: &sqlx::any::AnyRow) -> Result<Option<DesiredTask>, StoreError> {

@@ -67,12 +67,13 @@ impl Inbox for Letterbox {
             Ok(())
         })
     }
-    fn connected(&self, robot: &RobotId, _peer: SocketAddr, connection: u64) {
+    fn connected(&self, robot: &RobotId, _peer: Option<SocketAddr>, connection: u64) {
         let _ = self.seen.send(Seen::Connected(robot.clone(), connection));
     }
     fn disconnected(&self, robot: &RobotId, connection: u64) {
         let _ = self.seen.send(Seen::Disconnected(robot.clone(), connection));
     }
+    fn everyone_may_be_there(&self) {}
 }
 
 /// A running broker.
@@ -99,7 +100,7 @@ impl TestBroker {
     }
 
     pub fn address(&self) -> SocketAddr {
-        self.broker.local_addr()
+        self.broker.local_addr().unwrap()
     }
 
     /// The next thing the inbox sees about `robot`.

@@ -66,7 +66,7 @@ async fn an_order_reaches_all_that_match_and_settles(database: TestDatabase) {
     assert_eq!(code(refused), "no_robots_match");
     let id = fleet.deploy("1", |order| order.selector = "r0,r2".parse().expect("valid")).await;
     let rung: BTreeSet<_> = [robots[0].id.clone(), robots[2].id.clone()].into();
-    assert_eq!(fleet.changes.take_rings().await, rung);
+    assert_eq!(fleet.changes.take_rings().await.robots, rung);
     assert_eq!(fleet.phases(&id).await, [Phase::Assigned, Phase::Assigned]);
     assert_eq!(fleet.deployment(&id).await.state, DeploymentState::Active);
     assert!(fleet.desired(&robots[1]).await.expect("state").tasks.is_empty());
@@ -161,7 +161,7 @@ async fn a_newer_deployment_supersedes_and_a_cancel_puts_back(database: TestData
     fleet.changes.take_rings().await;
     fleet.actions.cancel_deployment(&new).await.expect("cancelled");
     fleet.actions.cancel_deployment(&new).await.expect("again is harmless");
-    assert_eq!(fleet.changes.take_rings().await, [robots[0].id.clone()].into());
+    assert_eq!(fleet.changes.take_rings().await.robots, [robots[0].id.clone()].into());
     assert_eq!(fleet.deployment(&new).await.state, DeploymentState::Cancelled);
     assert_eq!(fleet.phases(&new).await, [Phase::Cancelled]);
     let desired = fleet.desired(&robots[0]).await.expect("state");
@@ -209,7 +209,7 @@ async fn robots_that_are_to_poll_are_not_rung(database: TestDatabase) {
     });
     let poll = poll.await;
     fleet.deploy("2", |order| order.selector = "r1".parse().expect("valid")).await;
-    assert_eq!(fleet.changes.take_rings().await, [robots[1].id.clone()].into());
+    assert_eq!(fleet.changes.take_rings().await.robots, [robots[1].id.clone()].into());
     assert_eq!(fleet.desired(&robots[0]).await.expect("state").tasks[0].deployment, poll);
 }
 
@@ -226,13 +226,13 @@ async fn batches_follow_each_other_and_failures_pause(database: TestDatabase) {
         let assignments = fleet.deployment(&id).await.assignments.expect("there");
         assignments.iter().filter(|assignment| assignment.released).count()
     };
-    assert_eq!(fleet.changes.take_rings().await.len(), 2);
+    assert_eq!(fleet.changes.take_rings().await.robots.len(), 2);
     assert_eq!(released().await, 2);
     fleet.follow(&mut robots[0], Phase::Running).await;
     assert_eq!(released().await, 2);
     fleet.follow(&mut robots[1], Phase::Failed).await;
     assert_eq!(released().await, 4);
-    assert_eq!(fleet.changes.take_rings().await, [robots[2].id.clone(), robots[3].id.clone()].into());
+    assert_eq!(fleet.changes.take_rings().await.robots, [robots[2].id.clone(), robots[3].id.clone()].into());
     fleet.follow(&mut robots[2], Phase::Failed).await;
     assert_eq!(fleet.deployment(&id).await.state, DeploymentState::Paused);
     fleet.follow(&mut robots[3], Phase::Running).await;

@@ -95,6 +95,10 @@ impl Front {
         Ok(())
     }
 
+    pub(super) fn has_session(&self, robot: &RobotId) -> bool {
+        self.context.seats.doorbell(robot).is_some()
+    }
+
     pub(super) fn ask(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotAsked> {
         let doorbell = self.context.seats.doorbell(robot).ok_or(NotAsked::NotConnected)?;
         if doorbell.ask(payload) { Ok(()) } else { Err(NotAsked::Busy) }

@@ -197,7 +197,7 @@ struct Attendance<'a> {
 impl<'a> Attendance<'a> {
     fn begin(context: &'a Context, visitor: &Visitor, peer: SocketAddr, connection: u64) -> Option<Self> {
         let Visitor::Robot { robot, .. } = visitor else { return None };
-        context.inbox.connected(robot, peer, connection);
+        context.inbox.connected(robot, Some(peer), connection);
         Some(Self { inbox: &*context.inbox, robot: robot.clone(), connection })
     }
 }
@@ -480,8 +480,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
     }
 
     fn message(&self, robot: &RobotId, token_number: u64, topic: RobotTopic, payload: Bytes) -> RobotMessage {
-        let (robot, peer, connection) = (robot.clone(), self.peer, self.seat.number());
-        RobotMessage { robot, topic, payload, peer, connection, token_number }
+        let (peer, connection) = (Some(self.peer), self.seat.number());
+        RobotMessage { robot: robot.clone(), topic, payload, peer, connection, token_number: Some(token_number) }
     }
 
     async fn say_will(&mut self, will: Will) {

@@ -1,0 +1,237 @@
+//! A broker that is not ours: the server is a client of it, with one session that is begun anew, with jitter, whenever it
+//! ends. What MQTT 3.1.1 does not tell a client is not known here: who listens, who was let in, from where. Who is there
+//! follows from what robots say; nobody can be put out. Messages prove only what the broker's access control list does:
+//! the robot that a topic names. Reports never come this way (see docs/decisions).
+
+mod crowd;
+mod outbox;
+mod present;
+mod session;
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use bytes::Bytes;
+use task_proto::api::MqttTraffic;
+use task_proto::topic::{Topic, TopicPrefix};
+use task_proto::{Digest, RobotId};
+use tokio::sync::{Notify, Semaphore, watch};
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
+
+use super::{Health, Inbox, NotAsked, NotConnected, PartQos};
+use crate::broker_url::BrokerUrl;
+pub(super) use crowd::Crowd;
+use outbox::{Letter, Outbox};
+use present::Present;
+
+/// The last level of the topic on which the server hears itself.
+pub const CANARY_LEVEL: &str = "server";
+/// KiB of packages' parts that the broker has not acknowledged; a larger part goes alone.
+const WINDOW_KIB: u32 = 4 * 1024;
+/// How long the broker may leave so many unacknowledged.
+const PART_PATIENCE: Duration = Duration::from_secs(30);
+/// How long whoever rings many robots waits for room at most; a session that takes nothing ends by itself.
+const ROOM_PATIENCE: Duration = Duration::from_secs(60);
+/// The longest wait between two tries to connect.
+const MAX_PAUSE: Duration = Duration::from_secs(30);
+/// The longest wait before the second.
+const FIRST_PAUSE: Duration = Duration::from_millis(500);
+/// A session that lasted this long shows that the way is good: the pauses begin anew.
+const GOOD_SESSION: Duration = Duration::from_secs(30);
+
+/// Which broker, and as whom.
+#[derive(Debug, Clone)]
+pub struct ExternalConfig {
+    /// Where it is, with the server's user and password there.
+    pub url: BrokerUrl,
+    /// The MQTT client id; the broker ends an older session of the same id.
+    pub client_id: String,
+    /// What all topics start with.
+    pub prefix: TopicPrefix,
+}
+
+/// The connection to the broker, for as long as the server runs.
+pub(super) struct External {
+    config: ExternalConfig,
+    inbox: Arc<dyn Inbox>,
+    outbox: Mutex<Outbox>,
+    /// Something was put into the outbox.
+    filled: Notify,
+    /// Something was taken out of it.
+    taken: Notify,
+    /// What is free of the window, in KiB.
+    window: Arc<Semaphore>,
+    present: Mutex<Present>,
+    traffic: Mutex<MqttTraffic>,
+    stop: CancellationToken,
+    sessions: TaskTracker,
+}
+
+impl External {
+    /// Begins to connect. It goes on until [`External::shutdown`], whatever the broker does; the receiver always has how
+    /// it is.
+    pub(super) fn start(config: ExternalConfig, inbox: Arc<dyn Inbox>) -> (Arc<Self>, watch::Receiver<Health>) {
+        let (sender, health) = watch::channel(Health::Recovering(format!(
+            "the server has not connected to the broker at {} yet",
+            config.url.address()
+        )));
+        let external = Arc::new(Self {
+            config,
+            inbox,
+            outbox: Mutex::default(),
+            filled: Notify::new(),
+            taken: Notify::new(),
+            window: Arc::new(Semaphore::new(WINDOW_KIB as usize)),
+            present: Mutex::default(),
+            traffic: Mutex::default(),
+            stop: CancellationToken::new(),
+            sessions: TaskTracker::new(),
+        });
+        external.sessions.spawn(external.clone().run(sender));
+        external.sessions.close();
+        (external, health)
+    }
+
+    /// One session after another.
+    async fn run(self: Arc<Self>, health: watch::Sender<Health>) {
+        let mut failures = 0u32;
+        loop {
+            let begun = tokio::time::Instant::now();
+            let ended = session::run(&self, &health).await;
+            self.leave();
+            let Some(ended) = ended else { return };
+            lock(&self.traffic).connections_refused += u64::from(ended.is_refusal());
+            failures = if begun.elapsed() >= GOOD_SESSION { 0 } else { failures.saturating_add(1) };
+            let seen = ended.text(&self.config.url);
+            let is_news = health.send_if_modified(|health| {
+                let finding = Health::Recovering(seen.clone());
+                std::mem::replace(health, finding.clone()) != finding
+            });
+            if is_news {
+                tracing::warn!("{seen}; robots poll until it is back");
+            }
+            tokio::select! {
+                () = tokio::time::sleep(pause(failures, rand::random())) => {}
+                () = self.stop.cancelled() => return,
+            }
+        }
+    }
+
+    /// No session: nobody can be reached, and who is there is found out anew in the next one.
+    fn leave(&self) {
+        lock(&self.outbox).close();
+        self.taken.notify_waiters();
+        let gone = lock(&self.present).clear();
+        for (robot, number) in gone {
+            self.inbox.disconnected(&robot, number);
+        }
+    }
+
+    pub(super) fn ring(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotConnected> {
+        lock(&self.outbox).ring(robot, payload)?;
+        self.filled.notify_one();
+        Ok(())
+    }
+
+    pub(super) fn ask(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotAsked> {
+        if !lock(&self.present).contains(robot) {
+            return Err(NotAsked::NotConnected);
+        }
+        lock(&self.outbox).ask(robot, payload)?;
+        self.filled.notify_one();
+        Ok(())
+    }
+
+    /// Any robot may be listening, known to be there or not.
+    pub(super) fn is_up(&self) -> bool {
+        lock(&self.outbox).is_open()
+    }
+
+    /// Waits until what was rung before has gone out, all but a little.
+    pub(super) async fn room(&self) {
+        let room = async {
+            loop {
+                let mut taken = std::pin::pin!(self.taken.notified());
+                taken.as_mut().enable();
+                if lock(&self.outbox).has_room() {
+                    return;
+                }
+                taken.await;
+            }
+        };
+        // At worst more waits than should, for once.
+        let _ = tokio::time::timeout(ROOM_PATIENCE, room).await;
+    }
+
+    /// Publishes a part once there is a place for it in the window of unacknowledged ones.
+    async fn publish_part(&self, digest: Digest, payload: Bytes, qos: PartQos) -> Result<(), NotConnected> {
+        let kib = u32::try_from(payload.len().div_ceil(1024)).map_or(WINDOW_KIB, |kib| kib.min(WINDOW_KIB));
+        let place = tokio::time::timeout(PART_PATIENCE, self.window.clone().acquire_many_owned(kib)).await;
+        let place = place.map_err(|_| NotConnected)?.map_err(|_| NotConnected)?;
+        let topic = Topic::Package(digest);
+        lock(&self.outbox).part(Letter { topic, payload, qos, place: Some(place) })?;
+        self.filled.notify_one();
+        Ok(())
+    }
+
+    /// Waits until the broker has acknowledged all parts, at most for `patience`.
+    async fn parts_acknowledged(&self, patience: Duration) {
+        let _ = tokio::time::timeout(patience, self.window.acquire_many(WINDOW_KIB)).await;
+    }
+
+    /// What is taken of the window.
+    pub(super) fn queued_part_bytes(&self) -> usize {
+        (WINDOW_KIB as usize).saturating_sub(self.window.available_permits()) * 1024
+    }
+
+    /// The robot counts as gone. Its session lasts: a client can't end another's in MQTT 3.1.1.
+    pub(super) fn disconnect(&self, robot: &RobotId) {
+        let number = lock(&self.present).forget(robot);
+        if let Some(number) = number {
+            self.inbox.disconnected(robot, number);
+        }
+    }
+
+    pub(super) fn traffic(&self) -> MqttTraffic {
+        MqttTraffic { robots_connected: self.connected_count() as u64, ..*lock(&self.traffic) }
+    }
+
+    pub(super) fn connected_count(&self) -> usize {
+        lock(&self.present).count()
+    }
+
+    pub(super) fn address(&self) -> String {
+        self.config.url.address()
+    }
+
+    pub(super) async fn shutdown(&self, patience: Duration) {
+        self.stop.cancel();
+        if tokio::time::timeout(patience, self.sessions.wait()).await.is_err() {
+            tracing::warn!("the session at the MQTT broker did not end in time");
+        }
+    }
+}
+
+/// Exponential backoff with full jitter, `jitter` being even from 0 to 1.
+fn pause(failures: u32, jitter: f64) -> Duration {
+    FIRST_PAUSE.saturating_mul(1 << failures.min(10)).min(MAX_PAUSE).mul_f64(jitter.clamp(0.0, 1.0))
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    // Every change under these locks is complete in itself, so a panic elsewhere leaves nothing half-done.
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pauses_grow_to_a_bound_and_are_spread() {
+        assert_eq!(pause(0, 1.0), FIRST_PAUSE);
+        assert_eq!(pause(3, 0.5), FIRST_PAUSE * 4);
+        assert_eq!(pause(u32::MAX, 1.0), MAX_PAUSE);
+        assert_eq!(pause(7, 0.0), Duration::ZERO);
+    }
+}

@@ -1,0 +1,279 @@
+//! One session at an external broker, and the only place in the server that names rumqttc: subscribes, hears itself once
+//! to know that the broker passes messages on, then takes in what robots say and publishes what waits.
+
+use std::collections::VecDeque;
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use rumqttc::{
+    AsyncClient, ConnectReturnCode, ConnectionError, Event, MqttOptions, Outgoing, Packet, Publish, QoS,
+    SubscribeFilter,
+};
+use task_proto::RobotId;
+use task_proto::report::Status;
+use task_proto::topic::{RobotTopic, Topic};
+use tokio::sync::{OwnedSemaphorePermit, mpsc, watch};
+use tokio::time::Instant;
+
+use super::super::{Health, MAX_PART_BYTES, PartQos, RobotMessage};
+use super::outbox::Letter;
+use super::present::Turn;
+use super::{CANARY_LEVEL, External, lock};
+use crate::broker_url::BrokerUrl;
+
+const KEEP_ALIVE: Duration = Duration::from_secs(20);
+/// How long connecting, and flushing, may take.
+const NETWORK_TIMEOUT_S: u64 = 10;
+/// How long the server's own message may take to come back.
+const CANARY_PATIENCE: Duration = Duration::from_secs(10);
+/// How long saying goodbye may take.
+const GOODBYE_PATIENCE: Duration = Duration::from_secs(1);
+/// Unacknowledged messages of ours.
+const MAX_IN_FLIGHT: u16 = 256;
+/// Requests between this task and rumqttc, and events the other way.
+const QUEUED: usize = 64;
+/// The largest message that is taken in. A larger one ends the session, so the broker should refuse it before: see
+/// docs/broker.md.
+const MAX_TAKEN_BYTES: usize = 4 * 1024 * 1024;
+/// The largest that is sent: a part, and what is around it.
+const MAX_SENT_BYTES: usize = MAX_PART_BYTES + 1024;
+/// The largest status that is read.
+const MAX_STATUS_BYTES: usize = 4 * 1024;
+/// What robots say that is not a report.
+const HEARD: [RobotTopic; 3] = [RobotTopic::Status, RobotTopic::Reply, RobotTopic::Log];
+/// MQTT's fixed header at most, and the packet id.
+const HEADER_BYTES: usize = 7;
+
+/// Why a session ended.
+pub(super) enum Ended {
+    /// The broker does not accept the server.
+    Refused(ConnectReturnCode),
+    /// The server's own message did not come back.
+    Deaf,
+    /// Anything else.
+    Lost(ConnectionError),
+}
+
+impl Ended {
+    pub(super) fn is_refusal(&self) -> bool {
+        matches!(self, Self::Refused(_))
+    }
+
+    /// For the operator: what is wrong and where it is mended.
+    pub(super) fn text(&self, url: &BrokerUrl) -> String {
+        let broker = format!("the broker at {}", url.address());
+        match self {
+            Self::Refused(ConnectReturnCode::BadUserNamePassword | ConnectReturnCode::NotAuthorized) => {
+                format!("{broker} does not accept the user {} with the password in `broker`", url.user_name)
+            }
+            Self::Refused(code) => format!("{broker} refuses the server: {code:?}"),
+            Self::Deaf => {
+                format!("{broker} does not pass on what the server publishes: it needs the ACL of `taskd broker acl`")
+            }
+            Self::Lost(ConnectionError::Io(error)) => format!("{broker} can't be reached: {error}"),
+            Self::Lost(ConnectionError::NetworkTimeout) => format!("{broker} does not answer"),
+            Self::Lost(error) => format!("the session at {broker} ended: {error}"),
+        }
+    }
+}
+
+/// Runs one session to its end; `None`: the server stops.
+pub(super) async fn run(external: &External, health: &watch::Sender<Health>) -> Option<Ended> {
+    let (client, mut event_loop) = AsyncClient::new(options(external), QUEUED);
+    event_loop.network_options.set_connection_timeout(NETWORK_TIMEOUT_S).set_tcp_nodelay(true);
+    let (events_in, mut events) = mpsc::channel(QUEUED);
+    // rumqttc's poll must not be dropped half way, so it runs in one future that lives as long as the session.
+    let pump = async {
+        loop {
+            match event_loop.poll().await {
+                // The receiver lives as long as this future.
+                Ok(event) => drop(events_in.send(event).await),
+                Err(ConnectionError::ConnectionRefused(code)) => return Ended::Refused(code),
+                Err(error) => return Ended::Lost(error),
+            }
+        }
+    };
+    tokio::pin!(pump);
+    let mut session = Session::new(external, client);
+    let deadline = Instant::now() + Duration::from_secs(NETWORK_TIMEOUT_S) + CANARY_PATIENCE;
+    let ended = loop {
+        tokio::select! {
+            // Cancel-safe: the future is pinned outside of the loop and goes on where it was.
+            ended = &mut pump => break Some(ended),
+            // Cancel-safe: an event stays in the channel until it is received.
+            Some(event) = events.recv() => {
+                if session.take(event).await {
+                    health.send_replace(Health::Serving);
+                }
+            }
+            // Cancel-safe: a permit that was not taken stays.
+            () = external.filled.notified() => {}
+            // Cancel-safe: a timer that is made anew for the same time.
+            () = tokio::time::sleep_until(deadline), if !session.is_up => break Some(Ended::Deaf),
+            // Cancel-safe: a token can be awaited again.
+            () = external.stop.cancelled() => break None,
+        }
+        session.publish_waiting();
+    };
+    if ended.is_none() && session.client.try_disconnect().is_ok() {
+        // It ends by itself once the broker has closed the connection.
+        let goodbye = async { tokio::join!(&mut pump, async { while events.recv().await.is_some() {} }) };
+        let _ = tokio::time::timeout(GOODBYE_PATIENCE, goodbye).await;
+    }
+    ended
+}
+
+fn options(external: &External) -> MqttOptions {
+    let url = &external.config.url;
+    let mut options = MqttOptions::new(&external.config.client_id, &url.host, url.port);
+    options.set_credentials(&url.user_name, &url.password);
+    options.set_clean_session(true);
+    options.set_keep_alive(KEEP_ALIVE);
+    options.set_inflight(MAX_IN_FLIGHT);
+    options.set_max_packet_size(MAX_TAKEN_BYTES, MAX_SENT_BYTES);
+    options
+}
+
+struct Session<'a> {
+    external: &'a External,
+    client: AsyncClient,
+    canary: String,
+    is_up: bool,
+    /// The places of messages that were handed to rumqttc and have no packet id yet.
+    unsent: VecDeque<Option<OwnedSemaphorePermit>>,
+    /// Of those that were sent under this packet id.
+    sent: VecDeque<(u16, Option<OwnedSemaphorePermit>)>,
+}
+
+impl<'a> Session<'a> {
+    fn new(external: &'a External, client: AsyncClient) -> Self {
+        let canary = format!("{}/{CANARY_LEVEL}", external.config.prefix);
+        Self { external, client, canary, is_up: false, unsent: VecDeque::new(), sent: VecDeque::new() }
+    }
+
+    /// Takes in what happened; whether the session has come up by that.
+    async fn take(&mut self, event: Event) -> bool {
+        self.count(&event);
+        match event {
+            Event::Incoming(Packet::ConnAck(_)) => self.begin(),
+            Event::Incoming(Packet::Publish(message)) if message.topic == self.canary => return self.come_up(),
+            Event::Incoming(Packet::Publish(message)) => self.hear(message).await,
+            Event::Incoming(Packet::PubAck(ack)) => self.acknowledged(ack.pkid),
+            Event::Incoming(Packet::PubComp(complete)) => self.acknowledged(complete.pkid),
+            Event::Outgoing(Outgoing::Publish(id)) => {
+                // Without a packet id nothing comes back: its place is free at once.
+                if let Some(place) = self.unsent.pop_front().filter(|_| id != 0) {
+                    self.sent.push_back((id, place));
+                }
+            }
+            _ => {}
+        }
+        false
+    }
+
+    fn acknowledged(&mut self, id: u16) {
+        if let Some(at) = self.sent.iter().position(|(sent, _)| *sent == id) {
+            self.sent.remove(at);
+        }
+    }
+
+    fn begin(&mut self) {
+        let prefix = &self.external.config.prefix;
+        let heard = HEARD.map(|topic| format!("{prefix}/r/+/{}", topic.as_str()));
+        let filters = heard.into_iter().chain([self.canary.clone()]);
+        // The queue is empty at the start of a session, and a lost session is noticed by the pump.
+        let _ = self.client.try_subscribe_many(filters.map(|path| SubscribeFilter::new(path, QoS::AtLeastOnce)));
+        if self.client.try_publish(&self.canary, QoS::AtLeastOnce, false, "up").is_ok() {
+            self.unsent.push_back(None);
+        }
+    }
+
+    /// The server hears itself: from here on robots can be reached, and each is asked by its doorbell whether it is there.
+    fn come_up(&mut self) -> bool {
+        if self.is_up {
+            return false;
+        }
+        self.is_up = true;
+        tracing::info!(broker = %self.external.address(), "connected to the MQTT broker");
+        lock(&self.external.traffic).connections_accepted += 1;
+        lock(&self.external.outbox).open();
+        self.external.inbox.everyone_may_be_there();
+        true
+    }
+
+    async fn hear(&mut self, message: Publish) {
+        // Nothing of ours is retained: this was said some time ago, by whomever.
+        if message.retain {
+            return;
+        }
+        let Some(Topic::Robot(robot, topic)) = self.external.config.prefix.parse(&message.topic) else { return };
+        if !HEARD.contains(&topic) {
+            return;
+        }
+        let status = (topic == RobotTopic::Status && message.payload.len() <= MAX_STATUS_BYTES)
+            .then(|| serde_json::from_slice::<Status>(&message.payload).ok());
+        let turn = {
+            let mut present = lock(&self.external.present);
+            match &status {
+                Some(Some(status)) => present.status(&robot, status),
+                // What can't be read says nothing; the inbox says so.
+                Some(None) => Turn::default(),
+                None => present.heard(&robot),
+            }
+        };
+        self.tell(&robot, &turn);
+        let connection = turn.begun.unwrap_or_default();
+        let message =
+            RobotMessage { robot, topic, payload: message.payload, peer: None, connection, token_number: None };
+        // None of these topics is stored, so this answers at once.
+        let _ = self.external.inbox.receive(message).await;
+    }
+
+    fn tell(&self, robot: &RobotId, turn: &Turn) {
+        const UNKNOWN: Option<SocketAddr> = None;
+        if let Some(number) = turn.ended {
+            self.external.inbox.disconnected(robot, number);
+        }
+        if let Some(number) = turn.begun {
+            self.external.inbox.connected(robot, UNKNOWN, number);
+        }
+    }
+
+    /// Hands over what waits, as much as rumqttc is sure to take at once.
+    fn publish_waiting(&mut self) {
+        while self.is_up && self.unsent.len() < QUEUED / 2 {
+            let Some(letter) = lock(&self.external.outbox).next() else { break };
+            let Letter { topic, payload, qos, place } = letter;
+            let name = self.external.config.prefix.format(&topic);
+            let bytes = HEADER_BYTES + name.len() + payload.len();
+            let qos = match qos {
+                PartQos::AtMostOnce => QoS::AtMostOnce,
+                PartQos::AtLeastOnce => QoS::AtLeastOnce,
+                PartQos::ExactlyOnce => QoS::ExactlyOnce,
+            };
+            if self.client.try_publish(name, qos, false, payload).is_ok() {
+                lock(&self.external.traffic).all.bytes_out += bytes as u64;
+                self.unsent.push_back(place);
+            }
+            self.external.taken.notify_waiters();
+        }
+    }
+
+    fn count(&self, event: &Event) {
+        let mut traffic = lock(&self.external.traffic);
+        let all = &mut traffic.all;
+        match event {
+            Event::Incoming(packet) => {
+                all.packets_in += 1;
+                all.bytes_in += packet.size() as u64;
+                all.messages_in += u64::from(matches!(packet, Packet::Publish(_)));
+                all.acks_in += u64::from(matches!(packet, Packet::PubAck(_)));
+            }
+            Event::Outgoing(packet) => {
+                all.packets_out += 1;
+                all.messages_out += u64::from(matches!(packet, Outgoing::Publish(_)));
+                all.acks_out += u64::from(matches!(packet, Outgoing::PubAck(_)));
+            }
+        }
+    }
+}

@@ -1,0 +1,184 @@
+//! Where an external broker is and as whom the server signs in there: the setting `broker`, read. Its password is in no
+//! message and no debug output; it connects to nothing.
+
+use std::fmt;
+use std::net::IpAddr;
+use std::str::FromStr;
+
+use task_proto::RobotId;
+
+/// MQTT's port, where the URL names none.
+const DEFAULT_PORT: u16 = 1883;
+const SCHEME: &str = "mqtt://";
+/// More than any name or password needs; MQTT itself allows 64 KiB.
+const MAX_BYTES: usize = 512;
+
+/// `mqtt://user:password@host:port`.
+#[derive(Clone, PartialEq, Eq)]
+pub struct BrokerUrl {
+    /// Host name or address; an IPv6 address in brackets.
+    pub host: String,
+    /// TCP port.
+    pub port: u16,
+    /// The server's own user there.
+    pub user_name: String,
+    /// Its password.
+    pub password: String,
+}
+
+/// A text that is no such URL. Never repeats the text, which may hold a password.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum InvalidBrokerUrl {
+    /// It begins otherwise.
+    #[error("expected mqtt://USER:PASSWORD@HOST[:PORT], or \"embedded\" for the server's own broker")]
+    Form,
+    /// It asks for TLS.
+    #[error("mqtts:// is not supported yet: expected mqtt://USER:PASSWORD@HOST[:PORT]")]
+    Tls,
+    /// Without them the broker's access control list protects nothing.
+    #[error("it names no user or no password: expected mqtt://USER:PASSWORD@HOST[:PORT]")]
+    NoCredentials,
+    /// The user can't be written into the broker's files, or is a robot's.
+    #[error("its user name is not 1 to 64 letters, digits, '.', '_', '-' and '@', or has the form of a robot id")]
+    UserName,
+    /// A character that only fits in as %XX.
+    #[error("its password holds a '%' that is not followed by two hex digits, or is longer than 512 bytes")]
+    Password,
+    /// No host, or one that no machine can have.
+    #[error("its host is none: expected a name, an IPv4 address or an IPv6 address in brackets")]
+    Host,
+    /// No port from 1 to 65535.
+    #[error("its port is not a number from 1 to 65535")]
+    Port,
+}
+
+impl BrokerUrl {
+    /// Whether the host is this machine, by its name.
+    pub fn is_loopback(&self) -> bool {
+        let bare = self.host.trim_start_matches('[').trim_end_matches(']');
+        self.host == "localhost" || bare.parse::<IpAddr>().is_ok_and(|address| address.is_loopback())
+    }
+
+    /// `host:port`, as it may be shown.
+    pub fn address(&self) -> String {
+        format!("{}:{}", self.host, self.port)
+    }
+}
+
+impl FromStr for BrokerUrl {
+    type Err = InvalidBrokerUrl;
+
+    fn from_str(text: &str) -> Result<Self, InvalidBrokerUrl> {
+        if text.starts_with("mqtts://") {
+            return Err(InvalidBrokerUrl::Tls);
+        }
+        let rest = text.strip_prefix(SCHEME).ok_or(InvalidBrokerUrl::Form)?;
+        let rest = rest.strip_suffix('/').unwrap_or(rest);
+        // A host has no '@', a password may.
+        let (credentials, place) = rest.rsplit_once('@').ok_or(InvalidBrokerUrl::NoCredentials)?;
+        let (user_name, password) = credentials.split_once(':').ok_or(InvalidBrokerUrl::NoCredentials)?;
+        let user_name = decoded(user_name).ok_or(InvalidBrokerUrl::UserName)?;
+        let password = decoded(password).ok_or(InvalidBrokerUrl::Password)?;
+        if user_name.is_empty() || password.is_empty() {
+            return Err(InvalidBrokerUrl::NoCredentials);
+        }
+        let is_plain = |b: u8| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-' | b'@');
+        if user_name.len() > 64 || !user_name.bytes().all(is_plain) || user_name.parse::<RobotId>().is_ok() {
+            return Err(InvalidBrokerUrl::UserName);
+        }
+        let (host, port) = host_and_port(place)?;
+        Ok(Self { host: host.to_owned(), port, user_name, password })
+    }
+}
+
+fn host_and_port(place: &str) -> Result<(&str, u16), InvalidBrokerUrl> {
+    let end = if place.starts_with('[') { place.find(']').map(|at| at + 1) } else { place.find(':') };
+    let (host, port) = place.split_at(end.unwrap_or(place.len()));
+    let is_address = host
+        .strip_prefix('[')
+        .is_some_and(|inner| inner.strip_suffix(']').is_some_and(|inner| inner.parse::<std::net::Ipv6Addr>().is_ok()));
+    let is_name = !host.is_empty()
+        && host.len() <= 253
+        && host.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'-' | b'_'));
+    if !is_address && !is_name {
+        return Err(InvalidBrokerUrl::Host);
+    }
+    if port.is_empty() {
+        return Ok((host, DEFAULT_PORT));
+    }
+    match port.strip_prefix(':').and_then(|port| port.parse().ok()) {
+        Some(port) if port > 0 => Ok((host, port)),
+        _ => Err(InvalidBrokerUrl::Port),
+    }
+}
+
+/// The text with each `%XX` as the byte it stands for.
+fn decoded(text: &str) -> Option<String> {
+    let mut bytes = Vec::with_capacity(text.len());
+    let mut rest = text.as_bytes();
+    while let Some((&first, after)) = rest.split_first() {
+        if first == b'%' {
+            let digits = std::str::from_utf8(after.get(..2)?).ok()?;
+            if !digits.bytes().all(|digit| digit.is_ascii_hexdigit()) {
+                return None;
+            }
+            bytes.push(u8::from_str_radix(digits, 16).ok()?);
+            rest = &after[2..];
+        } else {
+            bytes.push(first);
+            rest = after;
+        }
+    }
+    String::from_utf8(bytes).ok().filter(|text| text.len() <= MAX_BYTES)
+}
+
+impl fmt::Debug for BrokerUrl {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("BrokerUrl")
+            .field("address", &self.address())
+            .field("user_name", &self.user_name)
+            .finish_non_exhaustive()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_url_is_taken_apart() {
+        let url: BrokerUrl = "mqtt://taskd:s%40c:r@et@broker.lab:1884".parse().expect("valid");
+        assert_eq!((url.user_name.as_str(), url.password.as_str()), ("taskd", "s@c:r@et"));
+        assert_eq!(url.address(), "broker.lab:1884");
+        assert!(!url.is_loopback());
+        assert!(!format!("{url:?}").contains("et@"), "{url:?}");
+        let url: BrokerUrl = "mqtt://taskd:x@[::1]/".parse().expect("valid");
+        assert_eq!((url.address().as_str(), url.is_loopback()), ("[::1]:1883", true));
+    }
+
+    #[test]
+    fn what_is_wrong_is_said_without_the_password() {
+        use InvalidBrokerUrl::{Form, Host, NoCredentials, Password, Port, Tls, UserName};
+        for (text, expected) in [
+            ("", Form),
+            ("tcp://a:secret@h", Form),
+            ("mqtts://a:secret@h", Tls),
+            ("mqtt://h", NoCredentials),
+            ("mqtt://a@h", NoCredentials),
+            ("mqtt://a:@h", NoCredentials),
+            ("mqtt://a b:secret@h", UserName),
+            ("mqtt://r00000000000000a1:secret@h", UserName),
+            ("mqtt://a:secret%4@h", Password),
+            ("mqtt://a:secret%+1@h", Password),
+            ("mqtt://a:secret@", Host),
+            ("mqtt://a:secret@h/x", Host),
+            ("mqtt://a:secret@[::g]:1", Host),
+            ("mqtt://a:secret@h:0", Port),
+            ("mqtt://a:secret@h:x", Port),
+        ] {
+            let error = text.parse::<BrokerUrl>().expect_err(text);
+            assert_eq!(error, expected, "{text}");
+            assert!(!error.to_string().contains("secret"));
+        }
+    }
+}

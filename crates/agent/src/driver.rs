@@ -14,17 +14,18 @@ use task_proto::envelope::PublicKey;
 use task_proto::id::Labels;
 use task_proto::report::{Condition, Progress};
 use task_proto::{Digest, InstanceId, RobotId, RobotName, TaskName};
-use tokio::sync::{mpsc, watch};
+use tokio::sync::{Notify, mpsc, watch};
 use tokio::task::{AbortHandle, JoinSet};
 use tokio::time::Instant;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
 use crate::admission;
 use crate::effects::{Effects, Now, chain};
+use crate::fetch::Asks;
 use crate::ledger::{Ledger, TaskRecord};
 use crate::link::{Heard, Shared};
 use crate::observed::{Health, Prepared, ProcessState, RobotFacts};
-use crate::plan::{self, Lane, Next, Situation, Step, StepFailure};
+use crate::plan::{self, Done, Lane, Next, Situation, Step, StepFailure};
 
 mod hearing;
 mod reporting;
@@ -77,6 +78,8 @@ struct View {
     transfers: BTreeMap<Lane, watch::Receiver<Progress>>,
     /// The same, as it is reported.
     progress: BTreeMap<Lane, Progress>,
+    /// What the step that gathers parts says of those that are lacking.
+    asked: Option<watch::Receiver<Asks>>,
 }
 
 /// The watchers of one process. Dropping it ends the one that asks ROS.
@@ -110,7 +113,7 @@ struct UnderWay {
     drop_at: Option<Instant>,
 }
 
-type Outcome = Result<Option<u32>, StepFailure>;
+type Outcome = Result<Done, StepFailure>;
 
 /// The driver of one robot.
 pub struct Driver<E> {
@@ -135,6 +138,10 @@ pub struct Driver<E> {
     withheld: Option<Condition>,
     /// The contents whose gathered bytes were kept when they were last gone through; `None`: they are to be.
     kept_parts: Option<Vec<Digest>>,
+    /// Notified when parts that are lacking are to be asked for.
+    asks: Arc<Notify>,
+    /// Whether they are to be, although the last report may have said the same.
+    asks_again: bool,
     seq: u64,
     started: Instant,
 }
@@ -191,6 +198,8 @@ impl<E: Effects> Driver<E> {
             conditions,
             withheld: None,
             kept_parts: None,
+            asks: Arc::default(),
+            asks_again: false,
             seq: 0,
             started: Instant::now(),
         }
@@ -208,6 +217,8 @@ impl<E: Effects> Driver<E> {
                 Some(seen) = self.seen.recv() => self.see(seen),
                 // Cancel-safe: likewise.
                 Some(message) = heard.recv() => self.hear(message),
+                // Cancel-safe: a permit that was not taken stays.
+                () = self.asks.notified() => self.asks_again = true,
                 // Cancel-safe: an interval keeps its own time.
                 _ = tick.tick() => self.tick(),
                 // Cancel-safe: a timer that is made anew each time.
@@ -250,12 +261,13 @@ impl<E: Effects> Driver<E> {
         wake
     }
 
+    /// All tasks, in the order in which they get what not all can have at once.
     fn task_names(&self) -> Vec<TaskName> {
-        let desired = self.desired.iter().flat_map(|state| &state.tasks).map(|task| task.task.clone());
-        let mut names: Vec<TaskName> = self.ledger.tasks.keys().cloned().chain(desired).collect();
-        names.sort();
-        names.dedup();
-        names
+        let desired = self.desired.iter().flat_map(|state| &state.tasks);
+        let desired = desired.map(|task| (task.task.clone(), task.priority));
+        let known = self.ledger.tasks.iter().map(|(task, record)| (task.clone(), record.order.priority));
+        let is_desired = |task: &TaskName| desired.clone().any(|(other, _)| other == *task);
+        plan::in_turn(known.filter(|(task, _)| !is_desired(task)).chain(desired.clone()).collect())
     }
 
     /// What is desired of a task. Before any desired state is known, what its record was ordered to be.
@@ -413,6 +425,7 @@ impl<E: Effects> Driver<E> {
         let package = |record: &TaskRecord| record.order.package.clone();
         if before.map(package).as_ref() != Some(&record.order.package) {
             view.prepared = None;
+            view.progress.remove(&Lane::Prepare);
         }
         let process = |record: &TaskRecord| Some(record.active.as_ref()?.process.as_ref()?.dir.clone());
         if before.and_then(process) != process(&record) {
@@ -425,7 +438,7 @@ impl<E: Effects> Driver<E> {
     fn tick(&mut self) {
         for view in self.views.values_mut() {
             let known = view.transfers.iter().map(|(lane, transfer)| (*lane, *transfer.borrow()));
-            view.progress = known.filter(|(_, progress)| progress.total > 0).collect();
+            view.progress.extend(known.filter(|(_, progress)| progress.total > 0));
         }
     }
 

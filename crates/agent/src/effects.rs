@@ -3,15 +3,17 @@
 
 use std::future::Future;
 
-use task_proto::desired::PackageRef;
+use bytes::Bytes;
+use task_proto::desired::{BlobRef, PackageRef};
 use task_proto::report::{HostFacts, Progress};
 use task_proto::{Digest, TaskName};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
+use crate::fetch::Asks;
 use crate::ledger::{ActiveRun, Collection, GateQuestion, Ledger, LedgerError, ProcessRecord};
 use crate::observed::{Health, Prepared, ProcessState, RobotFacts};
-use crate::plan::StepFailure;
+use crate::plan::{Done, StepFailure};
 
 mod robot;
 
@@ -75,20 +77,32 @@ pub trait Effects: Send + Sync + 'static {
     /// Deletes the gathered bytes of all contents but these.
     fn keep_parts(&self, wanted: &[Digest]);
 
-    /// Pulls the manifest.
+    /// Pulls the manifest, unless the server tells this robot to come back later.
     fn pull_manifest(
         &self,
         package: &PackageRef,
         cancel: &CancellationToken,
-    ) -> impl Future<Output = Result<(), StepFailure>> + Send;
+    ) -> impl Future<Output = Result<Done, StepFailure>> + Send;
 
-    /// Pulls and unpacks the content.
+    /// Takes blobs that came with an order and are what their digests say; those that came before are of no more use.
+    fn offer(&self, blobs: Vec<(BlobRef, Bytes)>);
+
+    /// Pulls and unpacks the content, likewise.
     fn pull_content(
         &self,
         package: &PackageRef,
         progress: &watch::Sender<Progress>,
         cancel: &CancellationToken,
-    ) -> impl Future<Output = Result<(), StepFailure>> + Send;
+    ) -> impl Future<Output = Result<Done, StepFailure>> + Send;
+
+    /// Gathers the parts of the content that the server pushes, pulls what does not come, and unpacks it.
+    fn gather_content(
+        &self,
+        package: &PackageRef,
+        progress: &watch::Sender<Progress>,
+        asks: &watch::Sender<Asks>,
+        cancel: &CancellationToken,
+    ) -> impl Future<Output = Result<Done, StepFailure>> + Send;
 
     /// Builds it.
     fn build(

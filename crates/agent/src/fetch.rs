@@ -1,37 +1,48 @@
 //! Pulls a package from the server in one pass: stream, hash, decompress, unpack. What has arrived is kept in a `.part`
 //! file, so that a pull goes on where the last one ended, across restarts of the agent: the `.part` is replayed, the
-//! rest is asked for by Range.
+//! rest is asked for by Range. Bytes that were pushed, as parts or with the order itself, go the same way.
 //!
 //! Invariants: a tree gets its place only when all its bytes had the ordered digest and are on the disk; the bytes of a
 //! pull that failed for good are gone. When a pull is dropped or cancelled nothing is left but the `.part`.
 //! The compressed bytes are not kept once the tree is there: it is what they were for, and a robot's disk is small.
 
 mod download;
+mod error;
 mod intake;
+mod offered;
+mod part_map;
+mod pushed;
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::fs;
 use std::io;
-use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError, Weak};
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::Duration;
 
 use bytes::Bytes;
+use task_proto::Digest;
 use task_proto::desired::{BlobRef, PackageRef};
 use task_proto::manifest::TaskManifest;
-use task_proto::report::{FailureCode, Progress};
-use task_proto::{Digest, TaskName};
+use task_proto::report::Progress;
 use tokio::sync::{OwnedMutexGuard, mpsc, watch};
+use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
 use self::download::Download;
+pub use self::error::FetchError;
 use self::intake::Intake;
+use self::offered::Offered;
+use self::pushed::Gathering;
+pub use self::pushed::{Asks, PartPatience};
 use crate::credential::Credential;
-use crate::disk::{self, DiskFull, Need};
+use crate::disk::{self, Need};
 use crate::durable;
 use crate::foreign_file;
 use crate::layout::DataDir;
-use crate::unpack::{Limits, Refusal};
+use crate::link_meter::LinkMeter;
+use crate::parts::Listening;
+use crate::unpack::Limits;
 
 /// The largest task manifest that is held in memory.
 const MAX_MANIFEST_BYTES: u64 = 1 << 20;
@@ -39,6 +50,17 @@ const MAX_MANIFEST_BYTES: u64 = 1 << 20;
 const QUEUED_CHUNKS: usize = 16;
 /// How often one pull connects anew after a cut before it is given back to the caller's slower retries.
 const MAX_RECONNECTS: u32 = 5;
+/// Contents that are remembered as not to be waited for.
+const MAX_GIVEN_UP: usize = 64;
+
+/// Where the bytes come from that are not there.
+enum Source {
+    Download(Box<Download>),
+    /// They came with the order.
+    Offered(Bytes),
+    /// All are there.
+    Nothing,
+}
 
 /// Limits of a pull.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -51,6 +73,8 @@ pub struct FetchSettings {
     pub stall_timeout: Duration,
     /// The longest wait before the first new connection after a cut; it grows with each further one.
     pub reconnect_wait: Duration,
+    /// How long parts are waited for that the server pushes.
+    pub parts: PartPatience,
 }
 
 impl Default for FetchSettings {
@@ -60,128 +84,8 @@ impl Default for FetchSettings {
             reserve_bytes: 256 << 20,
             stall_timeout: Duration::from_secs(30),
             reconnect_wait: Duration::from_secs(2),
+            parts: PartPatience::default(),
         }
-    }
-}
-
-/// Why a pull did not end with the package in its place.
-#[derive(Debug, thiserror::Error)]
-pub enum FetchError {
-    /// The caller took it back.
-    #[error("the pull was cancelled")]
-    Cancelled,
-    /// No connection, or it broke.
-    #[error("the server can't be reached, or the connection broke")]
-    Unreachable(#[source] reqwest::Error),
-    /// The answer ended before the blob's last byte.
-    #[error("the answer ended after {received} of {size} bytes")]
-    Interrupted {
-        /// Bytes there are now.
-        received: u64,
-        /// The blob's size.
-        size: u64,
-    },
-    /// Too little came for too long.
-    #[error("the server sent next to nothing for {} s", .0.as_secs())]
-    Stalled(Duration),
-    /// Something answered that is not a taskd server or a registry: a captive portal, a proxy.
-    #[error("something else answers in the server's place: {0}")]
-    NotTheServer(String),
-    /// The server is overloaded, restarting or broken.
-    #[error("the server answers {status}")]
-    Busy {
-        /// The HTTP status.
-        status: u16,
-        /// When it wants to be asked again.
-        retry_after: Option<Duration>,
-    },
-    /// The token is not accepted.
-    #[error("the server does not accept this robot's token")]
-    Unauthorized,
-    /// The server will not give this blob to this robot.
-    #[error("the server answers {status} for blob {digest} of {package}")]
-    Unavailable {
-        /// The HTTP status.
-        status: u16,
-        /// What was asked for.
-        digest: Digest,
-        /// The package it belongs to.
-        package: TaskName,
-    },
-    /// The bytes are not the ordered ones.
-    #[error("the server's bytes for {digest} are others: {reason}")]
-    DigestMismatch {
-        /// The ordered digest.
-        digest: Digest,
-        /// What was found.
-        reason: String,
-    },
-    /// The bytes are the ordered ones, but no task manifest for this package.
-    #[error("the package's task manifest can't be used: {0}")]
-    ManifestInvalid(String),
-    /// The bytes are the ordered ones, but hold what a package must not.
-    #[error(transparent)]
-    ArchiveRefused(#[from] Refusal),
-    /// There is not enough room.
-    #[error(transparent)]
-    DiskFull(#[from] DiskFull),
-    /// The disk fails in another way.
-    #[error("cannot use {}", path.display())]
-    Disk {
-        /// What was being read or written.
-        path: PathBuf,
-        /// What the system said.
-        source: io::Error,
-    },
-}
-
-impl FetchError {
-    /// The code that a report gives; `None` for a pull that was cancelled, which is no failure.
-    pub fn code(&self) -> Option<FailureCode> {
-        match self {
-            Self::Cancelled => None,
-            Self::Unreachable(_)
-            | Self::Interrupted { .. }
-            | Self::Stalled(_)
-            | Self::NotTheServer(_)
-            | Self::Busy { .. } => Some(FailureCode::SERVER_UNREACHABLE),
-            Self::Unauthorized => Some(FailureCode::UNAUTHORIZED),
-            Self::Unavailable { .. } => Some(FailureCode::PACKAGE_UNAVAILABLE),
-            Self::DigestMismatch { .. } => Some(FailureCode::DIGEST_MISMATCH),
-            Self::ManifestInvalid(_) => Some(FailureCode::MANIFEST_INVALID),
-            Self::ArchiveRefused(_) => Some(FailureCode::ARCHIVE_REFUSED),
-            Self::DiskFull(_) => Some(FailureCode::DISK_FULL),
-            Self::Disk { .. } => Some(FailureCode::IO_ERROR),
-        }
-    }
-
-    /// Whether the same pull may succeed later without anyone's doing.
-    pub fn is_retryable(&self) -> bool {
-        self.is_cut()
-            || matches!(self, Self::NotTheServer(_) | Self::Busy { .. } | Self::Unauthorized | Self::DiskFull(_))
-    }
-
-    /// Whether what was gathered is to go: it is of no use, or takes up the room that is missing.
-    fn spoils_gathered(&self) -> bool {
-        matches!(self, Self::DiskFull(_)) || !self.is_retryable() && !matches!(self, Self::Cancelled)
-    }
-
-    /// How long to wait at least before it is tried again.
-    pub fn retry_after(&self) -> Option<Duration> {
-        match self {
-            Self::Busy { retry_after, .. } => *retry_after,
-            Self::DiskFull(_) => Some(disk::FULL_PAUSE),
-            _ => None,
-        }
-    }
-
-    /// Whether it is the connection that failed, and not an answer.
-    fn is_cut(&self) -> bool {
-        matches!(self, Self::Unreachable(_) | Self::Interrupted { .. } | Self::Stalled(_))
-    }
-
-    fn disk(path: &Path, source: io::Error) -> Self {
-        Self::Disk { path: path.to_owned(), source }
     }
 }
 
@@ -193,6 +97,10 @@ pub struct Fetcher {
     data: DataDir,
     settings: FetchSettings,
     turns: Turns,
+    meter: LinkMeter,
+    offered: Offered,
+    /// Contents that were pushed and did not come: not waited for again.
+    given_up: Mutex<HashSet<Digest>>,
 }
 
 impl Fetcher {
@@ -204,7 +112,28 @@ impl Fetcher {
         data: DataDir,
         settings: FetchSettings,
     ) -> Self {
-        Self { client, server, token: token.into(), data, settings, turns: Turns::default() }
+        Self {
+            client,
+            server,
+            token: token.into(),
+            data,
+            settings,
+            turns: Turns::default(),
+            meter: LinkMeter::default(),
+            offered: Offered::default(),
+            given_up: Mutex::default(),
+        }
+    }
+
+    /// The same, with what transfers show of the link told to `meter`.
+    pub fn measured_by(self, meter: LinkMeter) -> Self {
+        Self { meter, ..self }
+    }
+
+    /// Blobs that came with an order; only those count that are what they say.
+    pub fn offer(&self, blobs: impl IntoIterator<Item = (BlobRef, Bytes)>) {
+        let is_itself = |(blob, bytes): &(BlobRef, Bytes)| Digest::of(bytes) == blob.digest;
+        self.offered.replace(blobs.into_iter().filter(is_itself));
     }
 
     /// The package's task manifest, from the disk if it is there whole. Its bytes are verified either way.
@@ -212,13 +141,19 @@ impl Fetcher {
         if let Some(manifest) = stored_manifest(&self.data, package) {
             return Ok(manifest);
         }
-        let pulled = cancel.run_until_cancelled(self.pull_manifest(package)).await;
-        let bytes = pulled.ok_or(FetchError::Cancelled)??;
+        let bytes = match self.offered.get(&package.config) {
+            Some(bytes) => bytes.into(),
+            None => {
+                let pulled = cancel.run_until_cancelled(self.pull_manifest(package)).await;
+                pulled.ok_or(FetchError::Cancelled)??
+            }
+        };
         let manifest = read_manifest(&bytes, package)?;
         let version = self.data.task(&package.name).version(&package.manifest.digest);
         let path = version.manifest();
         durable::create_dir_all(version.root()).map_err(|source| FetchError::disk(version.root(), source))?;
         durable::write(&path, &bytes, 0o644).map_err(|source| FetchError::disk(&path, source))?;
+        self.offered.forget(&package.config.digest);
         Ok(manifest)
     }
 
@@ -231,9 +166,57 @@ impl Fetcher {
         progress: &watch::Sender<Progress>,
         cancel: &CancellationToken,
     ) -> Result<(), FetchError> {
-        // Two tasks may share a content, and a pull that was dropped takes a moment to end.
-        let turn = cancel.run_until_cancelled(self.turns.take(package.content.digest)).await;
-        let turn = Arc::new(turn.ok_or(FetchError::Cancelled)?);
+        let turn = self.turn(package, cancel).await?;
+        self.content_in_turn(package, manifest, progress, cancel, turn).await
+    }
+
+    /// The same for a content that the server pushes: gathers its parts from `listening` first, and pulls what does not
+    /// come. `asks` is what a report says of the parts that are lacking.
+    pub async fn pushed_content(
+        &self,
+        package: &PackageRef,
+        manifest: &TaskManifest,
+        listening: &Listening,
+        (progress, asks): (&watch::Sender<Progress>, &watch::Sender<Asks>),
+        cancel: &CancellationToken,
+    ) -> Result<(), FetchError> {
+        let turn = self.turn(package, cancel).await?;
+        let content = package.content;
+        let is_there = self.src(package).is_dir() || self.offered.get(&content).is_some();
+        if !is_there && self.present(package)? < content.size && !self.given_up().contains(&content.digest) {
+            let need = self.check_room(package, manifest, 0)?;
+            let gathering = Gathering::open(self, package, progress, asks, turn.clone())?;
+            let gathered = gathering.run(listening.listen(content.digest, content.size), cancel).await;
+            match gathered {
+                Ok(Ok(())) => {}
+                Ok(Err(why)) => {
+                    tracing::info!(package = %package.name, "what is pushed is pulled: {why}");
+                    self.meter.lost_transfer(Instant::now());
+                    self.give_up(content.digest);
+                }
+                Err(error) => {
+                    let error = error.for_want_of_room(self.data.root(), need);
+                    if error.spoils_gathered() {
+                        self.discard(package)?;
+                    }
+                    return Err(error);
+                }
+            }
+        }
+        self.content_in_turn(package, manifest, progress, cancel, turn).await
+    }
+
+    async fn content_in_turn(
+        &self,
+        package: &PackageRef,
+        manifest: &TaskManifest,
+        progress: &watch::Sender<Progress>,
+        cancel: &CancellationToken,
+        turn: Arc<OwnedMutexGuard<()>>,
+    ) -> Result<(), FetchError> {
+        let content = package.content;
+        pushed::hand_over(&self.data, content)
+            .map_err(|source| FetchError::disk(&self.data.blob_parts(&content.digest), source))?;
         let resumed = self.present(package)? > 0;
         let result = self.pull_content(package, manifest, progress, cancel, turn.clone()).await;
         let result = match result {
@@ -244,11 +227,26 @@ impl Fetcher {
             }
             result => result,
         };
-        if result.as_ref().is_err_and(FetchError::spoils_gathered) {
+        match &result {
+            Ok(()) => {
+                self.offered.forget(&content.digest);
+                self.given_up().remove(&content.digest);
+            }
             // Nobody comes back for these bytes, or the disk is full and the ledger needs their room.
-            self.discard(package)?;
+            Err(error) if error.spoils_gathered() => self.discard(package)?,
+            Err(_) => {}
         }
         result
+    }
+
+    /// Two tasks may share a content, and a pull that was dropped takes a moment to end.
+    async fn turn(
+        &self,
+        package: &PackageRef,
+        cancel: &CancellationToken,
+    ) -> Result<Arc<OwnedMutexGuard<()>>, FetchError> {
+        let turn = cancel.run_until_cancelled(self.turns.take(package.content.digest)).await;
+        turn.map(Arc::new).ok_or(FetchError::Cancelled)
     }
 
     async fn pull_manifest(&self, package: &PackageRef) -> Result<Vec<u8>, FetchError> {
@@ -279,20 +277,21 @@ impl Fetcher {
         cancel: &CancellationToken,
         turn: Arc<OwnedMutexGuard<()>>,
     ) -> Result<(), FetchError> {
-        let src = self.data.task(&package.name).version(&package.manifest.digest).src();
+        let src = self.src(package);
         if src.is_dir() {
             return self.discard(package);
         }
         let offset = self.present(package)?;
-        let need = Need::of(package, manifest, offset, self.settings.reserve_bytes);
-        let root = self.data.root();
-        need.check(disk::room(root).map_err(|source| FetchError::disk(root, source))?)?;
+        progress.send_replace(Progress { done: offset, total: package.content.size });
+        let need = self.check_room(package, manifest, offset)?;
         // Ask first: a replay for nothing each time the server is away would wear the disk out.
-        let download = if offset < package.content.size {
-            let answer = cancel.run_until_cancelled(self.download(package, package.content, offset)).await;
-            Some(answer.ok_or(FetchError::Cancelled)??)
+        let source = if offset == package.content.size {
+            Source::Nothing
+        } else if let Some(bytes) = self.offered.get(&package.content) {
+            Source::Offered(bytes.slice(offset as usize..))
         } else {
-            None
+            let answer = cancel.run_until_cancelled(self.download(package, package.content, offset)).await;
+            Source::Download(Box::new(answer.ok_or(FetchError::Cancelled)??))
         };
         // Ends the blocking half even if this future is dropped while it replays.
         let stop = cancel.child_token();
@@ -302,13 +301,14 @@ impl Fetcher {
         let facts = manifest.content;
         let unpacking = tokio::task::spawn_blocking(move || intake.run(&facts, &src, need));
         let feeding = async {
-            match download {
-                Some(download) => self.feed(package, download, sender).await,
-                None => {
-                    drop(sender);
-                    Ok(())
-                }
+            match source {
+                Source::Download(download) => return self.feed(package, *download, sender).await,
+                // Nobody takes them if the disk fails, which the blocking half knows better.
+                Source::Offered(bytes) => drop(sender.send(bytes).await),
+                Source::Nothing => {}
             }
+            drop(sender);
+            Ok(())
         };
         let fed = cancel.run_until_cancelled(feeding).await.unwrap_or(Err(FetchError::Cancelled));
         let unpacked = unpacking.await.unwrap_or_else(|error| match error.try_into_panic() {
@@ -329,7 +329,7 @@ impl Fetcher {
         mut download: Download,
         sender: mpsc::Sender<Bytes>,
     ) -> Result<(), FetchError> {
-        let mut cut = match download.pass_on(&sender).await {
+        let mut cut = match self.pass_on(&mut download, &sender).await {
             Err(error) if error.is_cut() => error,
             ended => return ended,
         };
@@ -341,7 +341,7 @@ impl Fetcher {
             tokio::time::sleep(longest.mul_f64(rand::random())).await;
             let ended = match self.download(package, package.content, position).await {
                 Ok(mut download) => {
-                    let ended = download.pass_on(&sender).await;
+                    let ended = self.pass_on(&mut download, &sender).await;
                     position = download.position();
                     ended
                 }
@@ -353,6 +353,17 @@ impl Fetcher {
             };
         }
         Err(cut)
+    }
+
+    /// Passes on what one answer has, and measures it.
+    async fn pass_on(&self, download: &mut Download, sender: &mpsc::Sender<Bytes>) -> Result<(), FetchError> {
+        let from = download.position();
+        let ended = download.pass_on(sender).await;
+        self.meter.transferred(download.position() - from, download.asked_at().elapsed());
+        if ended.as_ref().is_err_and(FetchError::is_cut) {
+            self.meter.lost_transfer(Instant::now());
+        }
+        ended
     }
 
     async fn download(&self, package: &PackageRef, blob: BlobRef, offset: u64) -> Result<Download, FetchError> {
@@ -367,9 +378,35 @@ impl Fetcher {
         Download::start(request, package, blob, offset, self.settings.stall_timeout).await
     }
 
+    fn src(&self, package: &PackageRef) -> PathBuf {
+        self.data.task(&package.name).version(&package.manifest.digest).src()
+    }
+
+    /// Whether the rest of it fits on the disk when `present` bytes are there.
+    fn check_room(&self, package: &PackageRef, manifest: &TaskManifest, present: u64) -> Result<Need, FetchError> {
+        let need = Need::of(package, manifest, present, self.settings.reserve_bytes);
+        let root = self.data.root();
+        need.check(disk::room(root).map_err(|source| FetchError::disk(root, source))?)?;
+        Ok(need)
+    }
+
+    fn given_up(&self) -> MutexGuard<'_, HashSet<Digest>> {
+        // Every change under the lock is complete in itself.
+        self.given_up.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn give_up(&self, content: Digest) {
+        let mut given_up = self.given_up();
+        if given_up.len() >= MAX_GIVEN_UP {
+            given_up.clear();
+        }
+        given_up.insert(content);
+    }
+
     fn discard(&self, package: &PackageRef) -> Result<(), FetchError> {
         let part = self.data.blob_part(&package.content.digest);
-        durable::remove_file(&part).map_err(|source| FetchError::disk(&part, source))
+        let gone = durable::remove_file(&part).and_then(|()| pushed::discard(&self.data, &package.content.digest));
+        gone.map_err(|source| FetchError::disk(&part, source))
     }
 
     /// How many bytes of the content are there from earlier tries.

@@ -4,6 +4,8 @@
 //! identity.json                     who this robot is (0600)
 //! ledger.json                       what the agent was doing
 //! blobs/sha256/<hex>.part           bytes of a package's content that have arrived so far
+//! blobs/sha256/<hex>.parts          the same where they come as parts in any order: a file with holes
+//! blobs/sha256/<hex>.parts-note     which of its parts are on the disk
 //! staging/                          trees being unpacked; emptied at every start
 //! survey/                           what was last asked about the ROS installations
 //! logs/                             what nodes say that are of no task
@@ -75,6 +77,16 @@ impl DataDir {
         self.blobs().join(format!("{}.part", digest.hex()))
     }
 
+    /// Where a blob's bytes gather while they are pushed in parts.
+    pub fn blob_parts(&self, digest: &Digest) -> PathBuf {
+        self.blobs().join(format!("{}.parts", digest.hex()))
+    }
+
+    /// Which of those parts are there.
+    pub fn blob_parts_note(&self, digest: &Digest) -> PathBuf {
+        self.blobs().join(format!("{}.parts-note", digest.hex()))
+    }
+
     /// Where trees are unpacked before they get their place.
     pub fn staging(&self) -> PathBuf {
         self.root.join("staging")
@@ -109,7 +121,8 @@ impl DataDir {
 
     /// Removes all gathered bytes except those of the blobs in `wanted`.
     pub fn clean_parts(&self, wanted: &[Digest]) -> io::Result<()> {
-        let keep: Vec<PathBuf> = wanted.iter().map(|digest| self.blob_part(digest)).collect();
+        let of_blob = |digest| [self.blob_part(digest), self.blob_parts(digest), self.blob_parts_note(digest)];
+        let keep: Vec<PathBuf> = wanted.iter().flat_map(of_blob).collect();
         for path in entries(&self.blobs())? {
             if !keep.contains(&path) {
                 durable::remove_file(&path)?;
@@ -337,8 +350,11 @@ mod tests {
         durable::create_dir_all(&data.blobs()).unwrap();
         for digest in [wanted, other] {
             fs::write(data.blob_part(&digest), "…").unwrap();
+            fs::write(data.blob_parts(&digest), "…").unwrap();
+            fs::write(data.blob_parts_note(&digest), "…").unwrap();
         }
         data.clean_parts(&[wanted]).unwrap();
-        assert!(data.blob_part(&wanted).exists() && !data.blob_part(&other).exists());
+        let left = [data.blob_part(&wanted), data.blob_parts(&wanted), data.blob_parts_note(&wanted)];
+        assert_eq!(entries(&data.blobs()).unwrap(), left);
     }
 }

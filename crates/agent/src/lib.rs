@@ -2,6 +2,7 @@
 
 pub mod admission;
 pub mod answers;
+pub mod battery;
 pub mod builder;
 pub mod cgroup;
 pub mod clock;
@@ -27,10 +28,12 @@ pub mod launch;
 pub mod layout;
 pub mod ledger;
 pub mod link;
+pub mod link_meter;
 pub mod logs;
 pub mod mqtt;
 pub mod observed;
 pub mod outputs;
+pub mod parts;
 pub mod permanent_address;
 pub mod plan;
 pub mod process;

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use task_proto::api::ReportReply;
+use task_proto::desired::Inline;
 use task_proto::envelope::Envelope;
 use task_proto::report::Report;
 use task_proto::request::Request;
@@ -15,6 +16,8 @@ use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
 use crate::effects::chain;
+use crate::link_meter::LinkMeter;
+use crate::parts::Listening;
 use crate::plan::backoff_ms;
 use crate::server::{Sent, Server, ServerError};
 
@@ -27,7 +30,12 @@ const REFUSED_POLL: Duration = Duration::from_secs(300);
 #[derive(Debug)]
 pub enum Heard {
     /// A desired state, not verified.
-    Desired(Box<Envelope>),
+    Desired {
+        /// As it was signed.
+        envelope: Box<Envelope>,
+        /// Blobs that came along, only reached by the digests it names.
+        inline: Inline,
+    },
     /// The server has nothing newer.
     Unchanged,
     /// A report is stored.
@@ -65,6 +73,10 @@ pub struct Shared {
     pub poll: Arc<Notify>,
     /// Asks for a report over HTTP now, whether MQTT is up or not.
     pub post: Arc<Notify>,
+    /// Whose parts are wanted.
+    pub listening: Listening,
+    /// What is measured of the link.
+    pub meter: LinkMeter,
     /// The agent ends.
     pub shutdown: CancellationToken,
 }
@@ -109,6 +121,8 @@ impl Shared {
             token_refused: Arc::default(),
             poll: Arc::default(),
             post: Arc::default(),
+            listening: Listening::default(),
+            meter: LinkMeter::default(),
             shutdown,
         }
     }
@@ -120,8 +134,13 @@ pub async fn poll(server: Server, shared: Shared, intervals: Intervals, heard: m
     let mut tag = None;
     loop {
         let known = tag.as_ref().filter(|_| *shared.settled.borrow());
+        let begun = Instant::now();
         let outcome = server.desired(known).await;
         let asked_at = Instant::now();
+        // An MQTT session measures more often and without a connection to be made first.
+        if outcome.is_ok() && !*shared.mqtt_up.borrow() {
+            shared.meter.round_trip(asked_at - begun);
+        }
         let spread = spread();
         let least = match &outcome {
             Err(ServerError::TokenRefused(_)) => REFUSED_POLL.min(intervals.slow),
@@ -161,7 +180,7 @@ pub async fn poll(server: Server, shared: Shared, intervals: Intervals, heard: m
 
 fn heard_of(outcome: Result<Option<Sent>, ServerError>) -> Heard {
     match outcome {
-        Ok(Some(sent)) => Heard::Desired(Box::new(sent.envelope)),
+        Ok(Some(sent)) => Heard::Desired { envelope: Box::new(sent.envelope), inline: Inline::default() },
         Ok(None) => Heard::Unchanged,
         Err(ServerError::TokenRefused(_)) => Heard::TokenRefused,
         Err(ServerError::Refused { code, message }) => Heard::Withheld { code, text: message },
@@ -199,6 +218,9 @@ pub async fn post(server: Server, shared: Shared, heard: mpsc::Sender<Heard>) {
                         return;
                     }
                     retry = Duration::from_millis(backoff_ms(failures, MAX_POST_BACKOFF_MS, rand::random()).max(100));
+                    if let ServerError::Busy { retry_after: Some(wait), .. } = error {
+                        retry = retry.max(wait.min(REFUSED_POLL));
+                    }
                 }
             }
         }

@@ -1,11 +1,20 @@
 //! The MQTT half of the link, and the only place that names rumqttc: one session after another, each with a last will;
-//! the doorbell and questions in, status, the newest report, answers and log lines out. A report is confirmed by its
-//! PUBACK, which the server sends once the report is stored. It never decides what to do with what it hears.
+//! the doorbell, questions and the parts of packages in, status, the newest report, answers and log lines out. A report
+//! is confirmed by its PUBACK, which the server sends once the report is stored. It never decides what to do with what
+//! it hears.
+//!
+//! What is heard is acknowledged by hand: a part once it was written, all else at once. A part that nobody takes is all
+//! that is held here; until somebody does, nothing more is read.
+
+mod subscriptions;
 
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use rumqttc::{AsyncClient, ConnectReturnCode, ConnectionError, Event, LastWill, MqttOptions, Outgoing, Packet, QoS};
+use rumqttc::{
+    AsyncClient, ConnectReturnCode, ConnectionError, Event, EventLoop, LastWill, MqttOptions, Outgoing, Packet,
+    Publish, QoS, StateError,
+};
 use task_proto::RobotId;
 use task_proto::desired::{Doorbell, MAX_DOORBELL_BYTES};
 use task_proto::report::Status;
@@ -14,8 +23,10 @@ use task_proto::topic::{RobotTopic, Topic, TopicPrefix};
 use tokio::sync::mpsc;
 use tokio::time::Instant;
 
+use self::subscriptions::Subscriptions;
 use crate::credential::Credential;
 use crate::link::{Heard, Message, Shared, Talk};
+use crate::parts::{Acknowledgement, Arrived, Due};
 use crate::plan::backoff_ms;
 
 /// How often the broker hears from an idle robot.
@@ -30,8 +41,18 @@ const MAX_REFUSED_BACKOFF_MS: u64 = 5 * 60 * 1000;
 const GOOD_SESSION: Duration = Duration::from_secs(60);
 /// Requests between this task and rumqttc.
 const QUEUED_REQUESTS: usize = 16;
+/// What has been read and not been looked at yet.
+const QUEUED_EVENTS: usize = 2;
+/// Messages that were dealt with and whose acknowledgements wait; brokers have fewer in flight.
+const QUEUED_ACKNOWLEDGEMENTS: usize = 1024;
 /// The largest packet that is sent: a report of very many tasks.
 const MAX_SENT_BYTES: usize = 8 * 1024 * 1024;
+/// The largest message that is read unless the server is seen to send whole packages as one.
+pub const MESSAGE_BYTES: usize = 1024 * 1024;
+/// The largest that MQTT has.
+const MAX_MESSAGE_BYTES: u64 = 256 * 1024 * 1024 - 1;
+/// What a message has around its bytes: topic, packet id, a part's header.
+const AROUND_MESSAGE_BYTES: usize = 4096;
 
 /// Where and as whom to connect.
 #[derive(Clone)]
@@ -48,12 +69,16 @@ pub struct MqttAccess {
     pub token: Credential,
     /// What every status says; `connection` counts up from it.
     pub status: Status,
+    /// The largest message that is read at first, [`MESSAGE_BYTES`]. Only for a wanted package it gets larger.
+    pub message_bytes: usize,
 }
 
 /// Why a session ended.
 enum Ended {
     /// The broker does not accept this robot.
     Refused,
+    /// A part of a wanted package is larger than what this session can read.
+    TooNarrow,
     /// Anything else.
     Lost(ConnectionError),
     /// The agent ends.
@@ -63,14 +88,23 @@ enum Ended {
 /// Keeps a session up until the agent ends; after each end it waits with full jitter.
 pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Heard>, mut talk: Talk) {
     let mut failures = 0u32;
+    // Whether the server has been seen to send packages as messages larger than usual.
+    let mut sends_large = false;
     loop {
         access.status.connection += 1;
         let begun = Instant::now();
-        let ended = session(&access, &shared, &heard, &mut talk).await;
-        shared.mqtt_up.send_replace(false);
+        let room = MessageRoom::of(&access, &shared, sends_large);
+        let ended = session(&access, &shared, &heard, &mut talk, room).await;
+        let was_up = shared.mqtt_up.send_replace(false);
+        // Whoever waits for parts need not give up if the next session comes at once.
+        shared.listening.session(matches!(ended, Ended::TooNarrow));
         failures = if begun.elapsed() >= GOOD_SESSION { 1 } else { failures.saturating_add(1) };
         let max_ms = match ended {
             Ended::Closed => return,
+            Ended::TooNarrow => {
+                sends_large = true;
+                continue;
+            }
             Ended::Refused => {
                 tracing::warn!("the MQTT broker refuses this robot");
                 // Whether the robot was removed is asked over HTTP, whose answer is the server's own.
@@ -79,6 +113,9 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
             }
             Ended::Lost(error) => {
                 tracing::info!(%error, "no MQTT session");
+                if was_up {
+                    shared.meter.reconnected(Instant::now());
+                }
                 MAX_BACKOFF_MS
             }
         };
@@ -92,6 +129,37 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
     }
 }
 
+/// How large a message a session reads. It can't change while the session lasts.
+#[derive(Clone, Copy)]
+struct MessageRoom {
+    bytes: usize,
+    /// Whether it has to hold whole packages.
+    holds_packages: bool,
+}
+
+impl MessageRoom {
+    fn of(access: &MqttAccess, shared: &Shared, holds_packages: bool) -> Self {
+        let wanted = if holds_packages { Self::for_wanted(shared) } else { 0 };
+        Self { bytes: wanted.max(access.message_bytes), holds_packages }
+    }
+
+    /// What the largest wanted package takes as one message.
+    fn for_wanted(shared: &Shared) -> usize {
+        let message = shared.listening.largest_bytes().saturating_add(AROUND_MESSAGE_BYTES as u64);
+        usize::try_from(message.min(MAX_MESSAGE_BYTES)).unwrap_or(usize::MAX)
+    }
+
+    /// Whether a message of a wanted package does not fit.
+    fn is_too_narrow(&self, shared: &Shared) -> bool {
+        self.holds_packages && Self::for_wanted(shared) > self.bytes
+    }
+
+    /// Whether a message of `bytes` did not fit, and may be one of a wanted package.
+    fn was_too_narrow(&self, bytes: usize, shared: &Shared) -> bool {
+        bytes > self.bytes && bytes <= Self::for_wanted(shared)
+    }
+}
+
 /// What was published and is not acknowledged, the first one first.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Published {
@@ -101,37 +169,56 @@ enum Published {
     Lines,
 }
 
-async fn session(access: &MqttAccess, shared: &Shared, heard: &mpsc::Sender<Heard>, talk: &mut Talk) -> Ended {
+async fn session(
+    access: &MqttAccess,
+    shared: &Shared,
+    heard: &mpsc::Sender<Heard>,
+    talk: &mut Talk,
+    room: MessageRoom,
+) -> Ended {
     let Talk { requests, messages, lines } = talk;
-    let (client, mut event_loop) = AsyncClient::new(options(access), QUEUED_REQUESTS);
+    let (client, mut event_loop) = AsyncClient::new(options(access, room), QUEUED_REQUESTS);
     event_loop.network_options.set_connection_timeout(CONNECT_TIMEOUT_S);
-    let (events_in, mut events) = mpsc::channel(QUEUED_REQUESTS);
-    let mut reports = shared.reports.subscribe();
-    // rumqttc's poll must not be dropped half way, so it runs in one future that lives as long as the session.
-    let pump = async {
-        loop {
-            match event_loop.poll().await {
-                Ok(event) => {
-                    if events_in.send(event).await.is_err() {
-                        return Ended::Closed;
-                    }
-                }
-                Err(ConnectionError::ConnectionRefused(
-                    ConnectReturnCode::BadUserNamePassword | ConnectReturnCode::NotAuthorized,
-                )) => return Ended::Refused,
-                Err(error) => return Ended::Lost(error),
-            }
-        }
+    // An acknowledgement that waits for another packet to be answered would hold the sender up.
+    event_loop.network_options.set_tcp_nodelay(true);
+    let (events_in, mut events) = mpsc::channel(QUEUED_EVENTS);
+    let (acknowledge, due) = mpsc::channel(QUEUED_ACKNOWLEDGEMENTS);
+    let (mut reports, mut wishes) = (shared.reports.subscribe(), shared.listening.changes());
+    let (pump, acknowledgements) =
+        (pump(&mut event_loop, events_in, room, shared), acknowledge_all(client.clone(), due));
+    tokio::pin!(pump, acknowledgements);
+    let mut session = Session {
+        access,
+        shared,
+        heard,
+        requests,
+        client,
+        up: false,
+        unsent: VecDeque::new(),
+        sent: VecDeque::new(),
+        subscriptions: Subscriptions::default(),
+        acknowledge,
+        parked: None,
+        pinged_at: None,
     };
-    tokio::pin!(pump);
-    let mut session =
-        Session { access, shared, heard, requests, client, up: false, unsent: VecDeque::new(), sent: VecDeque::new() };
     loop {
+        if room.is_too_narrow(shared) {
+            return Ended::TooNarrow;
+        }
+        let parked = session.parked.as_ref().map(|(way, _)| way.clone());
         tokio::select! {
             // Cancel-safe: the future is pinned outside of the loop and goes on where it was.
             ended = &mut pump => return ended,
+            // Cancel-safe, likewise. It does not end before the session does.
+            () = &mut acknowledgements => {}
             // Cancel-safe: a message stays in the channel until it is received.
-            Some(event) = events.recv() => session.take(event).await,
+            Some(event) = events.recv(), if session.parked.is_none() => session.take(event).await,
+            // Cancel-safe: a place that was not taken stays free.
+            place = place_for(parked) => session.unpark(place),
+            // Cancel-safe: a watch remembers that it changed.
+            Ok(()) = wishes.changed() => session.tune(),
+            // Cancel-safe: a timer that is made anew each time.
+            () = tokio::time::sleep_until(session.subscriptions.next_try()) => session.tune(),
             // Cancel-safe: a watch remembers that it changed.
             Ok(()) = reports.changed() => session.publish_report(),
             // Cancel-safe: a message stays in the channel until it is received.
@@ -151,6 +238,35 @@ async fn session(access: &MqttAccess, shared: &Shared, heard: &mpsc::Sender<Hear
     }
 }
 
+/// Reads and writes until the session ends. rumqttc's poll must not be dropped half way, so it runs in one future that
+/// lives as long as the session.
+async fn pump(event_loop: &mut EventLoop, events: mpsc::Sender<Event>, room: MessageRoom, shared: &Shared) -> Ended {
+    loop {
+        match event_loop.poll().await {
+            Ok(event) => {
+                if events.send(event).await.is_err() {
+                    return Ended::Closed;
+                }
+            }
+            Err(ConnectionError::ConnectionRefused(
+                ConnectReturnCode::BadUserNamePassword | ConnectReturnCode::NotAuthorized,
+            )) => return Ended::Refused,
+            Err(ConnectionError::MqttState(StateError::Deserialization(rumqttc::Error::PayloadSizeLimitExceeded(
+                bytes,
+            )))) if room.was_too_narrow(bytes, shared) => return Ended::TooNarrow,
+            Err(error) => return Ended::Lost(error),
+        }
+    }
+}
+
+/// Acknowledges what is due, until nobody can say any more what is.
+async fn acknowledge_all(client: AsyncClient, mut due: mpsc::Receiver<Due>) {
+    while let Some(due) = due.recv().await {
+        // A session that is over has nobody to acknowledge anything to; the pump notices it.
+        let _ = client.ack(&answered(due)).await;
+    }
+}
+
 struct Session<'a> {
     access: &'a MqttAccess,
     shared: &'a Shared,
@@ -162,14 +278,47 @@ struct Session<'a> {
     unsent: VecDeque<Published>,
     /// Sent under this packet id.
     sent: VecDeque<(u16, Published)>,
+    subscriptions: Subscriptions,
+    acknowledge: mpsc::Sender<Due>,
+    /// A part that there is no room for, and where it goes.
+    parked: Option<(mpsc::Sender<Arrived>, Arrived)>,
+    pinged_at: Option<Instant>,
+}
+
+/// A place for the part that waits for one; `None` if nobody wants it any more.
+async fn place_for(way: Option<mpsc::Sender<Arrived>>) -> Option<mpsc::OwnedPermit<Arrived>> {
+    match way {
+        Some(way) => way.reserve_owned().await.ok(),
+        None => std::future::pending().await,
+    }
+}
+
+/// As much of a message as its acknowledgement takes.
+fn answered(due: Due) -> Publish {
+    let qos = rumqttc::qos(due.qos).unwrap_or(QoS::AtMostOnce);
+    let mut message = Publish::new("", qos, Vec::new());
+    message.pkid = due.packet_id;
+    message
 }
 
 impl Session<'_> {
     async fn take(&mut self, event: Event) {
         match event {
             Event::Incoming(Packet::ConnAck(_)) => self.begin(),
-            Event::Incoming(Packet::Publish(message)) => self.hear(&message.topic, &message.payload).await,
+            Event::Incoming(Packet::Publish(message)) => self.hear(message).await,
             Event::Incoming(Packet::PubAck(ack)) => self.confirm(ack.pkid).await,
+            Event::Incoming(Packet::SubAck(answer)) => {
+                if let Some(took) = self.subscriptions.answered(&answer, &self.shared.listening) {
+                    self.shared.meter.round_trip(took);
+                }
+            }
+            Event::Incoming(Packet::PingResp) => {
+                if let Some(pinged_at) = self.pinged_at.take() {
+                    self.shared.meter.round_trip(pinged_at.elapsed());
+                }
+            }
+            Event::Outgoing(Outgoing::PingReq) => self.pinged_at = Some(Instant::now()),
+            Event::Outgoing(Outgoing::Subscribe(id)) => self.subscriptions.sent(id),
             Event::Outgoing(Outgoing::Publish(id)) => {
                 if let Some(published) = self.unsent.pop_front() {
                     self.sent.push_back((id, published));
@@ -185,23 +334,64 @@ impl Session<'_> {
         tracing::info!(host = self.access.host, port = self.access.port, "connected to MQTT");
         for topic in [RobotTopic::Desired, RobotTopic::Request] {
             // The queue is empty at the start of a session, and a lost session is noticed by the pump.
-            let _ = self.client.try_subscribe(topic_name(self.access, topic), QoS::AtLeastOnce);
+            if self.client.try_subscribe(topic_name(self.access, topic), QoS::AtLeastOnce).is_ok() {
+                self.subscriptions.asked_for_own();
+            }
         }
+        self.shared.listening.session(true);
         self.publish(RobotTopic::Status, status_payload(self.access, true), Published::Status);
         self.publish_report();
     }
 
-    async fn hear(&self, topic: &str, payload: &[u8]) {
-        if topic == topic_name(self.access, RobotTopic::Request) {
-            return self.hear_request(payload);
+    /// Subscribes to what is wanted and not subscribed to, and ends what is not wanted any more.
+    fn tune(&mut self) {
+        if self.up {
+            self.subscriptions.tune(&self.client, &self.access.prefix, &self.shared.listening);
         }
-        if topic != topic_name(self.access, RobotTopic::Desired) {
-            return;
+    }
+
+    async fn hear(&mut self, message: Publish) {
+        let acknowledgement =
+            Acknowledgement::new(Due { packet_id: message.pkid, qos: message.qos as u8 }, self.acknowledge.clone());
+        match self.access.prefix.parse(&message.topic) {
+            Some(Topic::Package(digest)) => {
+                if let Some(way) = self.shared.listening.way_to(&digest) {
+                    self.pass_on(way, Arrived { message: message.payload, acknowledgement });
+                }
+            }
+            Some(Topic::Robot(robot, RobotTopic::Request)) if robot == self.access.robot => {
+                self.hear_request(&message.payload);
+            }
+            Some(Topic::Robot(robot, RobotTopic::Desired)) if robot == self.access.robot => {
+                self.hear_desired(&message.payload).await;
+            }
+            _ => {}
+        }
+    }
+
+    fn pass_on(&mut self, way: mpsc::Sender<Arrived>, part: Arrived) {
+        match way.try_send(part) {
+            Err(mpsc::error::TrySendError::Full(part)) => self.parked = Some((way, part)),
+            // Nobody wants it any more: letting go of it acknowledges it.
+            Ok(()) | Err(mpsc::error::TrySendError::Closed(_)) => {}
+        }
+    }
+
+    fn unpark(&mut self, place: Option<mpsc::OwnedPermit<Arrived>>) {
+        if let (Some((_, part)), Some(place)) = (self.parked.take(), place) {
+            place.send(part);
+        }
+    }
+
+    async fn hear_desired(&self, payload: &[u8]) {
+        if payload.len() > MAX_DOORBELL_BYTES {
+            tracing::warn!(bytes = payload.len(), "a desired state is too large for a message");
+            return self.shared.poll.notify_one();
         }
         match serde_json::from_slice::<Doorbell>(payload) {
-            Ok(Doorbell::State { envelope, .. }) => {
+            Ok(Doorbell::State { envelope, inline }) => {
                 // The driver ends before this task: nobody listens only when the agent ends.
-                let _ = self.heard.send(Heard::Desired(Box::new(envelope))).await;
+                let _ = self.heard.send(Heard::Desired { envelope: Box::new(envelope), inline }).await;
             }
             Ok(Doorbell::Notice { .. }) => self.shared.poll.notify_one(),
             Err(error) => tracing::warn!(%error, "the desired topic holds something else"),
@@ -263,13 +453,13 @@ impl Session<'_> {
     }
 }
 
-fn options(access: &MqttAccess) -> MqttOptions {
+fn options(access: &MqttAccess, room: MessageRoom) -> MqttOptions {
     let mut options = MqttOptions::new(access.robot.as_str(), &access.host, access.port);
     options.set_credentials(access.robot.as_str(), access.token.current());
     options.set_clean_session(true);
     options.set_keep_alive(KEEP_ALIVE);
-    // Base64 and JSON around the payload are counted in the limit, topic and header are not.
-    options.set_max_packet_size(MAX_DOORBELL_BYTES + 4096, MAX_SENT_BYTES);
+    options.set_manual_acks(true);
+    options.set_max_packet_size(room.bytes, MAX_SENT_BYTES);
     let will = status_payload(access, false);
     options.set_last_will(LastWill::new(topic_name(access, RobotTopic::Status), will, QoS::AtLeastOnce, false));
     options

@@ -43,7 +43,7 @@ mod transition;
 
 pub use collect::collect;
 pub use gate::consult;
-pub use transition::{StepFailure, adopted, backoff_ms, begun, finished};
+pub use transition::{Done, StepFailure, adopted, backoff_ms, begun, finished};
 
 /// All that the next step depends on.
 #[derive(Debug, Clone, Copy)]
@@ -103,8 +103,13 @@ pub enum Step {
     PullManifest(PackageRef),
     /// Look at what ROS there is, to tell whether the version can run here.
     LookForRos(PackageRef),
-    /// Pull and unpack the content.
-    PullContent(PackageRef),
+    /// Get and unpack the content: as parts that the server pushes, and what does not come so by a pull.
+    PullContent {
+        /// Of which package.
+        package: PackageRef,
+        /// Whether the server pushes it.
+        is_pushed: bool,
+    },
     /// Build it.
     Build(PackageRef),
     /// Ask the robot's gate.
@@ -146,7 +151,7 @@ impl Step {
     /// The lane it runs in.
     pub fn lane(&self) -> Lane {
         match self {
-            Self::PullManifest(_) | Self::LookForRos(_) | Self::PullContent(_) | Self::Build(_) => Lane::Prepare,
+            Self::PullManifest(_) | Self::LookForRos(_) | Self::PullContent { .. } | Self::Build(_) => Lane::Prepare,
             Self::Start(_) | Self::Stop(_) | Self::Prune { .. } | Self::Remove => Lane::Run,
             Self::Ask(_) => Lane::Gate,
             Self::Collect(_) => Lane::Collect,
@@ -157,7 +162,7 @@ impl Step {
     /// takes its time, and a build over its own limits.
     pub fn deadline(&self) -> Option<Duration> {
         let seconds = match self {
-            Self::PullContent(_) | Self::Build(_) | Self::Collect(_) => return None,
+            Self::PullContent { .. } | Self::Build(_) | Self::Collect(_) => return None,
             Self::PullManifest(_) | Self::LookForRos(_) | Self::Start(_) => STEP_DEADLINE_S,
             // Its own, shorter limit is a setting.
             Self::Ask(_) => STEP_DEADLINE_S + crate::config::MAX_GATE_TIMEOUT_S,
@@ -179,12 +184,13 @@ impl Step {
             Self::Ask(question) => {
                 record.and_then(|record| record.gate.as_ref()).is_some_and(|gate| gate.question == *question)
             }
-            Self::PullManifest(package)
-            | Self::LookForRos(package)
-            | Self::PullContent(package)
-            | Self::Build(package) => {
+            Self::PullManifest(package) | Self::LookForRos(package) | Self::Build(package) => {
                 desired.is_some_and(|task| task.wanted == Wanted::Running && task.package == *package)
             }
+            Self::PullContent { package, is_pushed } => desired.is_some_and(|task| {
+                let is_same = task.package == *package && task.delivery.is_pushed() == *is_pushed;
+                task.wanted == Wanted::Running && is_same
+            }),
             Self::Collect(_) => desired.is_some(),
             Self::Start(_) | Self::Stop(_) | Self::Prune { .. } | Self::Remove => true,
         }
@@ -203,6 +209,13 @@ pub const MAX_RESTARTS_IN_A_ROW: u32 = 100;
 
 /// When to look again at a process of which nothing could be told.
 const LOOK_AGAIN_MS: u64 = 5000;
+
+/// Tasks in the order in which they get what not all can have at once: those of higher priority first, then by name.
+pub fn in_turn(mut tasks: Vec<(TaskName, i32)>) -> Vec<TaskName> {
+    tasks.sort_by(|(name, priority), (other, other_priority)| other_priority.cmp(priority).then(name.cmp(other)));
+    tasks.dedup_by(|(name, _), (other, _)| name == other);
+    tasks.into_iter().map(|(name, _)| name).collect()
+}
 
 /// The next step about the active run: start, restart, stop, replace, remove.
 pub fn supervise(s: &Situation<'_>) -> Next {
@@ -259,7 +272,8 @@ pub fn prepare(s: &Situation<'_>) -> Next {
         return record(transition::prepared_to(s, Phase::Unmet, Some(failure)));
     }
     if !s.prepared.content {
-        return Next::Act(Step::PullContent(order.package.clone()));
+        let is_pushed = order.delivery.is_pushed();
+        return Next::Act(Step::PullContent { package: order.package.clone(), is_pushed });
     }
     if !s.prepared.built {
         return Next::Act(Step::Build(order.package.clone()));
@@ -359,7 +373,8 @@ pub fn describe(task: &TaskName, step: &Step) -> String {
     match step {
         Step::PullManifest(package) => format!("pull the manifest of {task} {}", package.version),
         Step::LookForRos(package) => format!("look for the ROS that {task} {} needs", package.version),
-        Step::PullContent(package) => format!("pull {task} {}", package.version),
+        Step::PullContent { package, is_pushed: false } => format!("pull {task} {}", package.version),
+        Step::PullContent { package, is_pushed: true } => format!("gather {task} {}", package.version),
         Step::Build(package) => format!("build {task} {}", package.version),
         Step::Ask(question) => format!("ask the gate about {task} {}", question.version),
         Step::Start(run) => format!("start {task} {} (run {})", run.package.version, run.run),

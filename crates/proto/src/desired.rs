@@ -116,6 +116,11 @@ impl Delivery {
             Self::PushPull => "push-pull",
         }
     }
+
+    /// Whether the content comes as parts over MQTT.
+    pub fn is_pushed(self) -> bool {
+        self == Self::DirectPush
+    }
 }
 
 impl fmt::Display for Delivery {

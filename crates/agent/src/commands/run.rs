@@ -71,11 +71,12 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
     };
     let client = server::client().context("cannot make an HTTP client")?;
     let credential = Credential::from(identity.token.clone());
-    let fetcher = Fetcher::new(client.clone(), base.clone(), credential.clone(), data.clone(), fetch_settings(&config));
-    let registry = Registry::new(client.clone(), base.clone(), credential.clone());
-    let robot = Arc::new(Robot::new(data.clone(), fetcher, registry, &config, &identity.robot_id, identity.mac));
     let shutdown = CancellationToken::new();
     let shared = Shared::new(shutdown.clone());
+    let fetcher = Fetcher::new(client.clone(), base.clone(), credential.clone(), data.clone(), fetch_settings(&config));
+    let fetcher = (fetcher.measured_by(shared.meter.clone()), shared.listening.clone());
+    let registry = Registry::new(client.clone(), base.clone(), credential.clone());
+    let robot = Arc::new(Robot::new(data.clone(), fetcher, registry, &config, &identity.robot_id, identity.mac));
     let instance = InstanceId::random();
     let speaker = Speaker {
         robot_id: identity.robot_id.clone(),
@@ -106,8 +107,12 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
     if config.mqtt {
         let host = identity.mqtt.host.clone().or_else(|| base.host_str().map(str::to_owned)).unwrap_or_default();
         let (port, prefix) = (identity.mqtt.port, identity.mqtt.prefix.clone());
-        let access = MqttAccess { host, port, prefix, robot: identity.robot_id, token: credential, status };
+        let (robot_id, message_bytes) = (identity.robot_id, mqtt::MESSAGE_BYTES);
+        let access = MqttAccess { host, port, prefix, robot: robot_id, token: credential, status, message_bytes };
         converse(access, shared, heard, data, &config, robot);
+    } else {
+        // Nobody is to wait for parts.
+        shared.listening.session(false);
     }
     let stop = tokio::spawn(cancel_on_signal(shutdown));
     driver.run(messages).await;

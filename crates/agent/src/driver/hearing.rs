@@ -1,6 +1,8 @@
 //! What the driver makes of what it hears from the server: desired states, confirmations, refusals.
 
+use bytes::Bytes;
 use task_proto::api::ReportReply;
+use task_proto::desired::Inline;
 use task_proto::envelope::Envelope;
 use task_proto::id::Labels;
 use task_proto::report::Condition;
@@ -14,9 +16,9 @@ use crate::link::Heard;
 impl<E: Effects> Driver<E> {
     pub(super) fn hear(&mut self, message: Heard) {
         match message {
-            Heard::Desired(envelope) => {
+            Heard::Desired { envelope, inline } => {
                 self.known_by_server();
-                self.consider(*envelope);
+                self.consider(*envelope, &inline);
             }
             Heard::Unchanged => self.known_by_server(),
             Heard::Confirmed { reply, .. } => {
@@ -45,12 +47,17 @@ impl<E: Effects> Driver<E> {
     }
 
     /// Accepts a desired state or says why not.
-    fn consider(&mut self, envelope: Envelope) {
+    fn consider(&mut self, envelope: Envelope, inline: &Inline) {
         let Speaker { server_key, robot_id, .. } = &self.speaker;
         let wall_ms = self.effects.now().wall_ms;
         match admission::admit(&envelope, server_key, robot_id, self.desired.as_ref(), wall_ms) {
             Ok(state) => {
                 self.conditions.remove("state_refused");
+                if !inline.is_empty() {
+                    let blobs = state.tasks.iter().flat_map(|task| [task.package.config, task.package.content]);
+                    let came = blobs.filter_map(|blob| Some((blob, Bytes::copy_from_slice(inline.get(&blob)?))));
+                    self.effects.offer(came.collect());
+                }
                 if self.desired.as_ref() != Some(&state) {
                     tracing::info!(generation = %state.generation, tasks = state.tasks.len(), "accepted a desired state");
                     self.ledger.accepted = Some(Accepted { generation: state.generation, envelope });

@@ -4,20 +4,26 @@ use std::sync::Arc;
 
 use task_proto::report::{ActiveVersion, Condition, Failure, FailureCode, Phase, Report, TaskReport};
 use task_proto::{Generation, TaskName};
+use tokio::time::Instant;
 
 use super::{Driver, View};
 use crate::admission;
 use crate::effects::Effects;
 use crate::ledger::{LostFiles, TaskRecord};
+use crate::link_meter;
 use crate::observed::{Health, ProcessState};
 use crate::plan::Lane;
+
+/// A battery that has lost less is no news.
+const BATTERY_STEP_PERCENT: u8 = 5;
 
 impl<E: Effects> Driver<E> {
     /// Publishes a snapshot, if it says anything that the last one did not.
     pub(super) fn publish_report(&mut self) {
         let report = self.report();
+        let again = std::mem::take(&mut self.asks_again);
         let news = self.shared.reports.borrow().as_ref().is_none_or(|last| !says_the_same(last, &report));
-        if news {
+        if news || again {
             self.seq = report.seq;
             self.shared.reports.send_replace(Some(Arc::new(report)));
         }
@@ -38,7 +44,7 @@ impl<E: Effects> Driver<E> {
             uptime_ms: u64::try_from(self.started.elapsed().as_millis()).unwrap_or(u64::MAX),
             host: self.effects.host_facts(),
             conditions: self.all_conditions(),
-            link: None,
+            link: self.shared.meter.facts(Instant::now()),
             tasks: tasks.map(|(task, record)| task_report(task, record, self.views.get(task), now_ms)).collect(),
         }
     }
@@ -79,10 +85,14 @@ fn says_the_same(last: &Report, next: &Report) -> bool {
     let without_times = |report: &Report| {
         let mut report = report.clone();
         (report.seq, report.uptime_ms, report.host.disk_free_bytes) = (0, 0, 0);
+        (report.host.battery_percent, report.link) = (None, None);
         report.tasks.iter_mut().for_each(|task| task.phase_ms = 0);
         report
     };
+    let battery = |report: &Report| report.host.battery_percent.map(|percent| percent / BATTERY_STEP_PERCENT);
     without_times(last) == without_times(next)
+        && battery(last) == battery(next)
+        && !link_meter::is_news(last.link.as_ref(), next.link.as_ref())
 }
 
 /// Why the run that is kept alive is not as it should be: something is missing that it once had, or the robot does not
@@ -124,7 +134,7 @@ fn task_report(task: &TaskName, record: &TaskRecord, view: Option<&View>, now_ms
         phase: if unpacking { Phase::Unpacking } else { phase },
         phase_ms: now_ms.saturating_sub(record.phase_since_ms),
         progress: progress.filter(|_| !unpacking),
-        missing_parts: None,
+        missing_parts: view.and_then(|view| view.asked.as_ref()?.borrow().missing.clone()),
         attempts: record.preparation.attempts,
         restarts: for_order.map_or(0, |active| active.restarts),
         failure: failure.cloned(),

@@ -5,14 +5,15 @@ use std::time::Duration;
 
 use task_proto::TaskName;
 use task_proto::report::{Failure, FailureCode, Progress};
-use tokio::sync::watch;
+use tokio::sync::{Notify, watch};
 use tokio::task::Id;
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
 use super::{Driver, Outcome, UnderWay};
 use crate::effects::Effects;
-use crate::plan::{self, Lane, Step, StepFailure};
+use crate::fetch::Asks;
+use crate::plan::{self, Done, Lane, Step, StepFailure};
 
 /// How long an interrupted step may take to end by itself.
 const INTERRUPT_GRACE: Duration = Duration::from_secs(5);
@@ -22,25 +23,38 @@ impl<E: Effects> Driver<E> {
         tracing::info!("{}", plan::describe(&task, &step));
         let cancel = CancellationToken::new();
         let (progress, transfer) = watch::channel(Progress { done: 0, total: 0 });
-        if matches!(step, Step::PullContent(_) | Step::Collect(_)) {
-            self.views.entry(task.clone()).or_default().transfers.insert(step.lane(), transfer);
+        let (asks, asked) = watch::channel(Asks::default());
+        let view = self.views.entry(task.clone()).or_default();
+        if matches!(step, Step::PullContent { .. } | Step::Collect(_)) {
+            view.transfers.insert(step.lane(), transfer);
         }
+        view.asked = matches!(step, Step::PullContent { is_pushed: true, .. }).then(|| asked.clone());
         let running = self.ledger.tasks.get(&task).and_then(|record| record.active.as_ref()?.process.clone());
-        let (effects, lane) = (self.effects.clone(), step.lane());
+        let (effects, lane, news) = (self.effects.clone(), step.lane(), self.asks.clone());
         let (name, doing, stop) = (task.clone(), step.clone(), cancel.clone());
         let handle = self.steps.spawn(async move {
-            let done = |()| None;
+            let done = |()| Done::Well;
             let work = async {
                 match &doing {
-                    Step::PullManifest(package) => effects.pull_manifest(package, &stop).await.map(done),
+                    Step::PullManifest(package) => effects.pull_manifest(package, &stop).await,
                     Step::LookForRos(_) => {
                         effects.look_for_ros().await;
-                        Ok(None)
+                        Ok(Done::Well)
                     }
-                    Step::PullContent(package) => effects.pull_content(package, &progress, &stop).await.map(done),
+                    Step::PullContent { package, is_pushed: false } => {
+                        effects.pull_content(package, &progress, &stop).await
+                    }
+                    Step::PullContent { package, is_pushed: true } => {
+                        let gathering = effects.gather_content(package, &progress, &asks, &stop);
+                        // Cancel-safe: what is dropped only notices changes.
+                        tokio::select! {
+                            done = gathering => done,
+                            () = notify(asked, &news) => unreachable!("it lasts as long as who asks"),
+                        }
+                    }
                     Step::Build(package) => effects.build(package, &stop).await.map(done),
                     Step::Ask(question) => effects.ask_gate(&name, question).await.map(done),
-                    Step::Start(run) => effects.start(&name, run).await.map(Some),
+                    Step::Start(run) => effects.start(&name, run).await.map(Done::Started),
                     Step::Stop(run) => effects.stop(&name, run).await.map(done),
                     Step::Collect(files) => effects.collect(&name, files, &progress, &stop).await.map(done),
                     Step::Prune { kept } => effects.prune(&name, kept, running.as_ref()).await.map(done),
@@ -95,8 +109,15 @@ impl<E: Effects> Driver<E> {
         let Some((task, lane)) = found else { return };
         let Some(under_way) = self.under_way.remove(&(task.clone(), lane)) else { return };
         let view = self.views.entry(task.clone()).or_default();
-        view.transfers.remove(&lane);
-        view.progress.remove(&lane);
+        if lane == Lane::Prepare {
+            view.asked = None;
+        }
+        let transfer = view.transfers.remove(&lane).map(|transfer| *transfer.borrow());
+        match transfer.filter(|_| matches!(outcome, Ok(Done::ToldToWait { .. }))) {
+            // What was gathered stays, and is shown while the robot waits for its turn.
+            Some(progress) if progress.total > 0 => view.progress.insert(lane, progress),
+            _ => view.progress.remove(&lane),
+        };
         if under_way.cancel.is_cancelled() {
             view.prepared = None;
             // It may have gathered more after its order was taken back.
@@ -135,6 +156,14 @@ impl<E: Effects> Driver<E> {
         }
         self.put(task, record);
     }
+}
+
+/// Passes on that something is to be said.
+async fn notify(mut asked: watch::Receiver<Asks>, news: &Notify) {
+    while asked.changed().await.is_ok() {
+        news.notify_one();
+    }
+    std::future::pending().await
 }
 
 /// A step that did not end in time. It is tried again: nothing is known of how far it came.

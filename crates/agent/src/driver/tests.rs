@@ -3,8 +3,9 @@
 mod fake;
 
 use task_proto::api::ReportReply;
-use task_proto::desired::{BlobRef, Delivery, PackageRef, Wanted};
+use task_proto::desired::{BlobRef, Delivery, Inline, PackageRef, Wanted};
 use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
+use task_proto::part::PartRange;
 use task_proto::report::{Failure, FailureCode, Phase, Report};
 use task_proto::{DeploymentId, Digest, Generation};
 
@@ -75,7 +76,8 @@ impl Bench {
             tasks,
         };
         let payload = serde_json::to_vec(&state).expect("json");
-        Heard::Desired(Box::new(Envelope::seal(DESIRED_STATE_TYPE, &payload, key)))
+        let envelope = Box::new(Envelope::seal(DESIRED_STATE_TYPE, &payload, key));
+        Heard::Desired { envelope, inline: Inline::default() }
     }
 
     async fn order(&self, generation: u64, tasks: Vec<DesiredTask>) {
@@ -368,4 +370,91 @@ async fn the_servers_name_wins_and_the_difference_is_said() {
     bench.report(|report| has(report, "settings_differ")).await;
     bench.say(Heard::Confirmed { seq: 2, reply: Some(reply("atlas")) }).await;
     bench.report(|report| !has(report, "settings_differ")).await;
+}
+
+#[tokio::test]
+async fn a_robot_that_is_told_to_wait_stays_fetching_without_a_failure() {
+    let bench = Bench::new().await;
+    bench.fake.state(|state| state.told_to_wait = vec![1, 3_600_000]);
+    bench.order(1, vec![order("1.0")]).await;
+    let waits = |report: &Report| report.tasks.first().is_some_and(|task| task.progress.is_some());
+    let report = bench.report(waits).await;
+    let task = &report.tasks[0];
+    assert_eq!((task.phase, task.attempts, &task.failure), (Phase::Fetching, 1, &None));
+    assert_eq!(task.progress, Some(Progress { done: 1, total: 2 }));
+    // It waits in its record, so that a new agent of this boot waits on, and another order need not.
+    let ledger = bench.fake.state(|state| state.ledgers.last().cloned()).expect("a ledger");
+    let preparation = &ledger.tasks.values().next().expect("a task").preparation;
+    assert!(preparation.retry_at_ms > bench.fake.now().boot_ms + 3_000_000 && preparation.failure.is_none());
+    bench.order(2, vec![order("1.1")]).await;
+    bench.phase(Phase::Running).await;
+    assert_eq!(*bench.fake.pulls.borrow(), 2);
+}
+
+#[tokio::test]
+async fn what_came_with_an_order_is_offered_if_the_order_is_accepted_and_names_it() {
+    let bench = Bench::new().await;
+    let blob = |bytes: &[u8]| BlobRef { digest: Digest::of(bytes), size: bytes.len() as u64 };
+    let mut order = order("1.0");
+    (order.package.config, order.package.content) = (blob(b"config"), blob(b"content"));
+    let mut came = Inline::default();
+    came.insert(Digest::of(b"config"), b"config".to_vec());
+    came.insert(Digest::of(b"content"), b"others".to_vec());
+    came.insert(Digest::of(b"not asked for"), b"not asked for".to_vec());
+    let rung = |heard: Heard| match heard {
+        Heard::Desired { envelope, .. } => Heard::Desired { envelope, inline: came.clone() },
+        other => other,
+    };
+    bench.say(rung(bench.sealed(1, vec![order.clone()], &SigningKey::random()))).await;
+    bench.report(|report| has(report, "state_refused")).await;
+    assert!(bench.fake.state(|state| state.offered.is_empty()));
+    bench.say(rung(bench.sealed(1, vec![order.clone()], &bench.key))).await;
+    bench.phase(Phase::Running).await;
+    let offered = bench.fake.state(|state| state.offered.clone());
+    assert_eq!(offered, [(order.package.config, bytes::Bytes::from_static(b"config"))]);
+}
+
+#[tokio::test]
+async fn parts_that_are_lacking_are_reported_each_time_they_are_asked_for() {
+    let bench = Bench::new().await;
+    let pushed = DesiredTask { delivery: Delivery::DirectPush, ..order("1.0") };
+    bench.order(1, vec![pushed.clone()]).await;
+    bench.phase(Phase::Fetching).await;
+    let says = |missing: Option<Vec<PartRange>>, times| bench.fake.asks.send_replace(Asks { missing, times });
+    let missing = |report: &Report| report.tasks[0].missing_parts.clone();
+    says(Some(Vec::new()), 1);
+    let first = bench.report(|report| missing(report) == Some(Vec::new())).await;
+    let ranges = vec![PartRange { from: 3, to: 5 }];
+    says(Some(ranges.clone()), 2);
+    let second = bench.report(|report| missing(report).as_ref() == Some(&ranges)).await;
+    says(Some(ranges.clone()), 3);
+    let third = bench.report(|report| report.seq > second.seq && missing(report).as_ref() == Some(&ranges)).await;
+    assert!(first.seq < second.seq && second.seq < third.seq);
+    // The server says that it should pull instead: what it gathers by is ended, and it pulls.
+    bench.order(2, vec![DesiredTask { delivery: Delivery::PushPull, ..pushed }]).await;
+    let report = bench.phase(Phase::Running).await;
+    assert_eq!(missing(&report), None);
+    assert_eq!(bench.fake.state(|state| state.pulled.len()), 1);
+}
+
+#[tokio::test]
+async fn tasks_of_higher_priority_are_prepared_first() {
+    let bench = Bench::new().await;
+    let named = |name: &str, priority| {
+        let mut order = order("1.0");
+        order.task = name.parse().expect("valid");
+        order.package.name = order.task.clone();
+        order.package.manifest.digest = Digest::of(name.as_bytes());
+        DesiredTask { priority, ..order }
+    };
+    // Two at a time are prepared; these wait on a person, so that only the order of the pulls is seen.
+    bench.fake.state(|state| state.held = true);
+    let tasks = [("a", -5), ("b", 0), ("c", 7), ("d", 100), ("e", 0), ("f", 7)];
+    bench.order(1, tasks.map(|(name, priority)| named(name, priority)).into()).await;
+    let all_wait = |report: &Report| report.tasks.iter().filter(|task| task.phase == Phase::Deferred).count() == 6;
+    bench.report(all_wait).await;
+    let begun = bench.fake.state(|state| state.pulled.clone());
+    let place = |name: &str| begun.iter().position(|task| task.as_str() == name).expect("pulled") / 2;
+    let places = ["d", "c", "f", "b", "e", "a"].map(place);
+    assert_eq!(places, [0, 0, 1, 1, 2, 2], "{begun:?}");
 }

@@ -7,26 +7,29 @@ use std::path::{Path, PathBuf};
 use std::sync::{PoisonError, RwLock};
 use std::time::Duration;
 
-use task_proto::desired::PackageRef;
+use bytes::Bytes;
+use task_proto::desired::{BlobRef, PackageRef};
 use task_proto::manifest::{BuildTool, TaskManifest};
 use task_proto::report::{Failure, FailureCode, HostFacts, Isolation, Progress, RosFacts};
 use task_proto::{Digest, MacAddress, RobotId, TaskName};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
+use self::outcomes::{fetch_failure, finally, later, millis, outputs_code, pulled};
 use super::{Effects, Now};
 use crate::builder::{self, BuildError, BuildLimits, BuildOrder};
 use crate::cgroup::{Cgroups, RunLimits};
 use crate::config::Config;
-use crate::fetch::{self, FetchError, Fetcher};
+use crate::fetch::{self, Asks, Fetcher};
 use crate::gate::Gate;
 use crate::graph_access::GraphAccess;
 use crate::installation::Installation;
 use crate::layout::{DataDir, VersionDir};
 use crate::ledger::{ActiveRun, Collection, GateQuestion, Ledger, LedgerError, ProcessRecord};
 use crate::observed::{Exit, Health, Prepared, ProcessState, RobotFacts};
-use crate::outputs::{self, OutputError, OutputOrder, Registry};
-use crate::plan::StepFailure;
+use crate::outputs::{self, OutputOrder, Registry};
+use crate::parts::Listening;
+use crate::plan::{Done, StepFailure};
 use crate::process::ExitStatus;
 use crate::readiness::Promise;
 use crate::run_dir::{LogSpec, RunSpec};
@@ -34,9 +37,10 @@ use crate::supervisor::{Observed, Supervisor, SupervisorError};
 use crate::task_user::{TaskUser, TaskUserError};
 use crate::underlay::{self, Places};
 use crate::watcher::{Watched, Watcher};
-use crate::{clock, disk, durable, environment, installation, launch, logs, script, survey};
+use crate::{battery, clock, disk, durable, environment, installation, launch, logs, script, survey};
 
 mod graph;
+mod outcomes;
 
 /// Written into a version's directory once it is built.
 const BUILT_MARKER: &str = "built";
@@ -53,6 +57,7 @@ const TAIL_BYTES: u64 = 3072;
 pub struct Robot {
     data: DataDir,
     fetcher: Fetcher,
+    listening: Listening,
     gate: Option<Gate>,
     registry: Registry,
     robot: RobotId,
@@ -77,7 +82,7 @@ impl Robot {
     /// The robot whose data is in `data`.
     pub fn new(
         data: DataDir,
-        fetcher: Fetcher,
+        (fetcher, listening): (Fetcher, Listening),
         registry: Registry,
         config: &Config,
         robot: &RobotId,
@@ -102,6 +107,7 @@ impl Robot {
         Self {
             data,
             fetcher,
+            listening,
             gate,
             registry,
             robot: robot.clone(),
@@ -191,7 +197,7 @@ impl Robot {
         match disk::room(self.data.root()) {
             Ok(room) if room.is_used_up() => {
                 let text = format!("{} of {} bytes are free; {}", room.free, room.total, chain(&error));
-                let least_ms = u64::try_from(disk::FULL_PAUSE.as_millis()).unwrap_or(u64::MAX);
+                let least_ms = millis(disk::FULL_PAUSE);
                 StepFailure { failure: Failure::new(FailureCode::DISK_FULL, text), retry_after_ms: Some(least_ms) }
             }
             _ => finally(code, &error),
@@ -244,7 +250,7 @@ impl Effects for Robot {
             ros_distros: installation::all_distros(&installations),
             disk_free_bytes: disk::room(self.data.root()).map_or(0, |room| room.free),
             ros: environment::ros_facts(&installations, &self.environment),
-            battery_percent: None,
+            battery_percent: battery::percent(Path::new(battery::SUPPLIES)),
             isolation: if isolates { Isolation::Cgroup } else { Isolation::None },
         }
     }
@@ -327,8 +333,12 @@ impl Effects for Robot {
         }
     }
 
-    async fn pull_manifest(&self, package: &PackageRef, cancel: &CancellationToken) -> Result<(), StepFailure> {
-        self.fetcher.manifest(package, cancel).await.map(drop).map_err(fetch_failure)
+    async fn pull_manifest(&self, package: &PackageRef, cancel: &CancellationToken) -> Result<Done, StepFailure> {
+        pulled(self.fetcher.manifest(package, cancel).await.map(drop))
+    }
+
+    fn offer(&self, blobs: Vec<(BlobRef, Bytes)>) {
+        self.fetcher.offer(blobs);
     }
 
     async fn pull_content(
@@ -336,9 +346,27 @@ impl Effects for Robot {
         package: &PackageRef,
         progress: &watch::Sender<Progress>,
         cancel: &CancellationToken,
-    ) -> Result<(), StepFailure> {
-        let manifest = self.manifest(package).await?;
-        self.fetcher.content(package, &manifest, progress, cancel).await.map_err(fetch_failure)
+    ) -> Result<Done, StepFailure> {
+        let manifest = match self.fetcher.manifest(package, cancel).await {
+            Ok(manifest) => manifest,
+            Err(error) => return pulled(Err(error)),
+        };
+        pulled(self.fetcher.content(package, &manifest, progress, cancel).await)
+    }
+
+    async fn gather_content(
+        &self,
+        package: &PackageRef,
+        progress: &watch::Sender<Progress>,
+        asks: &watch::Sender<Asks>,
+        cancel: &CancellationToken,
+    ) -> Result<Done, StepFailure> {
+        let manifest = match self.fetcher.manifest(package, cancel).await {
+            Ok(manifest) => manifest,
+            Err(error) => return pulled(Err(error)),
+        };
+        let told = (progress, asks);
+        pulled(self.fetcher.pushed_content(package, &manifest, &self.listening, told, cancel).await)
     }
 
     async fn build(&self, package: &PackageRef, cancel: &CancellationToken) -> Result<(), StepFailure> {
@@ -447,7 +475,7 @@ impl Effects for Robot {
                 Ok(())
             }
             Err(error) => Err(StepFailure {
-                retry_after_ms: error.retry_after().map(|wait| u64::try_from(wait.as_millis()).unwrap_or(u64::MAX)),
+                retry_after_ms: error.retry_after().map(millis),
                 failure: Failure::new(outputs_code(&error), chain(&error)),
             }),
         }
@@ -493,35 +521,6 @@ fn other_runs(runs: &Path, kept: Option<&Path>) -> Vec<PathBuf> {
 async fn on_disk(work: impl FnOnce() -> std::io::Result<()> + Send + 'static) -> Result<(), StepFailure> {
     let done = tokio::task::spawn_blocking(work).await.map_err(std::io::Error::other);
     done.flatten().map_err(|error| later(FailureCode::IO_ERROR, &error, 0))
-}
-
-fn fetch_failure(error: FetchError) -> StepFailure {
-    // A cancelled pull is no failure: the driver lets go of its outcome.
-    let code = error.code().unwrap_or(FailureCode::INTERRUPTED);
-    if error.is_retryable() || matches!(error, FetchError::Cancelled) {
-        let least_ms = error.retry_after().map_or(0, |wait| u64::try_from(wait.as_millis()).unwrap_or(u64::MAX));
-        return later(code, &error, least_ms);
-    }
-    finally(code, &error)
-}
-
-fn outputs_code(error: &OutputError) -> FailureCode {
-    match error {
-        OutputError::Unreachable(_) | OutputError::Busy { .. } => FailureCode::SERVER_UNREACHABLE,
-        OutputError::Read { .. } | OutputError::User(_) | OutputError::Note { .. } => FailureCode::IO_ERROR,
-        OutputError::Cancelled => FailureCode::INTERRUPTED,
-        OutputError::Pattern { .. } | OutputError::TooMuch(_) | OutputError::Refused { .. } => {
-            FailureCode::OUTPUTS_LOST
-        }
-    }
-}
-
-fn finally(code: FailureCode, error: &dyn Error) -> StepFailure {
-    StepFailure { failure: Failure::new(code, chain(error)), retry_after_ms: None }
-}
-
-fn later(code: FailureCode, error: &dyn Error, least_ms: u64) -> StepFailure {
-    StepFailure { failure: Failure::new(code, chain(error)), retry_after_ms: Some(least_ms) }
 }
 
 /// An error with all its causes.

@@ -38,6 +38,7 @@ pub(super) struct Download {
     /// is not the server's fault.
     waited: Duration,
     progressed: u64,
+    asked_at: Instant,
 }
 
 impl Download {
@@ -53,6 +54,7 @@ impl Download {
         if offset > 0 {
             request = request.header(RANGE, format!("bytes={offset}-"));
         }
+        let asked_at = Instant::now();
         let answer = tokio::time::timeout(stall_timeout, request.send()).await;
         let response = answer.map_err(|_| FetchError::Stalled(stall_timeout))?.map_err(FetchError::Unreachable)?;
         let skip = judge(&response, package, blob, offset)?;
@@ -64,12 +66,18 @@ impl Download {
             stall_timeout,
             waited: Duration::ZERO,
             progressed: 0,
+            asked_at,
         })
     }
 
     /// Where the next byte lies in the blob.
     pub(super) fn position(&self) -> u64 {
         self.position
+    }
+
+    /// When it was asked for.
+    pub(super) fn asked_at(&self) -> Instant {
+        self.asked_at
     }
 
     /// Sends all that comes to `sender`, until the whole blob has passed or nobody takes it any more.

@@ -16,7 +16,7 @@ use tokio::sync::{OwnedMutexGuard, mpsc, watch};
 use tokio_util::sync::CancellationToken;
 
 use super::{FetchError, Fetcher};
-use crate::disk::{self, Need};
+use crate::disk::Need;
 use crate::durable;
 use crate::unpack::{self, Limits, UnpackError};
 
@@ -73,16 +73,7 @@ impl Intake {
         if let Err(error) = cleaned.and_then(|()| durable::remove_dir_all(&staging)) {
             tracing::warn!(%error, part = %part.display(), "what a pull left can't be removed");
         }
-        match result {
-            Err(FetchError::Disk { source, .. })
-                if matches!(source.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded) =>
-            {
-                let parent = part.parent().unwrap_or(&part);
-                let room = disk::room(parent).map_err(|source| FetchError::disk(parent, source))?;
-                Err(disk::DiskFull { free: room.free, total: room.total, need }.into())
-            }
-            other => other,
-        }
+        result.map_err(|error| error.for_want_of_room(part.parent().unwrap_or(&part), need))
     }
 
     fn unpack(self, facts: &ContentFacts) -> Result<(), FetchError> {

@@ -11,6 +11,20 @@ use crate::ledger::{
 };
 use crate::observed::Exit;
 
+/// How a step ended that did not fail.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Done {
+    /// All of it was done.
+    Well,
+    /// A start: the process id.
+    Started(u32),
+    /// The server told this robot to come back later. That is no failure and no try.
+    ToldToWait {
+        /// Not before so many milliseconds.
+        at_least_ms: u64,
+    },
+}
+
 /// A step that did not succeed.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StepFailure {
@@ -24,6 +38,8 @@ pub struct StepFailure {
 const BACKOFF_BASE_MS: u64 = 1000;
 /// The longest wait before a step is tried again.
 const MAX_STEP_BACKOFF_MS: u64 = 5 * 60 * 1000;
+/// What a wait that the server asked for is lengthened by at most.
+const MAX_WAIT_JITTER_MS: u64 = 30 * 1000;
 /// The longest wait before the robot's gate is asked again.
 const MAX_GATE_BACKOFF_MS: u64 = 60 * 1000;
 /// The longest wait before a process is started again.
@@ -53,7 +69,7 @@ pub fn adopted(record: &TaskRecord, order: &DesiredTask, now_ms: u64) -> TaskRec
 pub fn begun(record: &TaskRecord, step: &Step, boot_id: &str, start: u64, now_ms: u64) -> TaskRecord {
     let mut record = record.clone();
     let phase = match step {
-        Step::PullManifest(_) | Step::LookForRos(_) | Step::PullContent(_) => Some(Phase::Fetching),
+        Step::PullManifest(_) | Step::LookForRos(_) | Step::PullContent { .. } => Some(Phase::Fetching),
         Step::Build(_) => Some(Phase::Building),
         Step::Ask(_) | Step::Start(_) | Step::Stop(_) | Step::Collect(_) | Step::Prune { .. } | Step::Remove => None,
     };
@@ -93,22 +109,27 @@ pub fn begun(record: &TaskRecord, step: &Step, boot_id: &str, start: u64, now_ms
     record
 }
 
-/// The record after `step`, which gave `outcome`: for a start the process id, else nothing.
-pub fn finished(s: &Situation<'_>, step: &Step, outcome: Result<Option<u32>, StepFailure>) -> TaskRecord {
+/// The record after `step`, which gave `outcome`.
+pub fn finished(s: &Situation<'_>, step: &Step, outcome: Result<Done, StepFailure>) -> TaskRecord {
     let mut record = s.record.clone();
     match (step, outcome) {
         (
-            Step::PullManifest(package) | Step::LookForRos(package) | Step::PullContent(package) | Step::Build(package),
+            Step::PullManifest(package)
+            | Step::LookForRos(package)
+            | Step::PullContent { package, .. }
+            | Step::Build(package),
             outcome,
         ) => {
             // The step of an order that was replaced meanwhile says nothing about the new one.
             if record.order.package == *package {
-                prepared(&mut record.preparation, s, outcome.err());
+                prepared(&mut record.preparation, s, outcome);
             }
         }
-        (Step::Start(_), Ok(pid)) => {
+        (Step::Start(_), Ok(done)) => {
             if let Some(process) = record.active.as_mut().and_then(|active| active.process.as_mut()) {
-                process.pid = pid;
+                if let Done::Started(pid) = done {
+                    process.pid = Some(pid);
+                }
                 process.started_ms = s.now_ms;
             }
         }
@@ -174,22 +195,33 @@ fn answered(gate: &mut GateRecord, s: &Situation<'_>, refusal: Option<StepFailur
     });
 }
 
-fn prepared(preparation: &mut Preparation, s: &Situation<'_>, error: Option<StepFailure>) {
+fn prepared(preparation: &mut Preparation, s: &Situation<'_>, outcome: Result<Done, StepFailure>) {
     preparation.kind = s.prepared.manifest.as_ref().map(|manifest| manifest.run.kind);
     preparation.retry_at_ms = 0;
-    match error {
-        None => preparation.failure = None,
-        Some(StepFailure { failure, retry_after_ms: None }) => {
+    match outcome {
+        Ok(Done::ToldToWait { at_least_ms }) => {
+            // Only the end of the order bounds how often: the server knows when it has room.
+            preparation.failure = None;
+            preparation.retry_at_ms = s.now_ms + at_least_ms + wait_jitter_ms(at_least_ms, s.jitter);
+        }
+        Ok(_) => preparation.failure = None,
+        Err(StepFailure { failure, retry_after_ms: None }) => {
             preparation.failure = Some(failure);
             preparation.phase = Phase::Failed;
         }
-        Some(StepFailure { failure, retry_after_ms: Some(least_ms) }) => {
+        Err(StepFailure { failure, retry_after_ms: Some(least_ms) }) => {
             preparation.failure = Some(failure);
             // Retries go on until the order ends: the server lets it expire.
             let wait_ms = backoff_ms(preparation.attempts, MAX_STEP_BACKOFF_MS, s.jitter).max(least_ms);
             preparation.retry_at_ms = s.now_ms + wait_ms;
         }
     }
+}
+
+/// What is added to a wait of `least_ms`, so that robots that were told the same do not all come back at once.
+fn wait_jitter_ms(least_ms: u64, jitter: f64) -> u64 {
+    let most_ms = (least_ms / 4).clamp(BACKOFF_BASE_MS, MAX_WAIT_JITTER_MS);
+    (most_ms as f64 * jitter.clamp(0.0, 1.0)) as u64
 }
 
 /// The record with the preparation at `phase`.

@@ -13,6 +13,7 @@ use axum::routing::get;
 use futures_util::{StreamExt, stream};
 use task_agent::fetch::{FetchError, FetchSettings, Fetcher};
 use task_agent::layout::{DataDir, VersionDir};
+use task_agent::link_meter::LinkMeter;
 use task_proto::Digest;
 use task_proto::desired::{BlobRef, PackageRef};
 use task_proto::manifest::{ContentFacts, TaskManifest};
@@ -27,7 +28,7 @@ const TOKEN: &str = "the robot's token";
 
 /// How the server answers one request for a blob.
 #[derive(Debug, Clone)]
-enum Answer {
+pub enum Answer {
     /// As it should.
     Well,
     /// As it should, but the connection breaks after so many bytes.
@@ -62,22 +63,23 @@ struct Script {
 }
 
 /// A server, a data directory and a package.
-struct Site {
+pub struct Site {
     script: Arc<Mutex<Script>>,
-    fetcher: Fetcher,
-    data: DataDir,
-    package: PackageRef,
-    manifest: TaskManifest,
-    content: Vec<u8>,
+    pub fetcher: Fetcher,
+    pub data: DataDir,
+    pub package: PackageRef,
+    pub manifest: TaskManifest,
+    pub content: Vec<u8>,
+    server: reqwest::Url,
     _dir: tempfile::TempDir,
 }
 
 impl Site {
-    async fn new(tar: &Tar) -> Self {
+    pub async fn new(tar: &Tar) -> Self {
         Self::with(tar, settings()).await
     }
 
-    async fn with(tar: &Tar, settings: FetchSettings) -> Self {
+    pub async fn with(tar: &Tar, settings: FetchSettings) -> Self {
         let content = tar.compressed();
         let manifest = manifest(tar.facts());
         let config = serde_json::to_vec(&manifest).unwrap();
@@ -92,19 +94,24 @@ impl Site {
         let script = Arc::new(Mutex::new(Script { blobs: vec![content.clone(), config], ..Script::default() }));
         let router = Router::new().route("/v2/{name}/blobs/{digest}", get(answer)).with_state(script.clone());
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
-        let server = format!("http://{}/", listener.local_addr().unwrap()).parse().unwrap();
+        let server: reqwest::Url = format!("http://{}/", listener.local_addr().unwrap()).parse().unwrap();
         tokio::spawn(async move { axum::serve(listener, router).await });
         let dir = tempfile::tempdir().unwrap();
         let data = DataDir::new(dir.path()).unwrap();
-        let fetcher = Fetcher::new(client(), server, TOKEN.to_owned(), data.clone(), settings);
-        Self { script, fetcher, data, package, manifest, content, _dir: dir }
+        let fetcher = Fetcher::new(client(), server.clone(), TOKEN.to_owned(), data.clone(), settings);
+        Self { script, fetcher, data, package, manifest, content, server, _dir: dir }
     }
 
-    fn answers(&self, answers: impl IntoIterator<Item = Answer>) {
+    /// As after a new start of the agent.
+    pub fn restart(&mut self, settings: FetchSettings) {
+        self.fetcher = Fetcher::new(client(), self.server.clone(), TOKEN.to_owned(), self.data.clone(), settings);
+    }
+
+    pub fn answers(&self, answers: impl IntoIterator<Item = Answer>) {
         self.script.lock().unwrap().answers = answers.into_iter().collect();
     }
 
-    fn asked(&self) -> Vec<u64> {
+    pub fn asked(&self) -> Vec<u64> {
         std::mem::take(&mut self.script.lock().unwrap().asked)
     }
 
@@ -113,11 +120,11 @@ impl Site {
         self.fetcher.content(&self.package, &self.manifest, &progress, &CancellationToken::new()).await
     }
 
-    fn version(&self) -> VersionDir {
+    pub fn version(&self) -> VersionDir {
         self.data.task(&self.package.name).version(&self.package.manifest.digest)
     }
 
-    fn part(&self) -> PathBuf {
+    pub fn part(&self) -> PathBuf {
         self.data.blob_part(&self.package.content.digest)
     }
 
@@ -126,19 +133,19 @@ impl Site {
         fs::write(self.part(), bytes).unwrap();
     }
 
-    fn assert_in_place(&self) {
+    pub fn assert_in_place(&self) {
         assert_eq!(fs::read(self.version().src().join("data")).unwrap(), noise());
         assert!(!self.part().exists(), "the compressed bytes are still there");
         self.assert_nothing_staged();
     }
 
-    fn assert_nothing_staged(&self) {
+    pub fn assert_nothing_staged(&self) {
         let staged = fs::read_dir(self.data.staging()).map_or(0, Iterator::count);
         assert_eq!(staged, 0, "a tree was left in the staging directory");
     }
 }
 
-fn settings() -> FetchSettings {
+pub fn settings() -> FetchSettings {
     FetchSettings { reserve_bytes: 0, reconnect_wait: Duration::from_millis(1), ..FetchSettings::default() }
 }
 
@@ -155,7 +162,7 @@ fn manifest(facts: ContentFacts) -> TaskManifest {
 }
 
 /// Bytes that do not compress, the same in each run.
-fn noise() -> Vec<u8> {
+pub fn noise() -> Vec<u8> {
     let mut state = 1u64;
     let next = || {
         state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
@@ -164,7 +171,7 @@ fn noise() -> Vec<u8> {
     std::iter::repeat_with(next).take(3 << 20).collect()
 }
 
-fn tar() -> Tar {
+pub fn tar() -> Tar {
     Tar::default().dir("bin").file("bin/run", b"#!/bin/sh\n").file("data", &noise()).end()
 }
 
@@ -391,6 +398,63 @@ async fn statuses_say_whether_to_come_back() {
             "{status}"
         );
     }
+}
+
+#[tokio::test]
+async fn a_server_without_room_is_obeyed_and_what_is_there_stays() {
+    for (answer, told) in [
+        (Answer::Status(429, vec![("retry-after", "7")]), Some(7)),
+        (Answer::Status(503, vec![("retry-after", "9")]), Some(9)),
+        (Answer::Status(503, vec![]), None),
+        (Answer::Status(500, vec![("retry-after", "9")]), None),
+    ] {
+        let site = Site::new(&tar()).await;
+        site.answers([Answer::Cut(1 << 20), answer.clone()]);
+        let progress = watch::Sender::new(Progress { done: 0, total: 0 });
+        let cancel = CancellationToken::new();
+        let pull = site.fetcher.content(&site.package, &site.manifest, &progress, &cancel);
+        let error = pull.await.unwrap_err();
+        assert_eq!(error.told_to_wait(), told.map(Duration::from_secs), "{answer:?}");
+        let there = fs::metadata(site.part()).unwrap().len();
+        assert!(there > 0);
+        assert_eq!(*progress.borrow(), Progress { done: there, total: site.content.len() as u64 });
+        site.pull().await.unwrap();
+        site.assert_in_place();
+    }
+}
+
+#[tokio::test]
+async fn what_came_with_the_order_is_not_pulled() {
+    let site = Site::new(&tar()).await;
+    let config = serde_json::to_vec(&site.manifest).unwrap();
+    let (package, cancel) = (&site.package, CancellationToken::new());
+    let blobs = |config: &[u8], content: &[u8]| {
+        [(package.config, Bytes::copy_from_slice(config)), (package.content, Bytes::copy_from_slice(content))]
+    };
+    // Others than the state names are as good as none.
+    site.fetcher.offer(blobs(&config[1..], &site.content[1..]));
+    site.answers([Answer::Status(404, vec![])]);
+    assert!(site.fetcher.manifest(package, &cancel).await.is_err());
+    assert_eq!(site.asked(), [0]);
+    site.fetcher.offer(blobs(&config, &site.content));
+    site.put_part(&site.content[..100]);
+    assert_eq!(site.fetcher.manifest(package, &cancel).await.unwrap(), site.manifest);
+    site.pull().await.unwrap();
+    site.assert_in_place();
+    assert_eq!(site.asked(), [0; 0]);
+}
+
+#[tokio::test]
+async fn transfers_teach_about_the_link() {
+    let mut site = Site::new(&tar()).await;
+    let meter = LinkMeter::default();
+    let fetcher = Fetcher::new(client(), site.server.clone(), TOKEN.to_owned(), site.data.clone(), settings());
+    site.fetcher = fetcher.measured_by(meter.clone());
+    site.answers([Answer::Cut(1 << 20)]);
+    site.pull().await.unwrap();
+    let facts = meter.facts(tokio::time::Instant::now()).unwrap();
+    assert_eq!((facts.losses, facts.reconnects, facts.rtt_ms), (1, 0, None));
+    assert!(facts.throughput_bytes_per_s > Some(0));
 }
 
 #[tokio::test]

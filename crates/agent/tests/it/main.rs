@@ -12,6 +12,8 @@ mod graph;
 mod harness;
 mod launch;
 mod logs;
+mod parts;
+mod peer;
 mod ros;
 mod supervise;
 mod unpack;

@@ -3,7 +3,8 @@
 use std::collections::BTreeSet;
 use std::sync::Mutex;
 
-use task_proto::desired::PackageRef;
+use bytes::Bytes;
+use task_proto::desired::{BlobRef, PackageRef};
 use task_proto::manifest::{Build, ContentFacts, Outputs, Ready, Requires, Run, TaskManifest};
 use task_proto::report::{Failure, FailureCode, HostFacts};
 use task_proto::{DeploymentId, Digest};
@@ -21,6 +22,10 @@ pub(super) struct Fake {
     pub(super) slow: std::sync::atomic::AtomicBool,
     /// Changes when a process has ended.
     exited: watch::Sender<()>,
+    /// Pulls of content that were told to come back later.
+    pub(super) pulls: watch::Sender<u32>,
+    /// What who gathers parts says of those that are lacking.
+    pub(super) asks: watch::Sender<Asks>,
 }
 
 #[derive(Default)]
@@ -30,6 +35,12 @@ pub(super) struct State {
     pub(super) alive: BTreeSet<String>,
     pub(super) started: Vec<(DeploymentId, u64)>,
     cancelled: u32,
+    /// How long the next pulls of content are told to wait, the last one first.
+    pub(super) told_to_wait: Vec<u64>,
+    /// What came with the newest order.
+    pub(super) offered: Vec<(BlobRef, Bytes)>,
+    /// The tasks whose contents were pulled, in this order.
+    pub(super) pulled: Vec<TaskName>,
     pub(super) kept_parts: Vec<Vec<Digest>>,
     pub(super) ledgers: Vec<Ledger>,
     pub(super) held: bool,
@@ -158,25 +169,59 @@ impl Effects for Fake {
         self.state(|state| state.kept_parts.push(wanted.to_vec()));
     }
 
-    async fn pull_manifest(&self, package: &PackageRef, _cancel: &CancellationToken) -> Result<(), StepFailure> {
+    async fn pull_manifest(&self, package: &PackageRef, _cancel: &CancellationToken) -> Result<Done, StepFailure> {
         self.state(|state| state.manifests.insert(package.manifest.digest));
-        Ok(())
+        Ok(Done::Well)
     }
 
     async fn pull_content(
         &self,
         package: &PackageRef,
-        _progress: &watch::Sender<Progress>,
+        progress: &watch::Sender<Progress>,
         cancel: &CancellationToken,
-    ) -> Result<(), StepFailure> {
+    ) -> Result<Done, StepFailure> {
+        if let Some(at_least_ms) = self.state(|state| state.told_to_wait.pop()) {
+            progress.send_replace(Progress { done: 1, total: 2 });
+            self.pulls.send_modify(|pulls| *pulls += 1);
+            return Ok(Done::ToldToWait { at_least_ms });
+        }
         if self.slow.load(std::sync::atomic::Ordering::SeqCst) {
             cancel.cancelled().await;
             self.state(|state| state.cancelled += 1);
             let failure = Failure::new(FailureCode::IO_ERROR, "cancelled");
             return Err(StepFailure { failure, retry_after_ms: Some(0) });
         }
-        self.state(|state| state.contents.insert(package.manifest.digest));
-        Ok(())
+        self.state(|state| {
+            state.pulled.push(package.name.clone());
+            state.contents.insert(package.manifest.digest)
+        });
+        Ok(Done::Well)
+    }
+
+    fn offer(&self, blobs: Vec<(BlobRef, Bytes)>) {
+        self.state(|state| state.offered = blobs);
+    }
+
+    async fn gather_content(
+        &self,
+        package: &PackageRef,
+        progress: &watch::Sender<Progress>,
+        asks: &watch::Sender<Asks>,
+        cancel: &CancellationToken,
+    ) -> Result<Done, StepFailure> {
+        progress.send_replace(Progress { done: 1, total: package.content.size });
+        let mut said = self.asks.subscribe();
+        loop {
+            let now = said.borrow_and_update().clone();
+            asks.send_replace(now);
+            tokio::select! {
+                Ok(()) = said.changed() => {}
+                () = cancel.cancelled() => break,
+            }
+        }
+        self.state(|state| state.cancelled += 1);
+        let failure = Failure::new(FailureCode::IO_ERROR, "cancelled");
+        Err(StepFailure { failure, retry_after_ms: Some(0) })
     }
 
     async fn build(&self, _package: &PackageRef, _cancel: &CancellationToken) -> Result<(), StepFailure> {

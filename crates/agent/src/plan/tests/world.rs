@@ -54,6 +54,10 @@ pub(super) enum Happening {
     Effect {
         well: bool,
     },
+    /// The server has no room for a pull and says when to come back.
+    ToldToWait {
+        ms: u64,
+    },
     /// The agent learns of the ends of steps.
     Learn,
     ProcessEnds {
@@ -105,6 +109,7 @@ pub(super) fn happening() -> impl Strategy<Value = Happening> {
             .prop_map(|(deployment, run, stop)| Order { deployment, run, stop: stop && run == 2 }),
         1 => Just(Withdraw),
         8 => prop::bool::weighted(0.8).prop_map(|well| Effect { well }),
+        2 => (0..90_000u64).prop_map(|ms| ToldToWait { ms }),
         8 => Just(Learn),
         2 => (0..2i32).prop_map(|code| ProcessEnds { code }),
         1 => Just(ProcessVanishes),
@@ -178,6 +183,7 @@ impl World {
             }
             Happening::Withdraw => self.desired = None,
             Happening::Effect { well } => self.effect(well),
+            Happening::ToldToWait { ms } => self.told_to_wait(ms),
             Happening::Learn => self.learn(),
             Happening::ProcessEnds { code } => self.end_process(Some(ExitStatus::Code(code))),
             Happening::ProcessVanishes => self.end_process(None),
@@ -303,6 +309,19 @@ impl World {
         })
     }
 
+    fn told_to_wait(&mut self, ms: u64) {
+        let is_pull = |step: &Step| matches!(step, Step::PullManifest(_) | Step::PullContent { .. });
+        let Some(at) = self.steps.iter().position(|(step, done)| !done && is_pull(step)) else { return };
+        let (step, _) = self.steps.remove(at);
+        let before = self.record.clone().expect("a step is of a record").preparation;
+        let told = Done::ToldToWait { at_least_ms: ms };
+        let record = self.with_situation(|s| finished(s, &step, Ok(told)));
+        let after = &record.preparation;
+        assert_eq!((after.phase, after.attempts), (before.phase, before.attempts), "it counts as a try");
+        assert!(after.failure.is_none() && after.retry_at_ms >= self.now_ms + ms);
+        self.record = Some(record);
+    }
+
     fn effect(&mut self, well: bool) {
         let Some((step, done)) = self.steps.iter_mut().find(|(_, done)| !done) else { return };
         *done = true;
@@ -326,7 +345,7 @@ impl World {
                 });
                 assert!(!same, "it still writes");
             }
-            Step::PullContent(package) => self.raise(package, 2),
+            Step::PullContent { package, .. } => self.raise(package, 2),
             Step::Build(package) => self.raise(package, 3),
             Step::Start(run) => {
                 assert!(self.alive.is_empty(), "a second process of the task");
@@ -375,7 +394,7 @@ impl World {
             if step == Step::Remove {
                 self.record = None;
             } else {
-                self.record = Some(self.with_situation(|s| finished(s, &step, Ok(Some(7)))));
+                self.record = Some(self.with_situation(|s| finished(s, &step, Ok(Done::Started(7)))));
             }
         }
     }

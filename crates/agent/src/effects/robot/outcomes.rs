@@ -1,0 +1,54 @@
+//! What the plan is told of how a step ended: each module's error as a failure's code and text, and whether to try again.
+
+use std::error::Error;
+use std::time::Duration;
+
+use task_proto::report::{Failure, FailureCode};
+
+use super::chain;
+use crate::fetch::FetchError;
+use crate::outputs::OutputError;
+use crate::plan::{Done, StepFailure};
+
+pub(super) fn pulled(outcome: Result<(), FetchError>) -> Result<Done, StepFailure> {
+    match outcome {
+        Ok(()) => Ok(Done::Well),
+        Err(error) => match error.told_to_wait() {
+            Some(wait) => Ok(Done::ToldToWait { at_least_ms: millis(wait) }),
+            None => Err(fetch_failure(error)),
+        },
+    }
+}
+
+pub(super) fn millis(duration: Duration) -> u64 {
+    u64::try_from(duration.as_millis()).unwrap_or(u64::MAX)
+}
+
+pub(super) fn fetch_failure(error: FetchError) -> StepFailure {
+    // A cancelled pull is no failure: the driver lets go of its outcome.
+    let code = error.code().unwrap_or(FailureCode::INTERRUPTED);
+    if error.is_retryable() || matches!(error, FetchError::Cancelled) {
+        let least_ms = error.retry_after().map_or(0, millis);
+        return later(code, &error, least_ms);
+    }
+    finally(code, &error)
+}
+
+pub(super) fn outputs_code(error: &OutputError) -> FailureCode {
+    match error {
+        OutputError::Unreachable(_) | OutputError::Busy { .. } => FailureCode::SERVER_UNREACHABLE,
+        OutputError::Read { .. } | OutputError::User(_) | OutputError::Note { .. } => FailureCode::IO_ERROR,
+        OutputError::Cancelled => FailureCode::INTERRUPTED,
+        OutputError::Pattern { .. } | OutputError::TooMuch(_) | OutputError::Refused { .. } => {
+            FailureCode::OUTPUTS_LOST
+        }
+    }
+}
+
+pub(super) fn finally(code: FailureCode, error: &dyn Error) -> StepFailure {
+    StepFailure { failure: Failure::new(code, chain(error)), retry_after_ms: None }
+}
+
+pub(super) fn later(code: FailureCode, error: &dyn Error, least_ms: u64) -> StepFailure {
+    StepFailure { failure: Failure::new(code, chain(error)), retry_after_ms: Some(least_ms) }
+}

@@ -1,0 +1,205 @@
+//! Which parts of a blob are there, and which of the others were asked for. Pure bookkeeping, bounded by the number of
+//! parts a blob may have; it never sees a byte of them.
+
+use task_proto::part::{Cut, PartRange};
+
+/// What a note begins with: its format.
+const NOTE_FORMAT: [u8; 4] = *b"pt1\n";
+
+/// The parts of one blob.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct PartMap {
+    cut: Cut,
+    there: Bits,
+    asked: Bits,
+    bytes: u64,
+}
+
+impl PartMap {
+    /// Of a blob of which the first `prefix` bytes are there.
+    pub(super) fn new(cut: Cut, prefix: u64) -> Self {
+        let mut map = Self { cut, there: Bits::new(cut.count()), asked: Bits::new(cut.count()), bytes: 0 };
+        for index in (0..cut.count()).take_while(|&index| cut.range(index).end <= prefix) {
+            map.take(index);
+        }
+        map
+    }
+
+    /// How the blob is cut.
+    pub(super) fn cut(&self) -> Cut {
+        self.cut
+    }
+
+    /// The bytes that are there.
+    pub(super) fn bytes(&self) -> u64 {
+        self.bytes
+    }
+
+    /// Whether the part is there.
+    pub(super) fn has(&self, index: u32) -> bool {
+        self.there.has(index)
+    }
+
+    /// The part is there; false if it was before.
+    pub(super) fn take(&mut self, index: u32) -> bool {
+        let is_new = index < self.cut.count() && self.there.set(index);
+        if is_new {
+            let range = self.cut.range(index);
+            self.bytes += range.end - range.start;
+        }
+        is_new
+    }
+
+    /// Whether all parts are there.
+    pub(super) fn is_whole(&self) -> bool {
+        self.lacking().next().is_none()
+    }
+
+    /// How many bytes are there without a gap from the first on.
+    pub(super) fn prefix(&self) -> u64 {
+        let first_gap = self.lacking().next().unwrap_or(self.cut.count());
+        self.cut.range(first_gap).start
+    }
+
+    /// Asks for all parts below `index` that are not there; whether there are any.
+    pub(super) fn ask_below(&mut self, index: u32) -> bool {
+        let lacking: Vec<u32> = self.lacking().take_while(|&lacking| lacking < index).collect();
+        lacking.iter().for_each(|&lacking| {
+            self.asked.set(lacking);
+        });
+        !lacking.is_empty()
+    }
+
+    /// Asks for no part any more.
+    pub(super) fn ask_nothing(&mut self) {
+        self.asked = Bits::new(self.cut.count());
+    }
+
+    /// What was asked for and has not come.
+    pub(super) fn asked(&self) -> Vec<PartRange> {
+        PartRange::runs(self.lacking().filter(|&index| self.asked.has(index)))
+    }
+
+    /// What a later agent has to know.
+    pub(super) fn note(&self) -> Vec<u8> {
+        let words = self.there.0.iter().flat_map(|word| word.to_be_bytes());
+        NOTE_FORMAT.into_iter().chain(self.cut.part_bytes().to_be_bytes()).chain(words).collect()
+    }
+
+    /// Reads a note about a blob of `size` bytes; `None` if it is none.
+    pub(super) fn of_note(note: &[u8], size: u64) -> Option<Self> {
+        let (part_bytes, words) = note.strip_prefix(&NOTE_FORMAT)?.split_first_chunk::<4>()?;
+        let mut map = Self::new(Cut::new(size, u32::from_be_bytes(*part_bytes)).ok()?, 0);
+        let (words, rest) = words.as_chunks::<8>();
+        if !rest.is_empty() || words.len() != map.there.0.len() {
+            return None;
+        }
+        let there = Bits(words.iter().map(|word| u64::from_be_bytes(*word)).collect());
+        for index in (0..map.cut.count()).filter(|&index| there.has(index)) {
+            map.take(index);
+        }
+        Some(map)
+    }
+
+    fn lacking(&self) -> impl Iterator<Item = u32> {
+        // Whole words first: a large blob has a million parts, most of them there or most of them not.
+        let words = self.there.0.iter().zip(0u32..).filter(|(word, _)| **word != u64::MAX);
+        let indexes =
+            words.flat_map(|(word, at)| (0..64).filter(move |bit| word >> bit & 1 == 0).map(move |bit| at * 64 + bit));
+        indexes.take_while(|&index| index < self.cut.count())
+    }
+}
+
+/// A bit for each part.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Bits(Vec<u64>);
+
+impl Bits {
+    fn new(count: u32) -> Self {
+        Self(vec![0; count.div_ceil(64) as usize])
+    }
+
+    fn has(&self, index: u32) -> bool {
+        self.0.get((index / 64) as usize).is_some_and(|word| word >> (index % 64) & 1 == 1)
+    }
+
+    /// Sets a bit; whether it was not set before.
+    fn set(&mut self, index: u32) -> bool {
+        let Some(word) = self.0.get_mut((index / 64) as usize) else { return false };
+        let before = *word;
+        *word |= 1 << (index % 64);
+        *word != before
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use proptest::prelude::*;
+
+    use super::*;
+
+    const PART: u64 = 1024;
+
+    proptest! {
+        #[test]
+        fn it_knows_what_came(size in 1..300 * PART, came in prop::collection::vec(0..320u32, 0..400)) {
+            let mut map = PartMap::new(Cut::new(size, PART as u32).expect("a cut"), 0);
+            let count = map.cut().count();
+            let mut there = BTreeSet::new();
+            for index in came {
+                prop_assert_eq!(map.take(index), index < count && there.insert(index));
+            }
+            prop_assert!((0..400).all(|index| map.has(index) == there.contains(&index)));
+            let bytes: u64 = there.iter().map(|&index| PART.min(size - u64::from(index) * PART)).sum();
+            prop_assert_eq!((map.bytes(), map.is_whole()), (bytes, bytes == size));
+            let gap = (0..count).find(|index| !there.contains(index));
+            prop_assert_eq!(map.prefix(), gap.map_or(size, |gap| u64::from(gap) * PART));
+            let read = PartMap::of_note(&map.note(), size);
+            prop_assert_eq!(read.as_ref(), Some(&map));
+
+            let lacking: Vec<u32> = (0..count).filter(|index| !there.contains(index)).collect();
+            prop_assert!(map.asked().is_empty());
+            prop_assert_eq!(map.ask_below(u32::MAX), !lacking.is_empty());
+            prop_assert_eq!(map.asked(), PartRange::runs(lacking.iter().copied()));
+            if let Some(&first) = lacking.first() {
+                map.take(first);
+                prop_assert_eq!(map.asked(), PartRange::runs(lacking[1..].iter().copied()));
+            }
+            map.ask_nothing();
+            prop_assert!(map.asked().is_empty());
+        }
+
+        #[test]
+        fn what_is_no_note_is_not_read(size in any::<u64>(), note in prop::collection::vec(any::<u8>(), 0..64), whole in any::<bool>()) {
+            let note = if whole { [&NOTE_FORMAT[..], &note].concat() } else { note };
+            if let Some(map) = PartMap::of_note(&note, size) {
+                prop_assert!(map.bytes() <= size && map.prefix() <= size);
+            }
+        }
+    }
+
+    #[test]
+    fn a_beginning_counts_as_whole_parts_only() {
+        let cut = Cut::new(10 * PART + 5, PART as u32).expect("a cut");
+        for (prefix, parts, bytes) in
+            [(0, 0, 0), (PART - 1, 0, 0), (3 * PART, 3, 3 * PART), (10 * PART + 5, 11, 10 * PART + 5)]
+        {
+            let mut map = PartMap::new(cut, prefix);
+            assert_eq!(((0..11).filter(|&index| map.has(index)).count(), map.bytes()), (parts, bytes));
+            assert_eq!(map.prefix(), bytes);
+            assert_eq!(map.ask_below(2), parts < 2);
+        }
+    }
+
+    #[test]
+    fn a_note_about_another_size_or_cut_off_is_none() {
+        let map = PartMap::new(Cut::new(100 * PART, PART as u32).expect("a cut"), 30 * PART);
+        let note = map.note();
+        assert!(PartMap::of_note(&note, 400 * PART).is_none());
+        for length in 0..note.len() {
+            assert!(PartMap::of_note(&note[..length], 100 * PART).is_none(), "{length}");
+        }
+    }
+}

@@ -1,0 +1,402 @@
+//! Packages that the server pushes as parts: through the agent's real session, from a peer and a server that misbehave.
+
+use std::fs;
+use std::sync::Arc;
+use std::time::Duration;
+
+use task_agent::credential::Credential;
+use task_agent::fetch::{Asks, FetchError, FetchSettings, PartPatience};
+use task_agent::link::{Shared, Talk};
+use task_agent::mqtt::{self, MqttAccess};
+use task_proto::part::{Cut, Part, PartRange};
+use task_proto::report::{Progress, Status};
+use task_proto::topic::{Topic, TopicPrefix};
+use task_proto::{InstanceId, RobotId};
+use tokio::sync::{mpsc, watch};
+use tokio_util::sync::CancellationToken;
+
+use crate::fetch::{Answer, Site, settings, tar};
+use crate::harness::{eventually, within};
+use crate::peer::Peer;
+
+const PART_BYTES: u32 = 64 * 1024;
+const LONG: Duration = Duration::from_secs(600);
+
+/// Nothing is asked for and nothing given up.
+fn patient() -> FetchSettings {
+    FetchSettings { parts: PartPatience { silence: LONG, deaf: LONG, starved: LONG }, ..settings() }
+}
+
+fn with(parts: PartPatience) -> FetchSettings {
+    FetchSettings { parts, ..settings() }
+}
+
+/// A package, who pushes it, and an agent's session between them.
+struct Rig {
+    site: Arc<Site>,
+    peer: Peer,
+    shared: Shared,
+    progress: watch::Sender<Progress>,
+    asks: watch::Sender<Asks>,
+    cut: Cut,
+}
+
+type Gathering = tokio::task::JoinHandle<Result<(), FetchError>>;
+
+impl Rig {
+    async fn new(settings: FetchSettings) -> Self {
+        Self::of(Site::with(&tar(), settings).await).await
+    }
+
+    async fn of(site: Site) -> Self {
+        let (peer, shared) = (Peer::start().await, Shared::new(CancellationToken::new()));
+        let access = MqttAccess {
+            host: "127.0.0.1".to_owned(),
+            port: peer.port,
+            prefix: TopicPrefix::default(),
+            robot: RobotId::random(),
+            token: Credential::from("token".to_owned()),
+            status: Status { online: true, start: 1, instance: InstanceId::random(), connection: 0 },
+            message_bytes: mqtt::MESSAGE_BYTES,
+        };
+        let (heard, _) = mpsc::channel(1);
+        let (requests, _) = mpsc::channel(1);
+        let talk = Talk { requests, messages: mpsc::channel(1).1, lines: mpsc::channel(1).1 };
+        tokio::spawn(mqtt::run(access, shared.clone(), heard, talk));
+        let cut = Cut::new(site.content.len() as u64, PART_BYTES).unwrap();
+        let progress = watch::Sender::new(Progress { done: 0, total: 0 });
+        Self { site: Arc::new(site), peer, shared, progress, asks: watch::Sender::default(), cut }
+    }
+
+    fn gather(&self, cancel: &CancellationToken) -> Gathering {
+        let (site, shared, cancel) = (self.site.clone(), self.shared.clone(), cancel.clone());
+        let (progress, asks) = (self.progress.clone(), self.asks.clone());
+        tokio::spawn(async move {
+            let (package, manifest) = (&site.package, &site.manifest);
+            site.fetcher.pushed_content(package, manifest, &shared.listening, (&progress, &asks), &cancel).await
+        })
+    }
+
+    /// Gathers, and waits until it hears.
+    async fn listen(&self) -> Gathering {
+        let gathering = self.gather(&CancellationToken::new());
+        self.peer.subscribed(&self.topic()).await;
+        self.asked(&[]).await;
+        gathering
+    }
+
+    fn topic(&self) -> String {
+        TopicPrefix::default().format(&Topic::Package(self.site.package.content.digest))
+    }
+
+    fn message(&self, index: u32) -> Vec<u8> {
+        let range = self.cut.range(index);
+        let bytes = &self.site.content[range.start as usize..range.end as usize];
+        Part { index, count: self.cut.count(), part_bytes: PART_BYTES, bytes }.encode()
+    }
+
+    fn push(&self, parts: impl IntoIterator<Item = u32>) {
+        parts.into_iter().for_each(|index| self.peer.publish(&self.topic(), 1, &self.message(index)));
+    }
+
+    /// Waits until so many bytes are there.
+    async fn has(&self, bytes: u64) {
+        let mut progress = self.progress.subscribe();
+        within("the parts", progress.wait_for(|progress| progress.done == bytes)).await.unwrap();
+    }
+
+    /// Waits until the agent asks for these parts.
+    async fn asked(&self, ranges: &[(u32, u32)]) {
+        let ranges: Vec<PartRange> = ranges.iter().map(|&(from, to)| PartRange { from, to }).collect();
+        let mut asks = self.asks.subscribe();
+        within("what is lacking", asks.wait_for(|asks| asks.missing.as_ref() == Some(&ranges))).await.unwrap();
+    }
+
+    async fn ends_well(&self, gathering: Gathering) {
+        within("the package", gathering).await.unwrap().unwrap();
+        self.site.assert_in_place();
+        for path in [self.site.data.blob_parts(&self.digest()), self.site.data.blob_parts_note(&self.digest())] {
+            assert!(!path.exists(), "{} is left", path.display());
+        }
+        assert_eq!(self.asks.borrow().missing, None);
+        let topic = self.topic();
+        self.peer.until("the end of the subscription", |seen| !seen.topics.contains(&topic)).await;
+    }
+
+    fn digest(&self) -> task_proto::Digest {
+        self.site.package.content.digest
+    }
+}
+
+impl Drop for Rig {
+    fn drop(&mut self) {
+        self.shared.shutdown.cancel();
+    }
+}
+
+#[tokio::test]
+async fn what_is_pushed_gets_its_place_without_a_pull_at_every_quality_of_service() {
+    for qos in [0, 1, 2] {
+        let rig = Rig::new(patient()).await;
+        let gathering = rig.listen().await;
+        let before = rig.peer.seen.borrow().acknowledged;
+        // In whatever order.
+        for index in (0..rig.cut.count()).rev() {
+            rig.peer.publish(&rig.topic(), qos, &rig.message(index));
+        }
+        rig.ends_well(gathering).await;
+        assert_eq!(rig.site.asked(), [0; 0]);
+        let size = rig.site.content.len() as u64;
+        assert_eq!(*rig.progress.borrow(), Progress { done: size, total: size });
+        if qos > 0 {
+            let all = before + rig.cut.count();
+            rig.peer.until("every acknowledgement", |seen| seen.acknowledged == all).await;
+        }
+    }
+}
+
+#[tokio::test]
+async fn parts_that_are_lacking_are_asked_for() {
+    let patience = PartPatience { silence: Duration::from_millis(300), deaf: LONG, starved: LONG };
+    let rig = Rig::new(with(patience)).await;
+    let gathering = rig.listen().await;
+    // Nobody has said how many there are.
+    rig.asked(&[(0, u32::MAX)]).await;
+    // It joined late: what went out before is asked for at once, a gap once it is quiet.
+    rig.push([10]);
+    rig.asked(&[(0, 9)]).await;
+    rig.push((11..rig.cut.count()).filter(|&index| index != 20));
+    rig.asked(&[(0, 9), (20, 20)]).await;
+    let times = rig.asks.borrow().times;
+    let mut asks = rig.asks.subscribe();
+    within("it asks again", asks.wait_for(|asks| asks.times > times)).await.unwrap();
+    assert_eq!(rig.asks.borrow().missing.as_ref().unwrap().len(), 2);
+    rig.push((0..10).chain([20]));
+    rig.ends_well(gathering).await;
+    assert_eq!(rig.site.asked(), [0; 0]);
+}
+
+#[tokio::test]
+async fn hostile_messages_are_passed_over() {
+    let rig = Rig::new(patient()).await;
+    let gathering = rig.listen().await;
+    let good = rig.message(3);
+    let altered = |at: usize, bytes: &[u8]| {
+        let mut message = good.clone();
+        message[at..at + bytes.len()].copy_from_slice(bytes);
+        message
+    };
+    let other_cut = {
+        let cut = Cut::new(rig.site.content.len() as u64, 4096).unwrap();
+        Part { index: 0, count: cut.count(), part_bytes: 4096, bytes: &[7; 4096] }.encode()
+    };
+    rig.push([0]);
+    for hostile in [
+        Vec::new(),
+        good[..13].to_vec(),
+        good[..14].to_vec(),
+        good[..good.len() - 1].to_vec(),
+        [&good[..], b"x"].concat(),
+        altered(0, &[2]),
+        altered(2, &rig.cut.count().to_be_bytes()),
+        altered(2, &u32::MAX.to_be_bytes()),
+        altered(6, &0u32.to_be_bytes()),
+        altered(6, &u32::MAX.to_be_bytes()),
+        altered(10, &0u32.to_be_bytes()),
+        altered(10, &1u32.to_be_bytes()),
+        altered(10, &u32::MAX.to_be_bytes()),
+        other_cut,
+        vec![1; 1_000_000],
+    ] {
+        rig.peer.publish(&rig.topic(), 1, &hostile);
+    }
+    // Of another package, and again what is there, with other bytes.
+    rig.peer.publish("taskd/v1/p/sha256:00", 1, &good);
+    rig.peer.publish("taskd/v1/r/r00000000000000a1/desired", 1, b"{");
+    let double = Part { index: 0, count: rig.cut.count(), part_bytes: PART_BYTES, bytes: &[7; PART_BYTES as usize] };
+    rig.peer.publish(&rig.topic(), 1, &double.encode());
+    rig.push(0..rig.cut.count());
+    rig.ends_well(gathering).await;
+    assert_eq!(rig.site.asked(), [0; 0]);
+    assert_eq!(rig.peer.seen.borrow().sessions, 1);
+}
+
+#[tokio::test]
+async fn wrong_bytes_are_found_by_the_digest_and_pulled() {
+    let rig = Rig::new(patient()).await;
+    let gathering = rig.listen().await;
+    let wrong = Part { index: 5, count: rig.cut.count(), part_bytes: PART_BYTES, bytes: &[7; PART_BYTES as usize] };
+    rig.peer.publish(&rig.topic(), 1, &wrong.encode());
+    rig.push(0..rig.cut.count());
+    rig.ends_well(gathering).await;
+    assert_eq!(rig.site.asked(), [0]);
+}
+
+#[tokio::test]
+async fn what_does_not_come_is_pulled_from_the_first_gap_on() {
+    let starved = PartPatience { starved: Duration::from_millis(500), ..patient().parts };
+    let rig = Rig::new(with(starved)).await;
+    let gathering = rig.listen().await;
+    rig.push((0..7).chain(9..20));
+    rig.ends_well(gathering).await;
+    assert_eq!(rig.site.asked(), [7 * u64::from(PART_BYTES)]);
+    assert_eq!(rig.shared.meter.facts(tokio::time::Instant::now()).unwrap().reconnects, 0);
+}
+
+#[tokio::test]
+async fn a_subscription_that_is_refused_is_tried_again_and_not_for_ever() {
+    let deaf = PartPatience { deaf: Duration::from_secs(4), ..patient().parts };
+    let rig = Rig::new(with(deaf)).await;
+    rig.peer.allows_parts.send_replace(false);
+    let gathering = rig.gather(&CancellationToken::new());
+    rig.peer.until("a refusal", |seen| seen.refused > 0).await;
+    rig.peer.allows_parts.send_replace(true);
+    rig.peer.subscribed(&rig.topic()).await;
+    rig.push(0..rig.cut.count());
+    rig.ends_well(gathering).await;
+    assert_eq!(rig.site.asked(), [0; 0]);
+
+    let deaf = PartPatience { deaf: Duration::from_millis(100), ..patient().parts };
+    let rig = Rig::new(with(deaf)).await;
+    rig.peer.allows_parts.send_replace(false);
+    within("the pull", rig.gather(&CancellationToken::new())).await.unwrap().unwrap();
+    rig.site.assert_in_place();
+    assert_eq!(rig.site.asked(), [0]);
+}
+
+#[tokio::test]
+async fn without_a_session_it_is_pulled_at_once_and_a_short_loss_is_waited_out() {
+    let site = Site::with(&tar(), patient()).await;
+    let listening = task_agent::parts::Listening::default();
+    listening.session(false);
+    let (progress, asks) = (watch::Sender::new(Progress { done: 0, total: 0 }), watch::Sender::default());
+    let cancel = CancellationToken::new();
+    let told = (&progress, &asks);
+    let pull = site.fetcher.pushed_content(&site.package, &site.manifest, &listening, told, &cancel);
+    within("the pull", pull).await.unwrap();
+    site.assert_in_place();
+
+    let rig = Rig::new(patient()).await;
+    let gathering = rig.listen().await;
+    rig.push(0..5);
+    rig.has(5 * u64::from(PART_BYTES)).await;
+    rig.peer.cut();
+    rig.peer.until("another session", |seen| seen.sessions == 2).await;
+    rig.peer.subscribed(&rig.topic()).await;
+    rig.push(5..rig.cut.count());
+    rig.ends_well(gathering).await;
+    assert_eq!(rig.site.asked(), [0; 0]);
+    assert_eq!(rig.shared.meter.facts(tokio::time::Instant::now()).unwrap().reconnects, 1);
+}
+
+/// Half of the parts are there when the agent ends; gives what the next one goes on from.
+async fn ended_half_way() -> Rig {
+    let mut rig = Rig::new(patient()).await;
+    let cancel = CancellationToken::new();
+    let gathering = rig.gather(&cancel);
+    rig.peer.subscribed(&rig.topic()).await;
+    rig.push((0..20).filter(|&index| index != 4));
+    rig.has(19 * u64::from(PART_BYTES)).await;
+    cancel.cancel();
+    let ended = within("the end", gathering).await.unwrap();
+    assert!(matches!(ended, Err(FetchError::Cancelled)), "{ended:?}");
+    let topic = rig.topic();
+    rig.peer.until("the end of the subscription", |seen| !seen.topics.contains(&topic)).await;
+    let alone = || Arc::get_mut(&mut rig.site).map(|site| site.restart(patient()));
+    eventually("nobody else has the site", alone).await;
+    rig.progress.send_replace(Progress { done: 0, total: 0 });
+    rig
+}
+
+#[tokio::test]
+async fn a_new_agent_goes_on_with_the_parts_that_are_there() {
+    let rig = ended_half_way().await;
+    let gathering = rig.listen().await;
+    rig.has(19 * u64::from(PART_BYTES)).await;
+    rig.push([20]);
+    rig.asked(&[(4, 4)]).await;
+    rig.push((21..rig.cut.count()).chain([4]));
+    rig.ends_well(gathering).await;
+    assert_eq!(rig.site.asked(), [0; 0]);
+}
+
+#[tokio::test]
+async fn what_a_power_cut_tore_is_found_and_pulled() {
+    let rig = ended_half_way().await;
+    let path = rig.site.data.blob_parts(&rig.digest());
+    let mut bytes = fs::read(&path).unwrap();
+    bytes[100_000..104_096].fill(0);
+    fs::write(&path, bytes).unwrap();
+    let gathering = rig.listen().await;
+    rig.push((20..rig.cut.count()).chain([4]));
+    rig.ends_well(gathering).await;
+    assert_eq!(rig.site.asked(), [0]);
+}
+
+#[tokio::test]
+async fn a_note_that_is_wrong_is_no_note() {
+    for spoil in [b"pt1\n".to_vec(), vec![0xff; 300], vec![0; 1 << 20]] {
+        let rig = ended_half_way().await;
+        fs::write(rig.site.data.blob_parts_note(&rig.digest()), spoil).unwrap();
+        let gathering = rig.listen().await;
+        assert_eq!(rig.progress.borrow().done, 0);
+        rig.push(0..rig.cut.count());
+        rig.ends_well(gathering).await;
+        assert_eq!(rig.site.asked(), [0; 0]);
+    }
+}
+
+#[tokio::test]
+async fn a_pull_goes_on_from_the_parts_that_are_there() {
+    let rig = ended_half_way().await;
+    let (progress, cancel) = (watch::Sender::new(Progress { done: 0, total: 0 }), CancellationToken::new());
+    // As when the server has told the robot to pull.
+    rig.site.answers([Answer::Well]);
+    rig.site.fetcher.content(&rig.site.package, &rig.site.manifest, &progress, &cancel).await.unwrap();
+    rig.site.assert_in_place();
+    assert_eq!(rig.site.asked(), [4 * u64::from(PART_BYTES)]);
+    assert!(!rig.site.data.blob_parts(&rig.digest()).exists());
+}
+
+#[tokio::test]
+async fn who_does_not_write_gets_no_more() {
+    let rig = Rig::new(patient()).await;
+    let mut ear = rig.shared.listening.listen(rig.digest(), rig.site.content.len() as u64);
+    rig.peer.subscribed(&rig.topic()).await;
+    let before = rig.peer.seen.borrow().acknowledged;
+    rig.push(0..rig.cut.count());
+    let first = within("a part", ear.parts.recv()).await.unwrap();
+    eventually("the queue is full", || (ear.parts.len() == ear.parts.max_capacity()).then_some(())).await;
+    assert_eq!(rig.peer.seen.borrow().acknowledged, before, "nothing was written");
+    drop(first);
+    for _ in 1..rig.cut.count() {
+        drop(within("a part", ear.parts.recv()).await.unwrap());
+    }
+    let all = before + rig.cut.count();
+    rig.peer.until("every acknowledgement", |seen| seen.acknowledged == all).await;
+}
+
+#[tokio::test]
+async fn a_package_may_come_as_one_message() {
+    let rig = Rig::new(patient()).await;
+    let gathering = rig.listen().await;
+    let size = u32::try_from(rig.site.content.len()).unwrap();
+    assert!(rig.site.content.len() > mqtt::MESSAGE_BYTES);
+    let whole = Part { index: 0, count: 1, part_bytes: size, bytes: &rig.site.content }.encode();
+    // The session can't read it; the next one can, because this package is wanted.
+    rig.peer.publish(&rig.topic(), 1, &whole);
+    rig.peer.until("another session", |seen| seen.sessions == 2).await;
+    rig.peer.subscribed(&rig.topic()).await;
+    rig.peer.publish(&rig.topic(), 1, &whole);
+    rig.ends_well(gathering).await;
+    assert_eq!(rig.site.asked(), [0; 0]);
+}
+
+#[tokio::test]
+async fn a_message_that_nobody_wants_ends_the_session_when_it_is_too_large() {
+    let rig = Rig::new(patient()).await;
+    rig.peer.until("a session", |seen| seen.topics.len() == 2).await;
+    rig.peer.publish(&rig.topic(), 1, &vec![0; 2 * mqtt::MESSAGE_BYTES]);
+    rig.peer.until("another session", |seen| seen.sessions == 2 && seen.topics.len() == 2).await;
+    assert_eq!(rig.shared.meter.facts(tokio::time::Instant::now()).unwrap().reconnects, 1);
+}

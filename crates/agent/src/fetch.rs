@@ -184,10 +184,13 @@ impl Fetcher {
         let content = package.content;
         let is_there = self.src(package).is_dir() || self.offered.get(&content).is_some();
         if !is_there && self.present(package)? < content.size && !self.given_up().contains(&content.digest) {
-            let need = self.check_room(package, manifest, 0)?;
             let gathering = Gathering::open(self, package, progress, asks, turn.clone())?;
-            let gathered = gathering.run(listening.listen(content.digest, content.size), cancel).await;
-            match gathered {
+            let need = Need::of(package, manifest, gathering.bytes(), self.settings.reserve_bytes);
+            let gathered = match self.check_room(need) {
+                Ok(()) => gathering.run(listening.listen(content.digest, content.size), cancel).await,
+                Err(error) => Err(error),
+            };
+            match gathered.map_err(|error| error.for_want_of_room(self.data.root(), need)) {
                 Ok(Ok(())) => {}
                 Ok(Err(why)) => {
                     tracing::info!(package = %package.name, "what is pushed is pulled: {why}");
@@ -195,7 +198,6 @@ impl Fetcher {
                     self.give_up(content.digest);
                 }
                 Err(error) => {
-                    let error = error.for_want_of_room(self.data.root(), need);
                     if error.spoils_gathered() {
                         self.discard(package)?;
                     }
@@ -283,7 +285,8 @@ impl Fetcher {
         }
         let offset = self.present(package)?;
         progress.send_replace(Progress { done: offset, total: package.content.size });
-        let need = self.check_room(package, manifest, offset)?;
+        let need = Need::of(package, manifest, offset, self.settings.reserve_bytes);
+        self.check_room(need)?;
         // Ask first: a replay for nothing each time the server is away would wear the disk out.
         let source = if offset == package.content.size {
             Source::Nothing
@@ -382,12 +385,9 @@ impl Fetcher {
         self.data.task(&package.name).version(&package.manifest.digest).src()
     }
 
-    /// Whether the rest of it fits on the disk when `present` bytes are there.
-    fn check_room(&self, package: &PackageRef, manifest: &TaskManifest, present: u64) -> Result<Need, FetchError> {
-        let need = Need::of(package, manifest, present, self.settings.reserve_bytes);
+    fn check_room(&self, need: Need) -> Result<(), FetchError> {
         let root = self.data.root();
-        need.check(disk::room(root).map_err(|source| FetchError::disk(root, source))?)?;
-        Ok(need)
+        Ok(need.check(disk::room(root).map_err(|source| FetchError::disk(root, source))?)?)
     }
 
     fn given_up(&self) -> MutexGuard<'_, HashSet<Digest>> {

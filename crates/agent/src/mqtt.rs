@@ -47,8 +47,8 @@ const QUEUED_EVENTS: usize = 2;
 const QUEUED_ACKNOWLEDGEMENTS: usize = 1024;
 /// The largest packet that is sent: a report of very many tasks.
 const MAX_SENT_BYTES: usize = 8 * 1024 * 1024;
-/// The largest message that is read unless the server is seen to send whole packages as one.
-pub const MESSAGE_BYTES: usize = 1024 * 1024;
+/// The largest message that is read unless the server is seen to send whole packages as one: a part of 1 MiB.
+pub const MESSAGE_BYTES: usize = 1024 * 1024 + AROUND_MESSAGE_BYTES;
 /// The largest that MQTT has.
 const MAX_MESSAGE_BYTES: u64 = 256 * 1024 * 1024 - 1;
 /// What a message has around its bytes: topic, packet id, a part's header.

@@ -160,7 +160,9 @@ impl<E: Effects> Driver<E> {
 
 /// Passes on that something is to be said.
 async fn notify(mut asked: watch::Receiver<Asks>, news: &Notify) {
-    while asked.changed().await.is_ok() {
+    let mut times = asked.borrow().times;
+    while let Ok(asks) = asked.wait_for(|asks| asks.times != times).await {
+        times = asks.times;
         news.notify_one();
     }
     std::future::pending().await

@@ -458,3 +458,15 @@ async fn tasks_of_higher_priority_are_prepared_first() {
     let places = ["d", "c", "f", "b", "e", "a"].map(place);
     assert_eq!(places, [0, 0, 1, 1, 2, 2], "{begun:?}");
 }
+
+#[tokio::test]
+async fn a_report_has_what_was_measured_of_the_link() {
+    let bench = Bench::new().await;
+    let report = bench.report(|_| true).await;
+    assert_eq!(report.link, None);
+    bench.shared.meter.transferred(1 << 20, std::time::Duration::from_secs(1));
+    bench.shared.meter.reconnected(Instant::now());
+    let report = bench.report(|report| report.link.is_some()).await;
+    let link = report.link.expect("waited for");
+    assert_eq!((link.throughput_bytes_per_s, link.reconnects), (Some(1 << 20), 1));
+}

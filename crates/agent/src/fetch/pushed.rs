@@ -34,8 +34,8 @@ const WRITTEN_TOGETHER: usize = 4;
 /// A note is written when so much has come since the last one, or after this time.
 const NOTED_BYTES: u64 = 16 << 20;
 const NOTED_AFTER: Duration = Duration::from_secs(5);
-/// How often what was asked for and has come since is taken back.
-const ASKED_AFRESH: Duration = Duration::from_secs(1);
+/// How soon what was asked for and has come is not asked for any more.
+const TAKEN_BACK_AFTER: Duration = Duration::from_millis(100);
 
 /// How long parts are waited for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -57,9 +57,9 @@ impl Default for PartPatience {
 /// What a robot that listens says of the parts it lacks.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Asks {
-    /// As in its report.
+    /// What its next report says, whatever that is sent for.
     pub missing: Option<Vec<PartRange>>,
-    /// Counts up each time that it is to be said, also if it is the same as before.
+    /// Counts up each time that a report is to be sent for it, also if it says the same as the last one.
     pub times: u32,
 }
 
@@ -119,7 +119,8 @@ struct Times {
     deaf_since: Option<Instant>,
     /// Whether no part has come by this subscription.
     is_fresh: bool,
-    told_at: Instant,
+    /// The first part that came since what is asked for was last looked through.
+    came_at: Option<Instant>,
 }
 
 impl<'a> Gathering<'a> {
@@ -194,7 +195,7 @@ impl<'a> Gathering<'a> {
             starved_since: now,
             deaf_since: Some(now),
             is_fresh: true,
-            told_at: now,
+            came_at: None,
         };
         if *ear.hearing.borrow_and_update() == Hearing::Away {
             return Ok(Err(GaveUp::NoSession));
@@ -260,10 +261,7 @@ impl<'a> Gathering<'a> {
         }
         times.starved_since = now;
         self.tell_progress();
-        if now - times.told_at >= ASKED_AFRESH {
-            times.told_at = now;
-            self.take_back();
-        }
+        times.came_at.get_or_insert(now);
         let due = self.bytes() - self.noted_bytes >= NOTED_BYTES || self.noted_at.elapsed() >= NOTED_AFTER;
         if due && self.noting.as_ref().is_none_or(JoinHandle::is_finished) {
             self.noted().await?;
@@ -320,15 +318,19 @@ impl<'a> Gathering<'a> {
     }
 
     fn next_look(&self, times: &Times) -> Instant {
-        match times.deaf_since {
+        let next = match times.deaf_since {
             Some(since) => since + self.patience.deaf,
             None => (times.quiet_since + times.silence).min(times.starved_since + self.patience.starved),
-        }
+        };
+        times.came_at.map_or(next, |at| next.min(at + TAKEN_BACK_AFTER))
     }
 
     /// Asks for what is lacking, or gives up.
     fn look(&mut self, times: &mut Times) -> Option<GaveUp> {
         let now = Instant::now();
+        if times.came_at.take_if(|at| now >= *at + TAKEN_BACK_AFTER).is_some() {
+            self.take_back();
+        }
         if let Some(since) = times.deaf_since {
             return (now >= since + self.patience.deaf).then_some(GaveUp::Deaf(self.patience.deaf));
         }
@@ -336,7 +338,7 @@ impl<'a> Gathering<'a> {
             return Some(GaveUp::Starved(self.patience.starved));
         }
         if now >= times.quiet_since + times.silence {
-            (times.quiet_since, times.told_at) = (now, now);
+            times.quiet_since = now;
             times.silence *= 2;
             if let Some(map) = &mut self.map {
                 map.ask_below(u32::MAX);
@@ -355,20 +357,16 @@ impl<'a> Gathering<'a> {
         self.asks.send_modify(|asks| *asks = Asks { missing: Some(missing), times: asks.times + 1 });
     }
 
-    /// Asks no longer for what has come.
+    /// Asks no longer for what has come, so that whatever makes the robot report does not ask for it again.
     fn take_back(&self) {
-        let Some(map) = &self.map else { return };
-        let still = map.asked();
-        self.asks.send_if_modified(|asks| {
-            let differs = asks.missing.as_ref().is_some_and(|missing| *missing != still);
-            if differs {
-                asks.missing = Some(still);
-            }
-            differs
-        });
+        let asked = |asks: &Asks| asks.missing.as_ref().is_some_and(|missing| !missing.is_empty());
+        if let Some(map) = self.map.as_ref().filter(|_| asked(&self.asks.borrow())) {
+            self.asks.send_modify(|asks| asks.missing = Some(map.asked()));
+        }
     }
 
-    fn bytes(&self) -> u64 {
+    /// The bytes that are there.
+    pub(super) fn bytes(&self) -> u64 {
         self.map.as_ref().map_or(0, PartMap::bytes)
     }
 

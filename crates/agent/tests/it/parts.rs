@@ -171,7 +171,9 @@ async fn parts_that_are_lacking_are_asked_for() {
     let mut asks = rig.asks.subscribe();
     within("it asks again", asks.wait_for(|asks| asks.times > times)).await.unwrap();
     assert_eq!(rig.asks.borrow().missing.as_ref().unwrap().len(), 2);
-    rig.push((0..10).chain([20]));
+    rig.push(0..5);
+    rig.asked(&[(5, 9), (20, 20)]).await;
+    rig.push((5..10).chain([20]));
     rig.ends_well(gathering).await;
     assert_eq!(rig.site.asked(), [0; 0]);
 }
@@ -356,6 +358,15 @@ async fn a_pull_goes_on_from_the_parts_that_are_there() {
     rig.site.assert_in_place();
     assert_eq!(rig.site.asked(), [4 * u64::from(PART_BYTES)]);
     assert!(!rig.site.data.blob_parts(&rig.digest()).exists());
+}
+
+#[tokio::test]
+async fn too_little_room_is_said_before_anything_is_pushed() {
+    let rig = Rig::new(FetchSettings { reserve_bytes: u64::MAX, ..patient() }).await;
+    let error = within("the refusal", rig.gather(&CancellationToken::new())).await.unwrap().unwrap_err();
+    assert!(matches!(error, FetchError::DiskFull(_)), "{error:?}");
+    assert!(!rig.site.data.blob_parts(&rig.digest()).exists());
+    assert_eq!((rig.site.asked(), rig.asks.borrow().times), (Vec::new(), 0));
 }
 
 #[tokio::test]

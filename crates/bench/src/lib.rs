@@ -3,15 +3,20 @@
 
 pub mod axis;
 pub mod clock;
+pub mod fleet;
+pub mod link;
 pub mod load;
 pub mod load_report;
 pub mod machine;
 pub mod measure;
+pub mod package;
 pub mod plot;
 pub mod process;
 pub mod progress;
 pub mod report;
 pub mod robot;
+pub mod robots;
 pub mod run;
+pub mod scenario;
 pub mod server;
 pub mod taskd;

@@ -10,6 +10,9 @@ use taskbench::load::{Load, LoadFlags};
 use taskbench::progress::say;
 use taskbench::report::page;
 use taskbench::run::Run;
+use taskbench::scenario::fleet::{self, FleetFlags};
+use taskbench::scenario::paper::{self, PaperFlags};
+use tokio::signal::unix::{SignalKind, signal};
 
 /// Measures taskd
 ///
@@ -35,6 +38,31 @@ enum Command {
                             --token-file ~/.local/share/taskd/operator.token --robots 1000")]
     Load(LoadFlags),
 
+    /// The paper's measurements made again: payload and robots against delay, every mechanism side by side
+    ///
+    /// For each point: the delay from the operator's order to the server's receipt of the last robot's verified answer,
+    /// the message arrival rate, and the bytes at the server's sockets. Runs are shuffled, failures shown. The exit code
+    /// is 0 if nothing failed.
+    #[command(
+        after_help = "Examples:\n  taskbench paper                              the whole grid, under half an hour\n  \
+                            taskbench paper --quick                      does everything work?\n  \
+                            taskbench paper --link 20mbit --max-payload 2000000   as over bad Wi-Fi (root)\n  \
+                            taskbench paper --only push-pull,poll --repetitions 9 --seed 7"
+    )]
+    Paper(PaperFlags),
+
+    /// How one server bears a fleet: all robots connect at once, then one deployment goes to all
+    ///
+    /// Robots are the agent's own driver, link, fetch and verification, all in one process; they build and start nothing.
+    /// The exit code is 0 if nothing failed.
+    #[command(after_help = "Examples:\n  taskbench fleet --robots 10,100,1000,10000\n  \
+                            taskbench fleet --robots 500 --delivery direct-push --payload 1000000")]
+    Fleet(FleetFlags),
+
+    /// The process of a scenario's robots; it is started by the scenario
+    #[command(hide = true)]
+    Robots,
+
     /// Draw the HTML page of a result again, from its JSON file
     #[command(after_help = "Example:\n  taskbench report taskbench-results/paper.json paper.html")]
     Report {
@@ -56,6 +84,9 @@ fn main() -> ExitCode {
 async fn run(command: Command) -> anyhow::Result<ExitCode> {
     match command {
         Command::Load(flags) => load(flags).await,
+        Command::Paper(flags) => concluded(until_interrupted(paper::run(flags)).await?),
+        Command::Fleet(flags) => concluded(until_interrupted(fleet::run(flags)).await?),
+        Command::Robots => taskbench::robots::run().await.map(|()| ExitCode::SUCCESS),
         Command::Report { json, html } => {
             let run = Run::read(&json).with_context(|| json.display().to_string())?;
             let html = html.unwrap_or_else(|| json.with_extension("html"));
@@ -63,6 +94,22 @@ async fn run(command: Command) -> anyhow::Result<ExitCode> {
             Ok(ExitCode::SUCCESS)
         }
     }
+}
+
+/// The scenario's outcome. When it is interrupted it is dropped, and with it all that it has started.
+async fn until_interrupted<T>(scenario: impl Future<Output = anyhow::Result<T>>) -> anyhow::Result<T> {
+    let mut terminated = signal(SignalKind::terminate()).context("SIGTERM can't be received")?;
+    tokio::select! {
+        outcome = scenario => outcome,
+        _ = tokio::signal::ctrl_c() => Err(anyhow::anyhow!("interrupted")),
+        _ = terminated.recv() => Err(anyhow::anyhow!("terminated")),
+    }
+}
+
+/// Success if nothing failed.
+fn concluded(run: Run) -> anyhow::Result<ExitCode> {
+    say(&format!("{} points, {} failures, {:.0} s", run.points.len(), run.failed(), run.wall_s));
+    Ok(if run.failed() == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
 /// Success if every step of every robot succeeded.

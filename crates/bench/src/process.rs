@@ -171,6 +171,13 @@ impl Program {
     }
 }
 
+/// Runs a program to its end from where nothing can be awaited; whether it succeeded.
+pub fn run_now(path: &str, arguments: &[&str]) -> bool {
+    let mut command = std::process::Command::new(path);
+    command.args(arguments).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+    command.status().is_ok_and(|status| status.success())
+}
+
 /// A program that runs. Dropping it kills it.
 #[derive(Debug)]
 pub struct Process {

@@ -9,14 +9,17 @@ use task_proto::api::{
     IDEMPOTENCY_KEY, RobotList, ServerInfo,
 };
 use task_proto::desired::BlobRef;
-use task_proto::manifest::{ContentFacts, TaskManifest};
 use task_proto::oci::{ImageManifest, MANIFEST_TYPE};
 use task_proto::selector::Selector;
 use task_proto::token::Token;
 use task_proto::{DeploymentId, Digest, RobotId, TaskName, Version};
 
+use crate::package::Package;
+
 /// How long one answer may take.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(60);
+/// The payload of a package that only has to exist.
+const SMALL_BYTES: u64 = 32;
 
 /// Why the server did not do what it was asked.
 #[derive(Debug, thiserror::Error)]
@@ -86,26 +89,16 @@ impl Server {
 
     /// Pushes a package with one small file, and gives its manifest.
     pub async fn push_package(&self, name: &TaskName, version: &Version) -> Result<Digest, ServerError> {
-        let (content, facts) = content();
-        let run = task_proto::manifest::Run { exec: Some(vec!["./run.sh".to_owned()]), ..Default::default() };
-        let manifest = TaskManifest {
-            name: name.clone(),
-            version: version.clone(),
-            build: Default::default(),
-            run,
-            ready: Default::default(),
-            parameters: Default::default(),
-            outputs: Default::default(),
-            requires: Default::default(),
-            limits: Default::default(),
-            exec_depends: Vec::new(),
-            content: facts,
-        };
-        let image = ImageManifest::package(
-            self.push_blob(name, json_bytes(&manifest)).await?,
-            self.push_blob(name, content).await?,
-        );
-        let bytes = json_bytes(&image);
+        self.push(Package::random(name.clone(), version.clone(), SMALL_BYTES, rand::random())).await
+    }
+
+    /// Pushes a package, and gives its manifest.
+    pub async fn push(&self, package: Package) -> Result<Digest, ServerError> {
+        let (config, content) = (package.config_blob(), package.content_blob());
+        let Package { name, version, config: config_bytes, content: content_bytes, .. } = package;
+        self.push_blob(&name, config, config_bytes).await?;
+        self.push_blob(&name, content, content_bytes).await?;
+        let bytes = json_bytes(&ImageManifest::package(config, content));
         let digest = Digest::of(&bytes);
         let put = self.request(Method::PUT, &format!("/v2/{name}/manifests/{version}"));
         send("the manifest", put.header(reqwest::header::CONTENT_TYPE, MANIFEST_TYPE).body(bytes)).await?;
@@ -118,11 +111,9 @@ impl Server {
         send("the package's removal", delete).await.map(drop)
     }
 
-    async fn push_blob(&self, name: &TaskName, bytes: Vec<u8>) -> Result<BlobRef, ServerError> {
-        let blob = BlobRef { digest: Digest::of(&bytes), size: bytes.len() as u64 };
+    async fn push_blob(&self, name: &TaskName, blob: BlobRef, bytes: Vec<u8>) -> Result<(), ServerError> {
         let post = self.request(Method::POST, &format!("/v2/{name}/blobs/uploads/?digest={}", blob.digest));
-        send("a blob", post.body(bytes)).await?;
-        Ok(blob)
+        send("a blob", post.body(bytes)).await.map(drop)
     }
 
     fn request(&self, method: Method, path: &str) -> RequestBuilder {
@@ -132,21 +123,6 @@ impl Server {
     fn url(&self, path: &str) -> String {
         format!("{}{path}", self.base.as_str().trim_end_matches('/'))
     }
-}
-
-/// A file in a tar+zstd, as the packer writes it.
-fn content() -> (Vec<u8>, ContentFacts) {
-    let script: &[u8] = b"#!/bin/sh\nexec sleep infinity\n";
-    let mut header = tar::Header::new_ustar();
-    header.set_size(script.len() as u64);
-    header.set_mode(0o755);
-    header.set_entry_type(tar::EntryType::Regular);
-    let mut archive = tar::Builder::new(Vec::new());
-    let tar = archive.append_data(&mut header, "run.sh", script).and_then(|()| archive.into_inner());
-    // Writing to memory does not fail.
-    let tar = tar.unwrap_or_default();
-    let facts = ContentFacts { tar_digest: Digest::of(&tar), tar_size: tar.len() as u64, entries: 1 };
-    (zstd::bulk::compress(&tar, 0).unwrap_or_default(), facts)
 }
 
 fn json_bytes(value: &impl serde::Serialize) -> Vec<u8> {

@@ -14,5 +14,6 @@ mod registry;
 mod restore;
 mod ros;
 mod ros1;
+mod scenarios;
 mod talker;
 mod tidy;

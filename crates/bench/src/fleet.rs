@@ -1,0 +1,259 @@
+//! A run's view of its simulated robots: it registers them, starts the process they live in, and hears from it who has
+//! verified what, when.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::{Context as _, anyhow, bail};
+use task_proto::api::{CreateEnrollmentToken, EnrollRequest};
+use task_proto::id::Labels;
+use task_proto::token::Token;
+use task_proto::{DeploymentId, Digest, MacAddress, TaskName};
+use tempfile::TempDir;
+use tokio::io::{AsyncBufReadExt as _, AsyncWriteExt as _, BufReader};
+use tokio::process::{ChildStdin, ChildStdout};
+use tokio::sync::mpsc;
+use tokio::time::Instant;
+
+use crate::clock::monotonic_ns;
+use crate::link::Link;
+use crate::measure::{PHASE_LIMIT, every};
+use crate::package::PAYLOAD_FILE;
+use crate::process::{Process, Program, Usage};
+use crate::robots::words::{Crew, Member, Order, Word};
+use crate::taskd::Taskd;
+
+/// Enrolments under way at a time.
+const REQUESTS_AT_ONCE: usize = 16;
+/// Words from the robots' process that were not read yet.
+const QUEUED_WORDS: usize = 1024;
+/// Where robots have their data: memory, because every real robot has a disk of its own and here they would share one.
+const MEMORY: &str = "/dev/shm";
+/// How long putting all robots together may take.
+const ASSEMBLY_LIMIT: Duration = Duration::from_secs(300);
+
+/// Simulated robots that run. Dropping it kills them.
+pub struct Fleet {
+    process: Process,
+    input: ChildStdin,
+    words: mpsc::Receiver<Word>,
+    dir: TempDir,
+    /// How many there are.
+    pub robots: usize,
+    /// What registering each took.
+    pub enrolments: Vec<Duration>,
+}
+
+/// What became of an order, robot by robot.
+#[derive(Debug, Default)]
+pub struct Arrivals {
+    /// Who arrived, and after how many milliseconds.
+    pub arrived: Vec<(usize, f64)>,
+    /// Why the others did not.
+    pub failures: Vec<String>,
+}
+
+impl Arrivals {
+    /// The delays.
+    pub fn delays_ms(&self) -> impl Iterator<Item = f64> {
+        self.arrived.iter().map(|(_, ms)| *ms)
+    }
+
+    /// The last one's delay.
+    pub fn last_ms(&self) -> Option<f64> {
+        self.delays_ms().max_by(f64::total_cmp)
+    }
+}
+
+impl Fleet {
+    /// Registers `robots` robots at `taskd` and puts them together; they do not run yet.
+    pub async fn assemble(taskd: &Taskd, robots: usize, poll: Duration, link: Option<&Link>) -> anyhow::Result<Self> {
+        let (members, enrolments, key) = enrol(taskd, robots).await?;
+        let mut builder = tempfile::Builder::new();
+        builder.prefix("taskbench-robots-");
+        let memory = Path::new(MEMORY);
+        let dir = if memory.is_dir() { builder.tempdir_in(memory) } else { builder.tempdir() };
+        let dir = dir.context("a directory for the robots")?;
+        let crew = Crew {
+            server: format!("http://{}", taskd.http),
+            mqtt_host: taskd.mqtt.ip().to_string(),
+            key,
+            data: dir.path().to_owned(),
+            poll_ms: u64::try_from(poll.as_millis())?,
+            own_addresses: link.is_none(),
+            members,
+        };
+        let mut program = Program::beside("taskbench", None)?.args(["robots"]);
+        if let Some(link) = link {
+            program = program.within(link.inside());
+        }
+        let (process, input, output) = program.converse(&dir.path().join("robots.log"))?;
+        let (said, words) = mpsc::channel(QUEUED_WORDS);
+        tokio::spawn(read_words(output, said));
+        let mut fleet = Self { process, input, words, dir, robots, enrolments };
+        fleet.tell(&serde_json::to_vec(&crew)?).await?;
+        match tokio::time::timeout(ASSEMBLY_LIMIT, fleet.words.recv()).await {
+            Ok(Some(Word::Ready)) => Ok(fleet),
+            Ok(word) => Err(fleet.lost(&format!("said {word:?} instead of being ready"))),
+            Err(_) => Err(fleet.lost(&format!("was not ready within {ASSEMBLY_LIMIT:?}"))),
+        }
+    }
+
+    /// Lets all robots begin at once; gives each one's time until it keeps to the server's state and the server knows.
+    pub async fn start(&mut self, limit: Duration) -> anyhow::Result<Arrivals> {
+        let begun_ns = monotonic_ns();
+        self.tell(&serde_json::to_vec(&Order::Start)?).await?;
+        let news = |word: Word| match word {
+            Word::Reconciled { robot, at_ns } => Some((robot, Ok(at_ns))),
+            _ => None,
+        };
+        self.hear(self.robots, begun_ns, limit, "is not connected and reconciled", news).await
+    }
+
+    /// Waits until the first `robots` robots have verified `deployment`, which was ordered at `ordered_ns`, or have failed.
+    pub async fn verified(
+        &mut self,
+        deployment: &DeploymentId,
+        robots: usize,
+        ordered_ns: u64,
+        limit: Duration,
+    ) -> anyhow::Result<Arrivals> {
+        let news = |word: Word| match word {
+            Word::Verified { robot, deployment: by, at_ns } if by == *deployment => Some((robot, Ok(at_ns))),
+            Word::Failed { robot, deployment: by, why } if by == *deployment => Some((robot, Err(why))),
+            _ => None,
+        };
+        self.hear(robots, ordered_ns, limit, "has not verified it", news).await
+    }
+
+    async fn hear(
+        &mut self,
+        robots: usize,
+        since_ns: u64,
+        limit: Duration,
+        missing: &str,
+        news: impl Fn(Word) -> Option<(usize, Result<u64, String>)>,
+    ) -> anyhow::Result<Arrivals> {
+        let deadline = Instant::now() + limit;
+        let mut arrivals = Arrivals::default();
+        let mut heard = vec![false; robots];
+        while heard.contains(&false) {
+            let Ok(word) = tokio::time::timeout_at(deadline, self.words.recv()).await else { break };
+            let Some(word) = word else { return Err(self.lost("ended")) };
+            let Some((robot, outcome)) = news(word) else { continue };
+            if heard.get(robot) != Some(&false) {
+                continue;
+            }
+            heard[robot] = true;
+            match outcome {
+                Ok(at_ns) => arrivals.arrived.push((robot, at_ns.saturating_sub(since_ns) as f64 / 1e6)),
+                Err(why) => arrivals.failures.push(why),
+            }
+        }
+        let late = heard.iter().filter(|heard| !**heard).count();
+        arrivals.failures.extend((0..late).map(|_| format!("a robot {missing} within {limit:?}")));
+        Ok(arrivals)
+    }
+
+    /// What the payload that robot `number` has unpacked hashes to.
+    pub fn payload(&self, number: usize, package: &TaskName, manifest: &Digest) -> anyhow::Result<Digest> {
+        let data = task_agent::layout::DataDir::new(&self.dir.path().join(number.to_string()))?;
+        let path: PathBuf = data.task(package).version(manifest).src().join(PAYLOAD_FILE);
+        let bytes = std::fs::read(&path).with_context(|| path.display().to_string())?;
+        Ok(Digest::of(&bytes))
+    }
+
+    /// What all robots together have used until now.
+    pub fn usage(&self) -> Usage {
+        self.process.usage()
+    }
+
+    /// Ends the robots.
+    pub async fn end(self) -> anyhow::Result<()> {
+        drop(self.input);
+        self.process.end().await;
+        self.dir.close().context("the robots' directory can't be removed")
+    }
+
+    async fn tell(&mut self, line: &[u8]) -> anyhow::Result<()> {
+        let told = async {
+            self.input.write_all(line).await?;
+            self.input.write_all(b"\n").await?;
+            self.input.flush().await
+        };
+        let told = told.await;
+        told.map_err(|error| self.lost(&format!("can't be told anything: {error}")))
+    }
+
+    fn lost(&self, what: &str) -> anyhow::Error {
+        let log = std::fs::read_to_string(self.dir.path().join("robots.log")).unwrap_or_default();
+        anyhow!("the robots' process {what}: {}", log.trim().lines().next_back().unwrap_or("it said nothing"))
+    }
+}
+
+async fn read_words(output: ChildStdout, said: mpsc::Sender<Word>) {
+    let mut lines = BufReader::new(output).lines();
+    while let Ok(Some(line)) = lines.next_line().await {
+        let Ok(word) = serde_json::from_str(&line) else { return };
+        if said.send(word).await.is_err() {
+            return;
+        }
+    }
+}
+
+/// Registers robots named `r0000`, `r0001`, … with addresses that no hardware has.
+async fn enrol(
+    taskd: &Taskd,
+    robots: usize,
+) -> anyhow::Result<(Vec<Member>, Vec<Duration>, task_proto::envelope::PublicKey)> {
+    let order = CreateEnrollmentToken { uses: Some(robots as u64), ..Default::default() };
+    let token = taskd.server.create_enrollment_token(&order).await?.token;
+    let key = token.parse::<Token>()?.server_key().context("the enrolment token pins no key")?.clone();
+    let steps = (0..robots).map(|number| {
+        let (server, token) = (&taskd.server, &token);
+        async move {
+            let begun = std::time::Instant::now();
+            let [.., a, b, c] = u64::try_from(number)?.to_be_bytes();
+            let mac = MacAddress::from_octets([0x02, 0, 0, a, b, c]).context("no MAC")?;
+            let name = Some(name(number).parse()?);
+            let enrolled = server.enroll(token, &EnrollRequest { mac, name, labels: Labels::new() }).await?;
+            Ok((number, Member { mac, enrolled }, begun.elapsed()))
+        }
+    });
+    let mut all = Vec::with_capacity(robots);
+    for step in every(REQUESTS_AT_ONCE, PHASE_LIMIT, steps).await {
+        all.push(step.context("a robot can't be registered")?);
+    }
+    if all.len() != robots {
+        bail!("{} of {robots} robots were registered", all.len());
+    }
+    all.sort_unstable_by_key(|(number, ..)| *number);
+    let (members, took) = all.into_iter().map(|(_, member, took)| (member, took)).unzip();
+    Ok((members, took, key))
+}
+
+/// A robot's name.
+pub fn name(number: usize) -> String {
+    format!("r{number:05}")
+}
+
+/// The selector that means the first `robots` of a fleet of `all`.
+pub fn first(robots: usize, all: usize) -> String {
+    if robots == all { "*".to_owned() } else { (0..robots).map(name).collect::<Vec<_>>().join(",") }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_robots_are_named() {
+        assert_eq!((first(2, 8), first(8, 8)), ("r00000,r00001".to_owned(), "*".to_owned()));
+    }
+
+    #[test]
+    fn arrivals_know_their_last() {
+        let arrivals = Arrivals { arrived: vec![(0, 3.0), (1, 9.0), (2, 5.0)], failures: Vec::new() };
+        assert_eq!((arrivals.last_ms(), Arrivals::default().last_ms()), (Some(9.0), None));
+    }
+}

@@ -1,0 +1,155 @@
+//! One order, from its making to its end: a package that nobody has seen, pushed beforehand; the time from the order to
+//! each robot's verified answer; the bytes at the server's sockets meanwhile; whether every robot has what was pushed.
+
+use std::time::Duration;
+
+use anyhow::{Context as _, ensure};
+use task_proto::api::{AssignmentView, CreateDeployment, DeliveryChoice, DeploymentView, ServerInfo};
+use task_proto::{Digest, TaskName, Version};
+
+use crate::clock::monotonic_ns;
+use crate::fleet::{Arrivals, Fleet, first};
+use crate::package::Package;
+use crate::taskd::Taskd;
+
+/// The name of every package.
+const NAME: &str = "taskbench";
+/// The rule that a decision names when a robot was told to pull because it was too slow.
+const FELL_BEHIND: &str = "fell behind";
+/// Payloads above it are hashed again in samples only: the agent has hashed each.
+const CHECKED_BYTES: u64 = 20_000_000;
+
+/// What is ordered.
+#[derive(Debug, Clone, Copy)]
+pub struct OneOrder {
+    /// How the bytes are to travel.
+    pub choice: DeliveryChoice,
+    /// How many.
+    pub payload_bytes: u64,
+    /// To the first so many robots of the fleet.
+    pub robots: usize,
+    /// What the bytes are made from; no two orders of a run have the same.
+    pub seed: u64,
+    /// How long it may take.
+    pub limit: Duration,
+}
+
+/// What became of it.
+#[derive(Debug, Default)]
+pub struct Outcome {
+    /// Each robot's delay, and why others did not arrive.
+    pub arrivals: Arrivals,
+    /// Bytes at the sockets both ways, from the order to the last answer, the order itself included.
+    pub mqtt_bytes: u64,
+    /// Likewise.
+    pub http_bytes: u64,
+    /// The decisions that were made: mechanism and rule.
+    pub decisions: Vec<String>,
+    /// Robots that were told to pull because they were too slow.
+    pub fell_behind: usize,
+}
+
+/// Makes the order and waits for its end. An error is one of the bench; what the system does wrong is in the outcome.
+pub async fn run_once(taskd: &Taskd, fleet: &mut Fleet, order: OneOrder) -> anyhow::Result<Outcome> {
+    let (name, version): (TaskName, Version) = (NAME.parse()?, format!("{:016x}", order.seed).parse()?);
+    let (of, bytes, seed) = (name.clone(), order.payload_bytes, order.seed);
+    let package = tokio::task::spawn_blocking(move || Package::random(of, version, bytes, seed)).await?;
+    let payload = package.payload;
+    let manifest = taskd.server.push(package).await.context("the package can't be pushed")?;
+    let create = CreateDeployment {
+        package: name.clone(),
+        manifest,
+        selector: first(order.robots, fleet.robots).parse()?,
+        delivery: order.choice,
+        priority: 0,
+        batch: None,
+        max_failures: None,
+        expires_in_s: None,
+        dry_run: false,
+    };
+    let (before, own) = own_bytes(taskd).await?;
+    let ordered_ns = monotonic_ns();
+    let deployment = match taskd.server.order(&create).await {
+        Ok(deployment) => deployment,
+        Err(error) => {
+            let refused = format!("the order is refused: {:#}", anyhow::Error::new(error));
+            let arrivals = Arrivals { failures: vec![refused; order.robots], ..Arrivals::default() };
+            taskd.server.remove_package(&name, &manifest).await.context("the package can't be removed")?;
+            return Ok(Outcome { arrivals, ..Outcome::default() });
+        }
+    };
+    let arrivals = fleet.verified(&deployment.id, order.robots, ordered_ns, order.limit).await?;
+    let after = taskd.server.info().await?;
+    let view = taskd.server.deployment(&deployment.id).await?;
+    let mut outcome = Outcome {
+        mqtt_bytes: mqtt_bytes(&after) - mqtt_bytes(&before),
+        http_bytes: (http_bytes(&after) - http_bytes(&before)).saturating_sub(own),
+        arrivals,
+        ..Outcome::default()
+    };
+    outcome.read_decisions(&view, order.choice);
+    check_payloads(fleet, &mut outcome.arrivals, order.payload_bytes, &name, &manifest, payload)?;
+    // Robots keep it until the next order takes its place; its name is of no more use.
+    taskd.server.remove_package(&name, &manifest).await.context("the package can't be removed")?;
+    Ok(outcome)
+}
+
+impl Outcome {
+    fn read_decisions(&mut self, view: &DeploymentView, choice: DeliveryChoice) {
+        let mut other = Vec::new();
+        let assignments = || view.assignments.iter().flatten().filter(|one: &&AssignmentView| one.released);
+        for decision in assignments().filter_map(|one| one.delivery.as_ref()) {
+            self.decisions.push(format!("{} ({})", decision.mechanism, decision.rule));
+            if decision.rule == FELL_BEHIND {
+                self.fell_behind += 1;
+            } else if choice.mechanism().is_some_and(|ordered| ordered != decision.mechanism) {
+                other.push(format!("the server delivers by {} instead", decision.mechanism));
+            }
+        }
+        let is_plain = choice == DeliveryChoice::PushPull;
+        let untold = assignments().filter(|one| one.delivery.is_none() && !is_plain);
+        other.extend(untold.map(|_| "the server does not say how it delivers".to_owned()));
+        if !other.is_empty() {
+            // The figures would be another mechanism's.
+            self.arrivals = Arrivals { arrived: Vec::new(), failures: other };
+        }
+    }
+}
+
+/// What is on the robots, or a failure of each that has something else. Its agent has verified it: this checks the bench.
+fn check_payloads(
+    fleet: &Fleet,
+    arrivals: &mut Arrivals,
+    payload_bytes: u64,
+    name: &TaskName,
+    manifest: &Digest,
+    payload: Digest,
+) -> anyhow::Result<()> {
+    let mut wrong = Vec::new();
+    let checked = if payload_bytes > CHECKED_BYTES { 1 } else { arrivals.arrived.len() };
+    for (robot, _) in arrivals.arrived.iter().take(checked) {
+        if fleet.payload(*robot, name, manifest)? != payload {
+            wrong.push(*robot);
+        }
+    }
+    arrivals.arrived.retain(|(robot, _)| !wrong.contains(robot));
+    arrivals.failures.extend(wrong.iter().map(|_| "a robot has verified other bytes than were pushed".to_owned()));
+    Ok(())
+}
+
+/// The figures now, and how many bytes asking for them costs.
+async fn own_bytes(taskd: &Taskd) -> anyhow::Result<(ServerInfo, u64)> {
+    let first = taskd.server.info().await?;
+    let second = taskd.server.info().await?;
+    ensure!(http_bytes(&second) > http_bytes(&first), "the server does not count what goes over HTTP");
+    let own = http_bytes(&second) - http_bytes(&first);
+    Ok((second, own))
+}
+
+fn mqtt_bytes(info: &ServerInfo) -> u64 {
+    info.traffic.all.bytes_in + info.traffic.all.bytes_out
+}
+
+fn http_bytes(info: &ServerInfo) -> u64 {
+    info.http.bytes_in + info.http.bytes_out
+}

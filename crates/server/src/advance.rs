@@ -6,6 +6,7 @@ use task_proto::DeploymentId;
 use task_proto::desired::Delivery;
 
 use crate::changes::Consequences;
+use crate::chooser::Chooser;
 use crate::rollout::{Move, next_move};
 use crate::store::{StoreError, Write};
 
@@ -13,6 +14,7 @@ use crate::store::{StoreError, Write};
 /// some robot may settle that one's batch, so that one is looked at as well.
 pub async fn advance(
     write: &mut Write,
+    chooser: &Chooser,
     touched: BTreeSet<DeploymentId>,
     now_ms: u64,
     consequences: &mut Consequences,
@@ -27,12 +29,15 @@ pub async fn advance(
             Move::Release(count) => {
                 let released = write.release(&deployment, count, now_ms).await?;
                 consequences.deployments.extend(released.superseded.iter().cloned());
-                // Robots that are to ask by themselves are not rung.
-                let told = match released.delivery {
-                    Delivery::Poll => &mut consequences.robots,
-                    Delivery::PushPull | Delivery::DirectPush | Delivery::Inline => &mut consequences.rings,
-                };
-                told.extend(released.robots);
+                for (robot, mechanism) in chooser.decide(write, &deployment, &released.robots, now_ms).await? {
+                    // Robots that are to ask by themselves are not rung.
+                    match mechanism {
+                        Delivery::Poll => consequences.robots.insert(robot),
+                        Delivery::PushPull | Delivery::DirectPush | Delivery::Inline => {
+                            consequences.rings.insert(robot)
+                        }
+                    };
+                }
                 waiting.extend(released.superseded);
             }
         }

@@ -49,7 +49,7 @@ pub struct Inputs {
     pub battery_percent: Option<u64>,
     /// Transfers that the server serves now.
     pub transfers: u64,
-    /// Messages that wait in the server for listeners to take them.
+    /// Bytes of parts that wait in the server for listeners to take them.
     pub backlog: u64,
 }
 
@@ -322,17 +322,13 @@ impl Quantity {
     /// In what its values are given.
     pub fn unit(self) -> Unit {
         match self {
-            Self::Size | Self::Lacking => Unit::Bytes,
+            Self::Size | Self::Lacking | Self::Backlog => Unit::Bytes,
             Self::Throughput => Unit::BytesPerSecond,
             Self::Rtt => Unit::Milliseconds,
             Self::Battery => Unit::Percent,
-            Self::Robots
-            | Self::Batch
-            | Self::SameSite
-            | Self::Losses
-            | Self::Reconnects
-            | Self::Transfers
-            | Self::Backlog => Unit::Count,
+            Self::Robots | Self::Batch | Self::SameSite | Self::Losses | Self::Reconnects | Self::Transfers => {
+                Unit::Count
+            }
         }
     }
 
@@ -545,7 +541,7 @@ mod tests {
             "backlog_at_least",
             100,
             Inputs { backlog: 200, ..of() },
-            "backlog 200 ≥ 100",
+            "backlog 200 B ≥ 100 B",
             Inputs { backlog: 99, ..of() },
         );
     }

@@ -8,6 +8,7 @@ pub mod blobs;
 pub mod broker;
 pub mod broker_url;
 pub mod changes;
+pub mod chooser;
 pub mod clock;
 pub mod collector;
 pub mod commands;

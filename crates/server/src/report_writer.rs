@@ -13,6 +13,7 @@ use tokio::task::JoinHandle;
 
 use crate::advance::advance;
 use crate::changes::{Changes, Consequences};
+use crate::chooser::Chooser;
 use crate::clock::Clock;
 use crate::store::{OpenAssignment, ReportedRobot, Store, StoreError, Write};
 
@@ -59,9 +60,9 @@ struct Submission {
 
 impl ReportWriter {
     /// Starts the writer. The task ends, after all that was handed in, when the last clone is dropped.
-    pub fn start(store: Store, clock: Clock, changes: Changes) -> (Self, JoinHandle<()>) {
+    pub fn start(store: Store, clock: Clock, changes: Changes, chooser: Chooser) -> (Self, JoinHandle<()>) {
         let (queue, submissions) = mpsc::channel(QUEUE);
-        (Self { queue }, tokio::spawn(write_all(submissions, store, clock, changes)))
+        (Self { queue }, tokio::spawn(write_all(submissions, store, clock, changes, chooser)))
     }
 
     /// Stores `report`, whose `robot_id` the caller has authenticated by the robot's token of this number. Resolves after
@@ -74,11 +75,17 @@ impl ReportWriter {
     }
 }
 
-async fn write_all(mut submissions: mpsc::Receiver<Submission>, store: Store, clock: Clock, changes: Changes) {
+async fn write_all(
+    mut submissions: mpsc::Receiver<Submission>,
+    store: Store,
+    clock: Clock,
+    changes: Changes,
+    chooser: Chooser,
+) {
     let mut batch = Vec::with_capacity(MAX_BATCH);
     while submissions.recv_many(&mut batch, MAX_BATCH).await > 0 {
         let newest = newest_by_robot(&batch);
-        let answers = match write_with_retries(&store, &newest, &clock).await {
+        let answers = match write_with_retries(&store, &chooser, &newest, &clock).await {
             Ok((answers, consequences)) => {
                 changes.publish(consequences);
                 Ok(answers)
@@ -134,12 +141,13 @@ type Answers = HashMap<RobotId, Answer>;
 
 async fn write_with_retries(
     store: &Store,
+    chooser: &Chooser,
     reports: &[&Submission],
     clock: &Clock,
 ) -> Result<(Answers, Consequences), StoreError> {
     let mut pause = FIRST_PAUSE;
     for _ in 1..TRIES {
-        match write_batch(store, reports, clock.now_ms()).await {
+        match write_batch(store, chooser, reports, clock.now_ms()).await {
             Ok(written) => return Ok(written),
             Err(error) => tracing::warn!(
                 error = &error as &dyn std::error::Error,
@@ -150,12 +158,13 @@ async fn write_with_retries(
         tokio::time::sleep(pause).await;
         pause *= 2;
     }
-    write_batch(store, reports, clock.now_ms()).await
+    write_batch(store, chooser, reports, clock.now_ms()).await
 }
 
 /// Stores a batch and what follows from it, in one write.
 async fn write_batch(
     store: &Store,
+    chooser: &Chooser,
     reports: &[&Submission],
     now_ms: u64,
 ) -> Result<(Answers, Consequences), StoreError> {
@@ -175,7 +184,7 @@ async fn write_batch(
     let moved = write_standings(&mut write, &news, now_ms).await?;
     write.store_reports(&news, now_ms).await?;
     consequences.deployments.extend(moved.iter().cloned());
-    advance(&mut write, moved, now_ms, &mut consequences).await?;
+    advance(&mut write, chooser, moved, now_ms, &mut consequences).await?;
     // A batch that has just been released may have raised generations.
     let rung: Vec<RobotId> = consequences.rings.iter().filter(|robot| known.contains_key(*robot)).cloned().collect();
     known.extend(write.reported_robots(&rung).await?.into_iter().map(|robot| (robot.id.clone(), robot)));

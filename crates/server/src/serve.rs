@@ -16,6 +16,7 @@ use crate::backlog::listen;
 use crate::blobs::{BlobError, BlobSettings, Blobs};
 use crate::broker::{Broker, BrokerConfig, BrokerError, ExternalConfig, Gatekeeper, Health, Inbox, Limits};
 use crate::changes::{Change, Changes};
+use crate::chooser::{Chooser, ServerLoad};
 use crate::clock::Clock;
 use crate::collector;
 use crate::config::Config;
@@ -46,6 +47,8 @@ const DATABASE_PATIENCE: Duration = Duration::from_secs(1);
 const EXPIRY_INTERVAL: Duration = Duration::from_secs(30);
 /// How often it looks for robots that have fallen silent.
 const SILENCE_INTERVAL: Duration = Duration::from_secs(5);
+/// How often it looks at how busy it is.
+const LOAD_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Why the server did not start.
 #[derive(Debug, thiserror::Error)]
@@ -100,8 +103,11 @@ impl Server {
 
         let changes = Changes::new();
         let presence = Arc::new(Presence::new(milliseconds(config.presence_timeout)));
-        let actions = Actions::new(store.clone(), clock.clone(), changes.clone(), key, action_settings(&config));
-        let (writer, reports) = ReportWriter::start(store.clone(), clock.clone(), changes.clone());
+        let load = Arc::new(ServerLoad::default());
+        let chooser = Chooser::new(&config.delivery, presence.clone(), load.clone());
+        let settings = action_settings(&config);
+        let actions = Actions::new(store.clone(), clock.clone(), changes.clone(), key, settings, chooser.clone());
+        let (writer, reports) = ReportWriter::start(store.clone(), clock.clone(), changes.clone(), chooser);
         let (requests, logs) = (Requests::default(), RobotLogs::new());
         let (heard, said) = (requests.clone(), logs.clone());
         let uplink = Uplink::new(writer.clone(), heard, said, presence.clone(), changes.clone(), clock.clone());
@@ -133,6 +139,7 @@ impl Server {
             stop: stop.clone(),
         };
         start_tasks(&tasks, &app, config.blob_grace);
+        tasks.spawn(watch_load(app.clone(), load));
         let router = crate::http::router(app);
         let http = listener::serve(http, router, http_limits(&config), http_traffic, stop.clone(), REQUEST_PATIENCE);
         let mqtt_address = broker.local_addr().map(|bound| reachable(bound).to_string());
@@ -195,6 +202,7 @@ impl Server {
 fn start_tasks(tasks: &TaskTracker, app: &App, blob_grace: Duration) {
     let downlink = Downlink {
         actions: app.actions.clone(),
+        blobs: app.blobs.clone(),
         broker: app.broker.clone(),
         presence: app.presence.clone(),
         clock: app.clock.clone(),
@@ -217,6 +225,13 @@ async fn expire_assignments(app: App) {
                 "assignments could not be looked through for expired ones"
             );
         }
+    }
+}
+
+async fn watch_load(app: App, load: Arc<ServerLoad>) {
+    let mut ticks = ticks(LOAD_INTERVAL);
+    while next_tick(&mut ticks, &app.stop).await {
+        load.set(app.transfers.running(), app.broker.queued_part_bytes() as u64);
     }
 }
 

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use task_proto::api::{CreateDeployment, PackageView};
+use task_proto::api::{CreateDeployment, DeliveryChoice, MAX_PRIORITY, MIN_PRIORITY, PackageView};
 use task_proto::report::Phase;
 use task_proto::{DeploymentId, RobotId};
 
@@ -10,6 +10,8 @@ use super::robots::lifetime_ms;
 use super::{ActionError, Actions, DAY_MS, IdempotencyKey};
 use crate::advance::advance;
 use crate::changes::Consequences;
+use crate::chooser::{Chooser, travelling_bytes};
+use crate::delivery::shown_bytes;
 use crate::store::{NewDeployment, Revocable, Write};
 
 /// How long an idempotency key is remembered.
@@ -33,10 +35,15 @@ impl Actions {
         if order.batch == Some(0) {
             return Err(ActionError::Invalid { key: "batch", reason: "expected at least 1 robot".to_owned() });
         }
+        if !(MIN_PRIORITY..=MAX_PRIORITY).contains(&order.priority) {
+            let reason = format!("expected {MIN_PRIORITY} to {MAX_PRIORITY}, not {}", order.priority);
+            return Err(ActionError::Invalid { key: "priority", reason });
+        }
         let mut write = self.store.begin().await?;
         if let Some(answer) = self.answered_before(&mut write, key, &request).await? {
             return Ok(answer);
         }
+        self.check_fits(order, package)?;
         let robots = write.matching_robots(&order.selector).await?;
         if robots.is_empty() {
             return Err(ActionError::NoRobotsMatch(order.selector.to_string()));
@@ -50,11 +57,23 @@ impl Actions {
         let mut touched = write.assign(&id, task, &robots, expires_at_ms, now_ms).await?;
         touched.insert(id.clone());
         let mut consequences = Consequences { deployments: touched.clone(), ..Consequences::default() };
-        advance(&mut write, touched, now_ms, &mut consequences).await?;
+        advance(&mut write, &self.chooser, touched, now_ms, &mut consequences).await?;
         self.remember_answer(&mut write, key, &request, &id, now_ms).await?;
         write.commit().await?;
         self.changes.publish(consequences);
         Ok(id)
+    }
+
+    /// What is ordered to ride inside an announcement must fit into one.
+    fn check_fits(&self, order: &CreateDeployment, package: &PackageView) -> Result<(), ActionError> {
+        let (size, most) = (travelling_bytes(&package.package), self.chooser.inline_bytes());
+        if order.delivery != DeliveryChoice::Inline || size <= most {
+            return Ok(());
+        }
+        let exact =
+            |bytes: u64| if shown_bytes(size) == shown_bytes(most) { format!("{bytes} B") } else { shown_bytes(bytes) };
+        let package = format!("{} {}", package.package.name, package.package.version);
+        Err(ActionError::TooLargeForInline { package, size: exact(size), most: exact(most) })
     }
 
     /// The deployment that `key` with this `order` gave before. A repeated order is answered also when its package is gone.
@@ -79,7 +98,7 @@ impl Actions {
         write.adopt_diverged(&robots, now_ms).await?;
         write.mark_cancelled(id, now_ms).await?;
         let taken = write.revocable(id).await?;
-        let mut consequences = take_back(&mut write, &taken, Phase::Cancelled, now_ms).await?;
+        let mut consequences = take_back(&mut write, &self.chooser, &taken, Phase::Cancelled, now_ms).await?;
         write.skip_as_previous(id).await?;
         consequences.deployments.insert(id.clone());
         write.commit().await?;
@@ -100,7 +119,7 @@ impl Actions {
         write.resume(id, rollout.forgiven.max(tally.failed)).await?;
         let touched = BTreeSet::from([id.clone()]);
         let mut consequences = Consequences { deployments: touched.clone(), ..Consequences::default() };
-        advance(&mut write, touched, now_ms, &mut consequences).await?;
+        advance(&mut write, &self.chooser, touched, now_ms, &mut consequences).await?;
         write.commit().await?;
         self.changes.publish(consequences);
         Ok(())
@@ -114,7 +133,7 @@ impl Actions {
         write.forget_orders(now_ms.saturating_sub(KEY_LIFETIME_MS)).await?;
         write.forget_ended_tokens(now_ms).await?;
         let overdue = write.overdue(now_ms).await?;
-        let consequences = take_back(&mut write, &overdue, Phase::Expired, now_ms).await?;
+        let consequences = take_back(&mut write, &self.chooser, &overdue, Phase::Expired, now_ms).await?;
         write.commit().await?;
         self.changes.publish(consequences);
         Ok(())
@@ -133,6 +152,7 @@ async fn is_cancelled(write: &mut Write, id: &DeploymentId) -> Result<bool, Acti
 /// Ends `taken` in `phase`, puts back what it had replaced, and moves on the rollouts this touches.
 async fn take_back(
     write: &mut Write,
+    chooser: &Chooser,
     taken: &[Revocable],
     phase: Phase,
     now_ms: u64,
@@ -145,6 +165,6 @@ async fn take_back(
         rings: taken_back.into_iter().collect(),
         deployments: touched.clone(),
     };
-    advance(write, touched, now_ms, &mut consequences).await?;
+    advance(write, chooser, touched, now_ms, &mut consequences).await?;
     Ok(consequences)
 }

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::sync::{Mutex, PoisonError};
 
-use task_proto::desired::DesiredState;
+use task_proto::desired::{BlobRef, DesiredState};
 use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope};
 use task_proto::{Generation, RobotId};
 
@@ -20,25 +20,35 @@ pub struct Desired {
     pub generation: Generation,
     /// The signed document.
     pub envelope: Envelope,
+    /// Blobs that are to ride along with it where it is pushed.
+    pub along: Vec<BlobRef>,
 }
 
-/// Signed states by robot, with when they were signed.
+/// A signed state and when it was signed.
+#[derive(Debug)]
+struct Kept {
+    issued_at_ms: u64,
+    generation: Generation,
+    envelope: Envelope,
+}
+
+/// Signed states by robot.
 #[derive(Debug, Default)]
-pub(super) struct Envelopes(Mutex<HashMap<RobotId, (u64, Desired)>>);
+pub(super) struct Envelopes(Mutex<HashMap<RobotId, Kept>>);
 
 impl Envelopes {
-    fn get(&self, robot: &RobotId, generation: Generation, signed_since_ms: u64) -> Option<Desired> {
+    fn get(&self, robot: &RobotId, generation: Generation, signed_since_ms: u64) -> Option<Envelope> {
         let kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let (issued_at_ms, desired) = kept.get(robot)?;
-        (desired.generation == generation && *issued_at_ms >= signed_since_ms).then(|| desired.clone())
+        let kept = kept.get(robot)?;
+        (kept.generation == generation && kept.issued_at_ms >= signed_since_ms).then(|| kept.envelope.clone())
     }
 
-    fn keep(&self, robot: &RobotId, issued_at_ms: u64, desired: &Desired) {
+    fn keep(&self, robot: &RobotId, state: Kept) {
         let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         if kept.len() >= MAX_KEPT {
             kept.clear();
         }
-        kept.insert(robot.clone(), (issued_at_ms, desired.clone()));
+        kept.insert(robot.clone(), state);
     }
 
     pub(super) fn forget(&self, robot: &RobotId) {
@@ -66,14 +76,14 @@ impl Actions {
     }
 
     fn sign(&self, found: DesiredTasks) -> Result<Desired, ActionError> {
-        let DesiredTasks { robot, generation, observed_generation, tasks } = found;
+        let DesiredTasks { robot, generation, observed_generation, tasks, along } = found;
         if observed_generation > generation {
             return Err(ActionError::Diverged(robot));
         }
         let now_ms = self.clock.now_ms();
         let lifetime_ms = self.settings.desired_lifetime_ms;
-        if let Some(desired) = self.envelopes.get(&robot, generation, now_ms.saturating_sub(lifetime_ms / 2)) {
-            return Ok(desired);
+        if let Some(envelope) = self.envelopes.get(&robot, generation, now_ms.saturating_sub(lifetime_ms / 2)) {
+            return Ok(Desired { generation, envelope, along });
         }
         let state = DesiredState {
             robot_id: robot.clone(),
@@ -84,8 +94,7 @@ impl Actions {
         };
         let payload = serde_json::to_vec(&state).expect("a desired state always has a JSON form");
         let envelope = Envelope::seal(DESIRED_STATE_TYPE, &payload, &self.key);
-        let desired = Desired { generation, envelope };
-        self.envelopes.keep(&robot, now_ms, &desired);
-        Ok(desired)
+        self.envelopes.keep(&robot, Kept { issued_at_ms: now_ms, generation, envelope: envelope.clone() });
+        Ok(Desired { generation, envelope, along })
     }
 }

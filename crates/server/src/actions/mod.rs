@@ -16,6 +16,7 @@ use task_proto::envelope::SigningKey;
 use task_proto::{DeploymentId, Digest, MacAddress, RobotId, RobotName};
 
 use crate::changes::Changes;
+use crate::chooser::Chooser;
 use crate::clock::Clock;
 use crate::store::{PastOrder, Store, StoreError, Write};
 
@@ -31,6 +32,7 @@ pub struct Actions {
     changes: Changes,
     key: Arc<SigningKey>,
     settings: ActionSettings,
+    chooser: Chooser,
     envelopes: Arc<desired::Envelopes>,
 }
 
@@ -60,9 +62,17 @@ impl Default for ActionSettings {
 }
 
 impl Actions {
-    /// Orders that go to `store` and are announced to `changes`; desired states are signed with `key`.
-    pub fn new(store: Store, clock: Clock, changes: Changes, key: SigningKey, settings: ActionSettings) -> Self {
-        Self { store, clock, changes, key: Arc::new(key), settings, envelopes: Arc::default() }
+    /// Orders that go to `store` and are announced to `changes`; desired states are signed with `key`, and how
+    /// packages travel is up to `chooser`.
+    pub fn new(
+        store: Store,
+        clock: Clock,
+        changes: Changes,
+        key: SigningKey,
+        settings: ActionSettings,
+        chooser: Chooser,
+    ) -> Self {
+        Self { store, clock, changes, key: Arc::new(key), settings, chooser, envelopes: Arc::default() }
     }
 
     /// What was answered when `key` came with this `request` before; an error if it came with another.
@@ -115,6 +125,16 @@ pub enum ActionError {
         /// What is wrong with its value.
         reason: String,
     },
+    /// More than an announcement may carry was ordered to ride inside one.
+    #[error("delivery: {package} has {size}, inline carries at most {most}")]
+    TooLargeForInline {
+        /// Name and version.
+        package: String,
+        /// What it has.
+        size: String,
+        /// What is possible.
+        most: String,
+    },
     /// Someone is registered by this MAC.
     #[error("a robot with MAC {mac} is registered as {name}; to register it again, make a token for that robot")]
     MacKnown {
@@ -164,6 +184,7 @@ impl ActionError {
             Self::NoRobotsMatch(_) => "no_robots_match",
             Self::IdempotencyKeyReused(_) => "idempotency_key_reused",
             Self::InvalidIdempotencyKey | Self::Invalid { .. } => "invalid_request",
+            Self::TooLargeForInline { .. } => "package_too_large",
             Self::MacKnown { .. } => "mac_known",
             Self::TokenForOther { .. } => "token_for_other_robot",
             Self::NameTaken(_) => "name_taken",

@@ -125,7 +125,7 @@ impl Actions {
         write.revoke_tokens(robot, now_ms).await?;
         write.remove_robot(robot, now_ms).await?;
         let mut consequences = Consequences { deployments: touched.clone(), ..Consequences::default() };
-        advance(&mut write, touched, now_ms, &mut consequences).await?;
+        advance(&mut write, &self.chooser, touched, now_ms, &mut consequences).await?;
         write.commit().await?;
         self.envelopes.forget(robot);
         self.changes.announce(Change::RobotRemoved(robot.clone()));

@@ -45,7 +45,7 @@ impl Actions {
             touched.extend(write.drop_waiting(Some(task), &ids, now_ms).await?);
         }
         consequences.deployments.extend(touched.iter().cloned());
-        advance(&mut write, touched, now_ms, &mut consequences).await?;
+        advance(&mut write, &self.chooser, touched, now_ms, &mut consequences).await?;
         let answer: Vec<MatchedRobot> = robots.into_iter().map(matched).collect();
         self.remember_answer(&mut write, key, &request, &answer, now_ms).await?;
         write.commit().await?;

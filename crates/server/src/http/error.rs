@@ -117,6 +117,7 @@ impl From<ActionError> for ApiError {
             ActionError::TokenRefused => StatusCode::UNAUTHORIZED,
             ActionError::TokenForOther { .. } => StatusCode::FORBIDDEN,
             ActionError::RobotNotFound(_) | ActionError::DeploymentNotFound(_) => StatusCode::NOT_FOUND,
+            ActionError::TooLargeForInline { .. } => StatusCode::UNPROCESSABLE_ENTITY,
             ActionError::NoRobotsMatch(_)
             | ActionError::IdempotencyKeyReused(_)
             | ActionError::MacKnown { .. }

@@ -5,12 +5,10 @@
 use std::collections::BTreeSet;
 
 use sqlx::{AssertSqlSafe, Row as _};
-use task_proto::api::DeliveryChoice;
-use task_proto::desired::Delivery;
 use task_proto::report::Phase;
 use task_proto::{DeploymentId, RobotId, TaskName};
 
-use super::rows::{from_word, groups, id, stored, values};
+use super::rows::{groups, id, stored, values};
 use super::{StoreError, Write};
 
 /// What may be ordered about a task that a robot has.
@@ -31,8 +29,6 @@ pub struct Released {
     pub robots: Vec<RobotId>,
     /// Deployments whose place was taken on some of them.
     pub superseded: BTreeSet<DeploymentId>,
-    /// How they learn of it.
-    pub delivery: Delivery,
 }
 
 /// An assignment that is to be taken back.
@@ -146,13 +142,7 @@ impl Write {
         .execute(self.connection())
         .await?;
         self.raise_generations(&robots).await?;
-        let delivery: String = sqlx::query_scalar("SELECT delivery FROM deployments WHERE id = $1")
-            .bind(deployment.as_str())
-            .fetch_one(self.connection())
-            .await?;
-        let choice: DeliveryChoice = from_word("deployments.delivery", &delivery)?;
-        let delivery = choice.mechanism().unwrap_or_default();
-        Ok(Released { robots, superseded: deployments(superseded)?, delivery })
+        Ok(Released { robots, superseded: deployments(superseded)? })
     }
 
     /// What a cancel takes back: all that has not settled, and what ended badly but is still what its robot should have.

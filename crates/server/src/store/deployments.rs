@@ -9,7 +9,8 @@ use task_proto::desired::PackageRef;
 use task_proto::manifest::TaskKind;
 use task_proto::report::Phase;
 
-use super::rows::{from_json, from_optional_json, from_word, id, json, number, stored, word};
+use super::deliveries;
+use super::rows::{from_json, from_optional_json, from_word, id, json, number, priority, stored, word};
 use super::{Store, StoreError, Write};
 use crate::deployment;
 use crate::rollout::{Rollout, Tally};
@@ -48,7 +49,7 @@ impl Store {
         let Some(mut view) = self.deployment_summary(id).await? else { return Ok(None) };
         let rows = sqlx::query(
             "SELECT a.robot_id, r.name, a.released, a.phase, a.progress, a.failure, a.attempts, a.superseded_by,
-                 a.updated_at_ms
+                 a.updated_at_ms, a.mechanism, a.rule, a.because
              FROM assignments a JOIN robots r ON r.id = a.robot_id WHERE a.deployment_id = $1",
         )
         .bind(id.as_str())
@@ -75,7 +76,7 @@ impl Store {
     /// The views of one deployment, or with an empty `id` of the newest.
     async fn deployment_views(&self, id: &str) -> Result<Vec<DeploymentView>, StoreError> {
         let rows = sqlx::query(AssertSqlSafe(format!(
-            "SELECT id, package, kind, selector, delivery, batch, max_failures, paused, created_at_ms, expires_at_ms,
+            "SELECT id, package, kind, selector, delivery, priority, batch, max_failures, paused, created_at_ms, expires_at_ms,
                  cancelled_at_ms
              FROM deployments WHERE id IN {LISTED} ORDER BY number DESC"
         )))
@@ -119,8 +120,8 @@ impl Write {
         let number = stored(self.turn());
         sqlx::query(
             "INSERT INTO deployments (id, number, task, version, package, kind, selector, delivery, batch, max_failures,
-                 created_at_ms, expires_at_ms)
-             VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12)",
+                 created_at_ms, expires_at_ms, priority)
+             VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13)",
         )
         .bind(new.id.as_str())
         .bind(number)
@@ -134,6 +135,7 @@ impl Write {
         .bind(new.order.max_failures.map(stored))
         .bind(stored(now_ms))
         .bind(stored(new.expires_at_ms))
+        .bind(i64::from(new.order.priority))
         .execute(self.connection())
         .await?;
         Ok(())
@@ -220,7 +222,7 @@ fn deployment_view(
         kind,
         selector: id("deployments.selector", row.try_get("selector")?)?,
         delivery: from_word("deployments.delivery", row.try_get("delivery")?)?,
-        priority: 0,
+        priority: priority(row)?,
         state: deployment::state(kind, cancelled, paused, &counts),
         batch: row.try_get::<Option<i64>, _>("batch")?.map(number),
         max_failures: row.try_get::<Option<i64>, _>("max_failures")?.map(number),
@@ -239,7 +241,7 @@ fn assignment_view(row: &sqlx::any::AnyRow) -> Result<AssignmentView, StoreError
         name: id("robots.name", row.try_get("name")?)?,
         online: false,
         released: row.try_get::<i64, _>("released")? == 1,
-        delivery: None,
+        delivery: deliveries::decision(row)?,
         phase: Phase::from_text(row.try_get("phase")?),
         progress: from_optional_json("assignments.progress", row.try_get("progress")?)?,
         failure: from_optional_json("assignments.failure", row.try_get("failure")?)?,

@@ -13,6 +13,7 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[
     (3, "token_rotation", include_str!("../migrations/0003_token_rotation.sql")),
     (4, "outputs", include_str!("../migrations/0004_outputs.sql")),
     (5, "broker_credentials", include_str!("../migrations/0005_broker_credentials.sql")),
+    (6, "delivery", include_str!("../migrations/0006_delivery.sql")),
 ];
 
 /// Applies what has not been applied yet.

@@ -5,6 +5,7 @@
 
 mod adoption;
 mod assignments;
+mod deliveries;
 mod deployments;
 mod migrate;
 mod orders;
@@ -22,6 +23,7 @@ use sqlx::any::{Any, AnyPoolOptions};
 use sqlx::{AnyConnection, AnyPool, Transaction};
 
 pub use assignments::{Released, Revocable, TaskOrder};
+pub use deliveries::{Decided, DeliveryOrder, RobotFacts};
 pub use deployments::NewDeployment;
 pub use orders::PastOrder;
 pub use packages::{NewManifest, PutManifest, Reference, StoredManifest};

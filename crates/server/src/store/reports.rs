@@ -102,11 +102,11 @@ impl Write {
     pub async fn store_reports(&mut self, reports: &[&Report], now_ms: u64) -> Result<(), StoreError> {
         for group in groups(reports) {
             let sql = format!(
-                "WITH v (id, start, seq, observed, report) AS ({})
+                "WITH v (id, start, seq, observed, report, link, battery) AS ({})
                  UPDATE robots SET report_start = v.start, report_seq = v.seq, observed_generation = v.observed,
-                     report = v.report, last_seen_ms = $1
+                     report = v.report, link = COALESCE(v.link, robots.link), battery = v.battery, last_seen_ms = $1
                  FROM v WHERE robots.id = v.id",
-                values(2, group.len(), &["TEXT", "BIGINT", "BIGINT", "BIGINT", "TEXT"])
+                values(2, group.len(), &["TEXT", "BIGINT", "BIGINT", "BIGINT", "TEXT", "TEXT", "BIGINT"])
             );
             let mut query = sqlx::query(AssertSqlSafe(sql)).bind(stored(now_ms));
             for report in group {
@@ -115,7 +115,9 @@ impl Write {
                     .bind(stored(report.start))
                     .bind(stored(report.seq))
                     .bind(stored(report.observed_generation.min(MAX_GENERATION).0))
-                    .bind(json(report));
+                    .bind(json(report))
+                    .bind(report.link.as_ref().map(json))
+                    .bind(report.host.battery_percent.map(|percent| i64::from(percent.min(100))));
             }
             query.execute(self.connection()).await?;
         }

@@ -3,14 +3,14 @@
 use std::collections::HashMap;
 
 use sqlx::{AssertSqlSafe, Row as _};
-use task_proto::api::{DeliveryChoice, RobotTask, RobotView};
-use task_proto::desired::{DesiredTask, PackageRef};
+use task_proto::api::{RobotTask, RobotView};
+use task_proto::desired::{BlobRef, Delivery, DesiredTask, PackageRef};
 use task_proto::id::Labels;
 use task_proto::report::{Condition, Phase, Report};
 use task_proto::selector::Selector;
 use task_proto::{Digest, Generation, MacAddress, RobotId, RobotName, TaskName};
 
-use super::rows::{from_json, from_optional_json, from_word, groups, id, json, number, stored, values};
+use super::rows::{from_json, from_optional_json, from_word, groups, id, json, number, priority, stored, values};
 use super::{Store, StoreError, Write};
 
 /// Who a robot is.
@@ -46,6 +46,8 @@ pub struct DesiredTasks {
     pub observed_generation: Generation,
     /// Its tasks, sorted by name.
     pub tasks: Vec<DesiredTask>,
+    /// Blobs that are to ride along with its state: it does not have them yet.
+    pub along: Vec<BlobRef>,
 }
 
 /// An order for which a robot fetches something.
@@ -138,7 +140,7 @@ impl Store {
             // One statement, so that generation and tasks belong together.
             let sql = format!(
                 "SELECT r.id, r.generation, r.observed_generation, a.task, a.deployment_id, a.wanted, a.run, d.package,
-                     d.delivery
+                     a.phase, COALESCE(a.mechanism, d.delivery) AS mechanism, d.priority
                  FROM robots r
                  LEFT JOIN assignments a ON a.robot_id = r.id AND a.desired = 1
                  LEFT JOIN deployments d ON d.id = a.deployment_id
@@ -157,9 +159,13 @@ impl Store {
                         generation: Generation(number(row.try_get("generation")?)),
                         observed_generation: Generation(number(row.try_get("observed_generation")?)),
                         tasks: Vec::new(),
+                        along: Vec::new(),
                     });
                 }
                 if let (Some(last), Some(task)) = (found.last_mut(), desired_task(&row)?) {
+                    if matches!(Phase::from_text(row.try_get("phase")?), Phase::Assigned | Phase::Fetching) {
+                        last.along.extend(riding(&task));
+                    }
                     last.tasks.push(task);
                 }
             }
@@ -171,9 +177,9 @@ impl Store {
     /// the robot should have.
     pub async fn fetched_by(&self, robot: &RobotId, digest: &Digest) -> Result<Option<FetchedBy>, StoreError> {
         let rows = sqlx::query(
-            "SELECT d.package, d.number, r.labels FROM assignments a JOIN deployments d ON d.id = a.deployment_id
+            "SELECT d.package, d.priority, d.number, r.labels FROM assignments a JOIN deployments d ON d.id = a.deployment_id
              JOIN robots r ON r.id = a.robot_id
-             WHERE a.robot_id = $1 AND a.desired = 1 ORDER BY d.number",
+             WHERE a.robot_id = $1 AND a.desired = 1 ORDER BY d.priority DESC, d.number",
         )
         .bind(robot.as_str())
         .fetch_all(&self.reads)
@@ -182,7 +188,8 @@ impl Store {
             let package: PackageRef = from_json("deployments.package", row.try_get("package")?)?;
             if [package.manifest, package.config, package.content].iter().any(|blob| blob.digest == *digest) {
                 let labels = from_json("robots.labels", row.try_get("labels")?)?;
-                return Ok(Some(FetchedBy { priority: 0, number: number(row.try_get("number")?), labels }));
+                let (priority, number) = (priority(&row)?, number(row.try_get("number")?));
+                return Ok(Some(FetchedBy { priority, number, labels }));
             }
         }
         Ok(None)
@@ -248,7 +255,8 @@ impl Write {
     /// Forgets what a robot has reported: it registers again, perhaps with an empty disk, and counts from 1.
     pub async fn forget_report(&mut self, robot: &RobotId) -> Result<(), StoreError> {
         sqlx::query(
-            "UPDATE robots SET report_start = 0, report_seq = 0, observed_generation = 0, report = NULL WHERE id = $1",
+            "UPDATE robots SET report_start = 0, report_seq = 0, observed_generation = 0, report = NULL,
+                 link = NULL, battery = NULL WHERE id = $1",
         )
         .bind(robot.as_str())
         .execute(self.connection())
@@ -282,7 +290,7 @@ const CREDENTIALS: &str =
 const WITH_TASK: &str = "SELECT robot_id FROM assignments WHERE task = $1 AND desired = 1";
 
 const ROBOT_ROWS: &str = "SELECT r.id, r.name, r.mac, r.labels, r.enrolled_at_ms, r.generation, r.observed_generation,
-         r.report, r.last_seen_ms
+         r.report, r.link, r.last_seen_ms
      FROM robots r WHERE r.removed_at_ms IS NULL";
 
 /// What each robot should have, and what it is still getting rid of. The first condition is that of an index, word for
@@ -315,16 +323,25 @@ fn broker_credential(row: &sqlx::any::AnyRow) -> Result<BrokerCredential, StoreE
 
 fn desired_task(row: &sqlx::any::AnyRow) -> Result<Option<DesiredTask>, StoreError> {
     let Some(task) = row.try_get::<Option<String>, _>("task")? else { return Ok(None) };
-    let choice: DeliveryChoice = from_word("deployments.delivery", row.try_get("delivery")?)?;
     Ok(Some(DesiredTask {
         task: id("assignments.task", &task)?,
         deployment: id("assignments.deployment_id", row.try_get("deployment_id")?)?,
         package: from_json("deployments.package", row.try_get("package")?)?,
         wanted: from_word("assignments.wanted", row.try_get("wanted")?)?,
         run: number(row.try_get("run")?),
-        delivery: choice.mechanism().unwrap_or_default(),
-        priority: 0,
+        delivery: from_word("assignments.mechanism", row.try_get("mechanism")?)?,
+        priority: priority(row)?,
     }))
+}
+
+/// The blobs of a task that ride along with the state which orders it.
+fn riding(task: &DesiredTask) -> Vec<BlobRef> {
+    let PackageRef { config, content, .. } = task.package;
+    match task.delivery {
+        Delivery::Inline => vec![config, content],
+        Delivery::DirectPush => vec![config],
+        Delivery::PushPull | Delivery::Poll => Vec::new(),
+    }
 }
 
 fn robot_views(robots: Vec<sqlx::any::AnyRow>, tasks: Vec<sqlx::any::AnyRow>) -> Result<Vec<RobotView>, StoreError> {
@@ -352,11 +369,10 @@ fn robot_view(row: &sqlx::any::AnyRow, mut tasks: Vec<RobotTask>) -> Result<Robo
         );
         conditions.push(Condition { code: "diverged".to_owned(), text });
     }
-    let (mut host, mut link, mut reported) = (None, None, Vec::new());
+    let (mut host, mut reported) = (None, Vec::new());
     if let Some(report) = report {
         conditions.extend(report.conditions);
         host = Some(report.host);
-        link = report.link;
         reported = report.tasks;
     }
     tasks.sort_by(|one, other| one.task.cmp(&other.task));
@@ -380,7 +396,7 @@ fn robot_view(row: &sqlx::any::AnyRow, mut tasks: Vec<RobotTask>) -> Result<Robo
         observed_generation,
         conditions,
         host,
-        link,
+        link: from_optional_json("robots.link", row.try_get("link")?)?,
         tasks,
         mqtt: None,
     })

@@ -2,6 +2,7 @@
 
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+use sqlx::Row as _;
 use std::str::FromStr;
 
 use super::StoreError;
@@ -18,6 +19,12 @@ pub(super) fn number(stored: i64) -> u64 {
 /// A number to be stored. What a robot makes up beyond 2^63 is stored as that.
 pub(super) fn stored(number: u64) -> i64 {
     i64::try_from(number).unwrap_or(i64::MAX)
+}
+
+/// The priority of a deployment's row.
+pub(super) fn priority(row: &sqlx::any::AnyRow) -> Result<i32, StoreError> {
+    let found: i64 = row.try_get("priority")?;
+    i32::try_from(found).map_err(|_| StoreError::Unreadable { column: "deployments.priority" })
 }
 
 /// A wire value as JSON text.

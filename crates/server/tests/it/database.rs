@@ -3,6 +3,7 @@
 #![expect(clippy::disallowed_methods, reason = "making a test's database takes SQL")]
 
 use sqlx::Connection as _;
+use task_proto::{DeploymentId, RobotId};
 use taskd::store::{Store, sqlite_url};
 
 /// An empty, migrated database of one test.
@@ -36,6 +37,23 @@ pub async fn postgres() -> TestDatabase {
     connection.close().await.expect("closes");
     let url = format!("{server}/{name}");
     TestDatabase { store: Store::open(&url).await.expect("opens"), url, _directory: None }
+}
+
+impl TestDatabase {
+    /// What was known when it was decided how a deployment travels to a robot, JSON.
+    pub async fn inputs(&self, deployment: &DeploymentId, robot: &RobotId) -> String {
+        let mut connection = sqlx::AnyConnection::connect(&self.url).await.expect("connects");
+        let query = sqlx::query_scalar("SELECT inputs FROM assignments WHERE deployment_id = $1 AND robot_id = $2");
+        let query = query.bind(deployment.as_str()).bind(robot.as_str());
+        query.fetch_one(&mut connection).await.expect("decided")
+    }
+
+    /// Makes all assignments such as they were before decisions were kept.
+    pub async fn forget_decisions(&self) {
+        let mut connection = sqlx::AnyConnection::connect(&self.url).await.expect("connects");
+        let forget = "UPDATE assignments SET mechanism = NULL, rule = NULL, because = NULL, inputs = NULL";
+        sqlx::query(forget).execute(&mut connection).await.expect("forgets");
+    }
 }
 
 /// Runs each of the async functions, which take a [`TestDatabase`], as one test on each database.

@@ -1,6 +1,7 @@
 //! A fleet without a network: orders and reports go straight to the store, and robots are values.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use task_proto::api::{
     CreateDeployment, CreateEnrollmentToken, DeliveryChoice, DeploymentView, EnrollRequest, PackageView, RobotView,
@@ -8,11 +9,14 @@ use task_proto::api::{
 use task_proto::desired::{BlobRef, DesiredState, DesiredTask, PackageRef};
 use task_proto::envelope::{DESIRED_STATE_TYPE, SigningKey};
 use task_proto::manifest::{TaskKind, TaskManifest};
-use task_proto::report::{HostFacts, Phase, Report, TaskReport};
+use task_proto::report::{HostFacts, LinkFacts, Phase, Report, TaskReport};
 use task_proto::{DeploymentId, Digest, Generation, InstanceId, MacAddress, RobotId};
 use taskd::actions::{ActionError, ActionSettings, Actions, Enrolled, IdempotencyKey};
 use taskd::changes::Changes;
+use taskd::chooser::{Chooser, ServerLoad};
 use taskd::clock::Clock;
+use taskd::config::DeliverySettings;
+use taskd::presence::Presence;
 use taskd::report_writer::ReportWriter;
 
 use crate::database::TestDatabase;
@@ -26,6 +30,9 @@ pub struct Fleet {
     pub writer: ReportWriter,
     pub clock: Clock,
     pub changes: Changes,
+    pub presence: Arc<Presence>,
+    pub load: Arc<ServerLoad>,
+    pub chooser: Chooser,
 }
 
 /// A robot's own view: what it has accepted and what it says.
@@ -35,16 +42,31 @@ pub struct Robot {
     seq: u64,
     pub observed: Generation,
     pub tasks: BTreeMap<String, TaskReport>,
+    pub link: Option<LinkFacts>,
+    pub battery_percent: Option<u8>,
 }
 
 impl Fleet {
     pub fn new(database: TestDatabase) -> Self {
+        Self::with_delivery(database, &DeliverySettings::default())
+    }
+
+    pub fn with_delivery(database: TestDatabase, settings: &DeliverySettings) -> Self {
+        let load = Arc::new(ServerLoad::default());
         let (clock, changes) = (Clock::fixed(1_000_000), Changes::new());
-        let (writer, _) = ReportWriter::start(database.store.clone(), clock.clone(), changes.clone());
+        let presence = Arc::new(Presence::new(90_000));
+        let chooser = Chooser::new(settings, presence.clone(), load.clone());
+        let (writer, _) = ReportWriter::start(database.store.clone(), clock.clone(), changes.clone(), chooser.clone());
         let key = SigningKey::from_bytes(SEED);
-        let settings = ActionSettings::default();
-        let actions = Actions::new(database.store.clone(), clock.clone(), changes.clone(), key, settings);
-        Self { database, actions, writer, clock, changes }
+        let actions = Actions::new(
+            database.store.clone(),
+            clock.clone(),
+            changes.clone(),
+            key,
+            ActionSettings::default(),
+            chooser.clone(),
+        );
+        Self { database, actions, writer, clock, changes, presence, load, chooser }
     }
 
     pub async fn enrolment_token(&self, order: CreateEnrollmentToken) -> task_proto::token::Token {
@@ -115,7 +137,15 @@ impl Fleet {
 
 impl Robot {
     pub fn new(id: RobotId) -> Self {
-        Self { id, start: 1, seq: 0, observed: Generation(0), tasks: BTreeMap::new() }
+        Self {
+            id,
+            start: 1,
+            seq: 0,
+            observed: Generation(0),
+            tasks: BTreeMap::new(),
+            link: None,
+            battery_percent: None,
+        }
     }
 
     pub fn accept(&mut self, desired: &DesiredState, phase: Phase) {
@@ -134,9 +164,9 @@ impl Robot {
             seq: self.seq,
             observed_generation: self.observed,
             uptime_ms: 1,
-            host: HostFacts::default(),
+            host: HostFacts { battery_percent: self.battery_percent, ..HostFacts::default() },
             conditions: Vec::new(),
-            link: None,
+            link: self.link,
             tasks: self.tasks.values().cloned().collect(),
         }
     }

@@ -7,6 +7,7 @@ mod auth;
 mod browser;
 mod cli;
 mod database;
+mod deliveries;
 mod fleet;
 mod harness;
 mod logs;

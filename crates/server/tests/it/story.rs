@@ -115,7 +115,8 @@ async fn racing_operators_leave_one_winner(database: TestDatabase) {
     // A second server process on the same database would be as good a rival as a second operator.
     let rival = Store::open(&fleet.database.url).await.expect("opens");
     let key = task_proto::envelope::SigningKey::random();
-    let rival = Actions::new(rival, fleet.clock.clone(), fleet.changes.clone(), key, Default::default());
+    let rival =
+        Actions::new(rival, fleet.clock.clone(), fleet.changes.clone(), key, Default::default(), fleet.chooser.clone());
     let mut orders = tokio::task::JoinSet::new();
     for round in 0..50u32 {
         let (keys, versions) = ([random_key(), random_key()], [format!("1.{round}"), format!("2.{round}")]);

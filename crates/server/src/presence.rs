@@ -64,6 +64,7 @@ impl Presence {
         let sightings = heard(&mut robots, robot, address, now_ms);
         if sightings.connection.is_none_or(|known| known.number < connection) {
             sightings.connection = Some(Connection { number: connection, since_ms: now_ms });
+            sightings.address = address.or(sightings.address);
         }
     }
 
@@ -150,7 +151,11 @@ fn heard<'a>(
         polled_ms: None,
         instances: InstanceHistory::default(),
     });
-    sightings.address = address.or(sightings.address);
+    let is_elsewhere = address.map(|address| address.ip()) != sightings.address.map(|address| address.ip());
+    // While there is a session its port is the robot's: each HTTP request may have another one.
+    if address.is_some() && (sightings.connection.is_none() || is_elsewhere) {
+        sightings.address = address;
+    }
     sightings.last_seen_ms = sightings.last_seen_ms.max(now_ms);
     sightings
 }
@@ -326,6 +331,24 @@ mod tests {
         presence.connected(&robot, Some(address()), 1, 1);
         presence.disconnected(&robot, 1, 2);
         assert_eq!(presence.get(&robot, 50_000).and_then(|sighting| sighting.connection), Some(2));
+    }
+
+    #[test]
+    fn a_sessions_port_stays_while_requests_come_from_others() {
+        let presence = Presence::new(1000);
+        let robot = RobotId::random();
+        let shown = || presence.get(&robot, 0)?.address.map(|address| address.to_string());
+        presence.seen(&robot, "10.0.0.7:5000".parse().expect("valid"), 0);
+        presence.connected(&robot, "10.0.0.7:4000".parse().ok(), 1, 0);
+        presence.seen(&robot, "10.0.0.7:5001".parse().expect("valid"), 0);
+        assert_eq!(shown().as_deref(), Some("10.0.0.7:4000"));
+        presence.seen(&robot, "10.0.9.9:5002".parse().expect("valid"), 0);
+        assert_eq!(shown().as_deref(), Some("10.0.9.9:5002"), "it has moved, and its session has not noticed yet");
+        presence.connected(&robot, "10.0.9.9:4001".parse().ok(), 2, 0);
+        assert_eq!(shown().as_deref(), Some("10.0.9.9:4001"));
+        presence.disconnected(&robot, 2, 0);
+        presence.seen(&robot, "10.0.9.9:5003".parse().expect("valid"), 0);
+        assert_eq!(shown().as_deref(), Some("10.0.9.9:5003"));
     }
 
     #[test]

@@ -156,11 +156,15 @@ impl RobotLogs {
         Some(Remembered { lines: kept.lines.iter().cloned().collect(), robot_ms, received_ms, suppressed })
     }
 
-    /// Forgets a robot that was removed.
+    /// Forgets a robot that was removed. Its followers' streams end.
     pub fn forget(&self, robot: &RobotId) {
         let mut state = self.state();
         let bytes = state.robots.remove(robot).map_or(0, |kept| kept.bytes);
         state.bytes -= bytes;
+        if let Some(followed) = state.followed.remove(robot) {
+            // Whoever asks the robot has nobody to ask for any more.
+            followed.changed.notify_one();
+        }
     }
 
     /// Follows `robot`: lines of `level` and above.
@@ -233,8 +237,12 @@ impl State {
 impl Kept {
     fn shrink(&mut self, share: usize) {
         while self.lines.len() > MAX_ROBOT_LINES || self.bytes > share {
-            let Some(oldest) = self.lines.pop_front() else { return };
+            let Some(oldest) = self.lines.pop_front() else { break };
             self.bytes -= size(&oldest);
+        }
+        // A large batch leaves its room behind, which counts as much as lines do.
+        if self.lines.capacity() > 2 * self.lines.len() {
+            self.lines.shrink_to_fit();
         }
     }
 }
@@ -304,6 +312,8 @@ mod tests {
         assert_eq!(bytes, logs.state().bytes);
         assert!(robots.iter().all(|robot| texts(&logs, robot).last().is_some_and(|text| text == "the last")));
         assert!(robots.iter().all(|robot| texts(&logs, robot).len() > 1), "nobody is left with nothing");
+        let has_room = |kept: &Kept| kept.lines.capacity() > 2 * kept.lines.len();
+        assert!(!logs.state().robots.values().any(has_room), "room that no line needs is given back");
     }
 
     #[test]
@@ -317,6 +327,19 @@ mod tests {
         let shown = texts(&logs, &robot);
         assert_eq!(shown[0], "a\u{fffd}[31mb\u{fffd}c");
         assert!(shown[1].len() <= MAX_LINE_BYTES);
+    }
+
+    #[tokio::test]
+    async fn following_ends_with_the_robot() {
+        let (logs, robot) = (RobotLogs::new(), RobotId::random());
+        let mut joined = logs.follow(&robot, LogLevel::Info);
+        let changed = logs.changed(&robot).expect("followed");
+        logs.forget(&robot);
+        assert!(matches!(joined.told.recv().await, Err(broadcast::error::RecvError::Closed)));
+        changed.notified().await;
+        assert_eq!(logs.wanted(&robot), None, "whoever asks it stops");
+        drop(joined);
+        assert!(logs.state().followed.is_empty());
     }
 
     #[test]

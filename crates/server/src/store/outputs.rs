@@ -1,5 +1,6 @@
 //! Outputs of runs: which files came back from which robot. The bytes lie in the blob store, under the robot's repository.
 
+use futures_util::TryStreamExt as _;
 use sqlx::Row as _;
 use task_proto::api::OutputView;
 use task_proto::output::OutputSet;
@@ -9,17 +10,21 @@ use super::{Store, StoreError, Write, rows};
 
 /// The newest runs kept of one task on one robot.
 const KEPT: usize = 10;
+/// The newest runs kept of one robot: the names of tasks are in its own hands.
+const KEPT_OF_ROBOT: usize = 200;
 /// The most outputs listed.
 const MAX_LISTED: i64 = 1000;
+/// The most bytes of JSON listed: an output of many files with long names takes a lot of room.
+const MAX_LISTED_BYTES: usize = 16 * 1024 * 1024;
 
 impl Store {
-    /// The newest outputs first, of one robot or of all, of one task or of all; at most 1,000.
+    /// The newest outputs first, of one robot or of all, of one task or of all; at most 1,000, and fewer if they are large.
     pub async fn outputs(
         &self,
         robot: Option<&RobotId>,
         task: Option<&TaskName>,
     ) -> Result<Vec<OutputView>, StoreError> {
-        let found = sqlx::query(
+        let mut found = sqlx::query(
             "SELECT o.manifest, o.output, o.pushed_at_ms, r.name FROM outputs o JOIN robots r ON r.id = o.robot_id
              WHERE ($1 = '' OR o.robot_id = $1) AND ($2 = '' OR o.task = $2)
              ORDER BY o.pushed_at_ms DESC, o.manifest LIMIT $3",
@@ -27,30 +32,35 @@ impl Store {
         .bind(robot.map_or("", RobotId::as_str))
         .bind(task.map_or("", TaskName::as_str))
         .bind(MAX_LISTED)
-        .fetch_all(&self.reads)
-        .await?;
-        let view = |row: &sqlx::any::AnyRow| {
-            Ok(OutputView {
+        .fetch(&self.reads);
+        let (mut views, mut bytes) = (Vec::new(), 0);
+        while let Some(row) = found.try_next().await? {
+            let output: &str = row.try_get("output")?;
+            bytes += output.len();
+            if bytes > MAX_LISTED_BYTES {
+                break;
+            }
+            views.push(OutputView {
                 robot_name: rows::id("robots.name", row.try_get("name")?)?,
                 manifest: rows::id("outputs.manifest", row.try_get("manifest")?)?,
                 pushed_at_ms: rows::number(row.try_get("pushed_at_ms")?),
-                output: rows::from_json("outputs.output", row.try_get("output")?)?,
-            })
-        };
-        found.iter().map(view).collect()
+                output: rows::from_json("outputs.output", output)?,
+            });
+        }
+        Ok(views)
     }
 }
 
 impl Write {
-    /// Notes an output, which takes the place of an earlier one of the same run. Gives the manifests of its repository
-    /// that are too many now.
+    /// Notes an output, which takes the place of an earlier one of the same run. Gives the manifests of the robot's
+    /// repositories that are too many now.
     pub(super) async fn insert_output(
         &mut self,
         repository: &RepositoryName,
         manifest: &Digest,
         output: &OutputSet,
         now_ms: u64,
-    ) -> Result<Vec<Digest>, StoreError> {
+    ) -> Result<Vec<(RepositoryName, Digest)>, StoreError> {
         let tag = format!("{}-{}", output.deployment, output.run);
         sqlx::query(
             "INSERT INTO outputs (repository, manifest, robot_id, task, tag, output, pushed_at_ms)
@@ -67,19 +77,25 @@ impl Write {
         .execute(self.connection())
         .await?;
         let others = sqlx::query(
-            "SELECT manifest, tag FROM outputs WHERE repository = $1 AND manifest <> $2
+            "SELECT repository, manifest, tag FROM outputs
+             WHERE robot_id = $1 AND NOT (repository = $2 AND manifest = $3)
              ORDER BY pushed_at_ms DESC, manifest",
         )
+        .bind(output.robot_id.as_str())
         .bind(repository.as_str())
         .bind(manifest.to_string())
         .fetch_all(self.connection())
         .await?;
-        let (mut surplus, mut kept) = (Vec::new(), 1);
+        let (mut surplus, mut kept, mut kept_here) = (Vec::new(), 1, 1);
         for row in &others {
-            if row.try_get::<&str, _>("tag")? == tag || kept >= KEPT {
-                surplus.push(rows::id("outputs.manifest", row.try_get("manifest")?)?);
+            let is_here = row.try_get::<&str, _>("repository")? == repository.as_str();
+            let is_replaced = is_here && row.try_get::<&str, _>("tag")? == tag;
+            if is_replaced || kept >= KEPT_OF_ROBOT || (is_here && kept_here >= KEPT) {
+                let repository = rows::id("outputs.repository", row.try_get("repository")?)?;
+                surplus.push((repository, rows::id("outputs.manifest", row.try_get("manifest")?)?));
             } else {
                 kept += 1;
+                kept_here += usize::from(is_here);
             }
         }
         Ok(surplus)

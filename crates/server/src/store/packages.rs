@@ -90,8 +90,8 @@ impl Store {
             write.insert_package(package, task_manifest, now_ms).await?;
         }
         if let Some(output) = &new.output {
-            for surplus in write.insert_output(repository, &new.manifest.digest, output, now_ms).await? {
-                write.delete_manifest(repository, &surplus).await?;
+            for (repository, surplus) in write.insert_output(repository, &new.manifest.digest, output, now_ms).await? {
+                write.delete_manifest(&repository, &surplus).await?;
             }
         }
         write.commit().await?;

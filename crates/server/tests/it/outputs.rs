@@ -83,6 +83,31 @@ async fn a_robot_brings_files_back_and_operators_read_them() {
 }
 
 #[tokio::test]
+async fn what_is_kept_of_a_robot_is_bounded_whatever_its_tasks_are_called() {
+    const TASKS: u64 = 21;
+    let server = TestServer::start().await;
+    let (robot, other) = (server.enroll("atlas").await, server.enroll("husky").await);
+    let push = Push::new(&server, &other, format!("outputs/{}/mapping", other.id));
+    let map = push.blob(b"x").await;
+    assert_eq!(push.output(&output(&other, 1, vec![file("a", map)])).await, StatusCode::CREATED);
+    for number in 1..=TASKS {
+        let task = format!("task{number}");
+        let push = Push::new(&server, &robot, format!("outputs/{}/{task}", robot.id));
+        push.blob(b"x").await;
+        for run in 1..=10 {
+            let set = OutputSet { task: task.parse().expect("valid"), ..output(&robot, run, vec![file("a", map)]) };
+            server.clock.advance_ms(1);
+            assert_eq!(push.output(&set).await, StatusCode::CREATED, "{task} {run}");
+        }
+    }
+    let list: OutputList = server.get("/api/v1/outputs?robot=atlas").await;
+    assert_eq!(list.outputs.len(), 200);
+    assert!(list.outputs.iter().all(|view| view.output.task.as_str() != "task1"), "the oldest went: {list:?}");
+    let others: OutputList = server.get("/api/v1/outputs?robot=husky").await;
+    assert_eq!(others.outputs.len(), 1, "another robot's stay");
+}
+
+#[tokio::test]
 async fn a_robot_pushes_nothing_else_and_nowhere_else() {
     let server = TestServer::start().await;
     let (robot, other) = (server.enroll("atlas").await, server.enroll("husky").await);

@@ -13,6 +13,7 @@ use task_proto::api::{BASE, ErrorBody, IDEMPOTENCY_KEY};
 use task_proto::request::{Answer, Ask};
 use task_proto::token::{InvalidToken, Token};
 
+use super::output::printable;
 use super::{CommandError, Connection, Outcome};
 
 /// How often a request is tried.
@@ -255,11 +256,17 @@ impl Client {
             let message = status.canonical_reason().unwrap_or("refused").to_lowercase();
             return ClientError::Refused { status, code: status.as_str().to_owned(), message };
         }
+        // A robot's own words may be among the server's.
+        let refused = |code: &str, message: &str| ClientError::Refused {
+            status,
+            code: printable(code),
+            message: printable(message),
+        };
         if let Ok(ErrorBody { error }) = serde_json::from_slice(&body) {
-            return ClientError::Refused { status, code: error.code, message: error.message };
+            return refused(&error.code, &error.message);
         }
         match serde_json::from_slice::<RegistryErrors>(&body).ok().and_then(|errors| errors.errors.into_iter().next()) {
-            Some(error) => ClientError::Refused { status, code: error.code.to_lowercase(), message: error.message },
+            Some(error) => refused(&error.code.to_lowercase(), &error.message),
             None => self.not_the_server(status),
         }
     }
@@ -375,11 +382,17 @@ mod tests {
         };
         let router = axum::Router::new()
             .route("/api/v1/orders", axum::routing::post(order))
+            .route("/api/v1/refused", axum::routing::get(hostile_refusal))
             .route("/api/v1/page", axum::routing::get(|| async { "<html>sign in to the hotel's network</html>" }));
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap();
         tokio::spawn(async move { axum::serve(listener, router).await });
         address
+    }
+
+    async fn hostile_refusal() -> impl axum::response::IntoResponse {
+        let error = serde_json::json!({ "code": "rejected", "message": "no\u{1b}[2J\nway" });
+        (StatusCode::CONFLICT, axum::Json(serde_json::json!({ "error": error })))
     }
 
     fn client(address: std::net::SocketAddr) -> Client {
@@ -399,6 +412,13 @@ mod tests {
         let client = client(busy_server().await);
         let keys: Vec<String> = client.order("/orders", &serde_json::json!({}), "k1").await.unwrap();
         assert_eq!(keys, ["k1", "k1", "k1"]);
+    }
+
+    #[tokio::test]
+    async fn a_refusal_carries_nothing_that_a_terminal_obeys() {
+        let client = client(busy_server().await);
+        let error = client.get::<String>("/refused", &[]).await.unwrap_err();
+        assert_eq!(error.to_string(), "no [2J way (rejected)");
     }
 
     #[tokio::test]

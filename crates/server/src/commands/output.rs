@@ -61,7 +61,7 @@ impl Output {
 }
 
 fn json<T: Serialize>(value: &T) -> Result<String, CommandError> {
-    serde_json::to_string_pretty(value).map_err(unprintable)
+    serde_json::to_string_pretty(value).map(escaped).map_err(unprintable)
 }
 
 fn unprintable(error: serde_json::Error) -> CommandError {
@@ -70,7 +70,20 @@ fn unprintable(error: serde_json::Error) -> CommandError {
 
 /// One of many values, on one line.
 pub(crate) fn json_line<T: Serialize>(value: &T) -> Result<String, CommandError> {
-    serde_json::to_string(value).map_err(unprintable)
+    serde_json::to_string(value).map(escaped).map_err(unprintable)
+}
+
+/// JSON as a terminal may see it: the control characters that JSON itself allows, which lie in texts only, are escaped.
+fn escaped(json: String) -> String {
+    if !json.contains(is_c1) {
+        return json;
+    }
+    let escape = |c: char| if is_c1(c) { format!("\\u{:04x}", u32::from(c)) } else { c.to_string() };
+    json.chars().map(escape).collect()
+}
+
+fn is_c1(c: char) -> bool {
+    matches!(c, '\u{7f}'..='\u{9f}')
 }
 
 fn print(text: &str) -> Result<(), CommandError> {
@@ -100,9 +113,11 @@ pub(crate) fn table(header: &[&str], rows: Vec<Vec<String>>) -> String {
     table.lines().map(line).collect::<Vec<_>>().join("\n")
 }
 
-/// `text` on one line and without control characters: a robot or a package may have put them there.
+/// `text` on one line and without control characters, nor those that turn a line's direction: a robot or a package may
+/// have put them there.
 pub(crate) fn printable(text: &str) -> String {
-    text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect()
+    let turns = |c: char| matches!(c, '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
+    text.chars().map(|c| if c.is_control() || turns(c) { ' ' } else { c }).collect()
 }
 
 /// Says `text` on stderr. Nobody may be listening, which is no reason to fail.
@@ -151,6 +166,15 @@ mod tests {
         assert_eq!(time(0), "1970-01-01 00:00:00Z");
         assert_eq!(time(951_782_400_000), "2000-02-29 00:00:00Z");
         assert_eq!(time(1_704_067_199_999), "2023-12-31 23:59:59Z");
+    }
+
+    #[test]
+    fn what_a_terminal_would_obey_is_not_printed() {
+        assert_eq!(printable("a\u{1b}[31m\u{9b}2Jb\u{202e}c\u{2066}d\n"), "a [31m 2Jb c d ");
+        let text = "\u{1b}]0;x\u{7}\u{9b}2J\u{7f} é";
+        let line = json_line(&text).unwrap();
+        assert_eq!(line, r#""\u001b]0;x\u0007\u009b2J\u007f é""#);
+        assert_eq!(serde_json::from_str::<String>(&line).unwrap(), text, "programs read what was meant");
     }
 
     #[test]

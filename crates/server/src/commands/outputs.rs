@@ -1,6 +1,8 @@
 //! `taskd output`: what tasks brought back from robots, listed and fetched.
 
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use clap::Subcommand;
 use reqwest::Method;
@@ -9,9 +11,15 @@ use task_proto::api::{OutputList, OutputView};
 use task_proto::output::OutputFile;
 use task_proto::{Digest, RobotName, Tag, TaskName};
 use tokio::io::AsyncWriteExt as _;
+use tokio::time::timeout;
 
 use super::output::{bytes, say, time};
 use super::{CommandError, Outcome, Session};
+
+/// The longest the server may say nothing in the middle of a file.
+const SILENCE: Duration = Duration::from_secs(60);
+/// The longest one file may take.
+const LONGEST: Duration = Duration::from_secs(24 * 60 * 60);
 
 /// What to do with outputs.
 #[derive(Debug, Subcommand)]
@@ -101,13 +109,19 @@ async fn fetch(session: &Session, view: &OutputView, file: &OutputFile, into: &P
     let failed = |source| CommandError::Io { what: format!("can't write {}", path.display()), source };
     let parent = path.parent().unwrap_or(into);
     tokio::fs::create_dir_all(parent).await.map_err(failed)?;
+    // As any new file of this person, once it is whole.
+    let readable = std::fs::Permissions::from_mode(0o666);
+    let beside = tempfile::Builder::new().permissions(readable).tempfile_in(parent).map_err(failed)?;
+    let mut writer = tokio::fs::File::from_std(beside.reopen().map_err(failed)?);
     let (robot, task) = (&view.output.robot_id, &view.output.task);
     let url = format!("/v2/outputs/{robot}/{task}/blobs/{}", file.blob.digest);
-    let mut response = session.client.send(|| session.client.request(Method::GET, &url)).await?;
-    let beside = tempfile::NamedTempFile::new_in(parent).map_err(failed)?;
-    let mut writer = tokio::fs::File::from_std(beside.reopen().map_err(failed)?);
+    // A large file may take long, as long as it goes on.
+    let mut response = session.client.send(|| session.client.request(Method::GET, &url).timeout(LONGEST)).await?;
     let mut hash = Sha256::new();
-    while let Some(chunk) = response.chunk().await.map_err(|source| session.client.unreachable(source))? {
+    loop {
+        let chunk = timeout(SILENCE, response.chunk()).await;
+        let chunk = chunk.map_err(|_| failed(std::io::Error::other("the server has stopped sending")))?;
+        let Some(chunk) = chunk.map_err(|source| session.client.unreachable(source))? else { break };
         hash.update(&chunk);
         writer.write_all(&chunk).await.map_err(failed)?;
     }

@@ -6,6 +6,9 @@ import { ago, size, words } from './format.js';
 import { drawMap, isMap } from './map.js';
 
 const SHOWN_RUNS = 3;
+// Of one run; a robot may bring back hundreds.
+const SHOWN_PICTURES = 4;
+const SHOWN_FILES = 20;
 // A larger picture would only make the browser slow; it can be downloaded.
 const MAX_PICTURE_BYTES = 16e6;
 
@@ -29,9 +32,9 @@ export class Outputs {
     if (!robot) return;
     try {
       const { outputs } = await robotOutputs(robot);
-      if (this.robot === key) this.list = outputs;
+      if (this.robot === key) Object.assign(this, { list: outputs, problem: null });
     } catch (error) {
-      this.problem = error.message;
+      if (this.robot === key) this.problem = error.message;
     }
     this.#changed();
   }
@@ -50,22 +53,30 @@ export function outputList({ list, problem }, now) {
 
 const run = (output, now) => html`
   <p>${output.task}<span class="quiet">@${output.version} · run ${output.run} · ${ago(output.pushed_at_ms, now)}</span></p>
-  ${output.files.filter(({ path, size: bytes }) => isMap(path) && bytes <= MAX_PICTURE_BYTES).map((file) => picture(output, file))}
-  <ul>${output.files.map((file) => html`<li><a href=${url(output, file)} download=${file.path.split('/').at(-1)}>${file.path}</a> <span class="quiet">${size(file.size)}</span></li>`)}</ul>`;
+  ${output.files.filter(({ path, size: bytes }) => isMap(path) && bytes <= MAX_PICTURE_BYTES).slice(0, SHOWN_PICTURES).map((file) => picture(output, file))}
+  <ul>${output.files.slice(0, SHOWN_FILES).map((file) => html`<li><a href=${url(output, file)} download=${file.path.split('/').at(-1)}>${file.path}</a> <span class="quiet">${size(file.size)}</span></li>`)}</ul>
+  ${output.files.length > SHOWN_FILES ? html`<p class="quiet">${output.files.length - SHOWN_FILES} more: <code>taskd output get</code></p>` : nothing}`;
 
 const picture = (output, file) => html`
   <figure>
     <canvas role="img" aria-label=${`${file.path}, ${words(output.task)}`} data-source=${url(output, file)}></canvas>
+    <p class="bad"></p>
     <figcaption class="quiet">${file.path}</figcaption>
   </figure>`;
 
 const url = ({ robot_id, task }, { digest }) => `/v2/outputs/${robot_id}/${task}/blobs/${digest}`;
 
-/** Draws the maps that have come into the page since the last time. */
+/** Draws the maps that have come into the page since the last time. What can't be drawn is said in its place. */
 export function drawMaps() {
   for (const canvas of document.querySelectorAll('canvas[data-source]')) {
-    if (canvas.dataset.drawn === canvas.dataset.source) continue;
-    canvas.dataset.drawn = canvas.dataset.source;
-    drawMap(canvas, canvas.dataset.source);
+    const { source, drawn } = canvas.dataset;
+    if (drawn === source) continue;
+    canvas.dataset.drawn = source;
+    const say = (problem) => {
+      if (canvas.dataset.source !== source) return;
+      canvas.hidden = Boolean(problem);
+      canvas.nextElementSibling.textContent = problem;
+    };
+    drawMap(canvas).then(() => say(''), ({ message }) => say(`The picture can't be shown: ${message}`));
   }
 }

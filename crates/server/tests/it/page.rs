@@ -115,18 +115,32 @@ async fn a_map_that_came_back_is_shown_as_a_picture() {
     let push = Push::new(&server, &robot, format!("outputs/{}/mapping", robot.id));
     let map = push.blob(b"P5\n# drawn by a test\n3 2\n255\n\x00\xcd\xfe\xfe\xcd\x00").await;
     let broken = push.blob(b"P5 999 999 255 ").await;
-    let files = vec![file("maps/broken.pgm", broken), file("maps/corridor.pgm", map)];
+    // Few bytes that claim to be a large picture, which would keep the browser busy or take its memory.
+    let endless = push.blob(b"P2 3999 3999 255 0 0").await;
+    let huge = push.blob(b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR\x00\x00\xff\xff\x00\x00\xff\xff\x08\x06").await;
+    let mut files = vec![
+        file("maps/broken.pgm", broken),
+        file("maps/endless.pgm", endless),
+        file("maps/huge.png", huge),
+        file("maps/corridor.pgm", map),
+    ];
+    files.extend((0..30).map(|number| file(&format!("more/{number:02}.pgm"), map)));
     assert_eq!(push.output(&output(&robot, 1, files)).await, StatusCode::CREATED);
 
     let browser = Browser::start().await;
     browser.open(&server.url(&format!("/#token={}", server.operator.reveal()))).await;
     browser.wait("document.querySelector('[data-robot] .name button')?.innerText === 'atlas'").await;
     browser.run("document.querySelector('[data-robot] .name button').click()").await;
-    browser.wait("document.querySelector('dialog .outputs canvas')?.width === 3").await;
-    let grays = "const { data } = document.querySelector('.outputs canvas').getContext('2d').getImageData(0, 0, 3, 2);
+    let drawn = "dialog .outputs canvas:not([hidden])";
+    browser.wait(&format!("document.querySelector('{drawn}')?.width === 3")).await;
+    let grays = "const { data } = document.querySelector('.outputs canvas:not([hidden])').getContext('2d').getImageData(0, 0, 3, 2);
         return [0, 4, 8, 12, 16, 20].map((at) => data[at])";
     assert_eq!(browser.run(grays).await, json!([0, 205, 254, 254, 205, 0]));
-    browser.wait("document.querySelector('dialog .outputs').innerText.includes('it ends before its last row')").await;
+    let problems = "return [...document.querySelectorAll('.outputs figure .bad')].map((said) => said.innerText)";
+    let ends = "The picture can't be shown: it ends before its last row";
+    let expected = json!([ends, ends, "The picture can't be shown: it is too large", ""]);
+    assert_eq!(browser.run(problems).await, expected, "four of many are shown");
+    browser.wait("document.querySelector('dialog .outputs').innerText.includes('14 more: taskd output get')").await;
     let link = "return document.querySelector('.outputs a[download=\"corridor.pgm\"]').getAttribute('href')";
     let expected = format!("/v2/outputs/{}/mapping/blobs/{}", robot.id, map.digest);
     assert_eq!(browser.run(link).await, json!(expected));

@@ -73,9 +73,8 @@ pub async fn run_once(taskd: &Taskd, fleet: &mut Fleet, order: OneOrder) -> anyh
         Ok(deployment) => deployment,
         Err(error) => {
             let refused = format!("the order is refused: {:#}", anyhow::Error::new(error));
-            let arrivals = Arrivals { failures: vec![refused; order.robots], ..Arrivals::default() };
             taskd.server.remove_package(&name, &manifest).await.context("the package can't be removed")?;
-            return Ok(Outcome { arrivals, ..Outcome::default() });
+            return Ok(Outcome::failed(refused, order.robots));
         }
     };
     let arrivals = fleet.verified(&deployment.id, order.robots, ordered_ns, order.limit).await?;
@@ -95,6 +94,11 @@ pub async fn run_once(taskd: &Taskd, fleet: &mut Fleet, order: OneOrder) -> anyh
 }
 
 impl Outcome {
+    /// An order by which none of so many robots got anything.
+    pub fn failed(why: String, robots: usize) -> Self {
+        Self { arrivals: Arrivals { arrived: Vec::new(), failures: vec![why; robots] }, ..Self::default() }
+    }
+
     fn read_decisions(&mut self, view: &DeploymentView, choice: DeliveryChoice) {
         let mut other = Vec::new();
         let assignments = || view.assignments.iter().flatten().filter(|one: &&AssignmentView| one.released);

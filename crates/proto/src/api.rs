@@ -241,6 +241,9 @@ pub struct RobotTask {
     pub wanted: Wanted,
     /// How often it was asked to start.
     pub run: u64,
+    /// How its bytes travel, and why.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub delivery: Option<DeliveryDecision>,
     /// Where it stands.
     pub phase: Phase,
     /// How far the phase has come.

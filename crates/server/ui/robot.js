@@ -47,11 +47,15 @@ function ros({ ros: used, ros_distros: found }) {
   return [used.distro, used.rmw, domain].filter(Boolean).join(', ');
 }
 
+/** How its bytes travel, in a word; why, on pointing at it. */
+const travels = ({ delivery }) => delivery
+  ? html` · <span class="delivery" title=${`${delivery.rule}: ${delivery.because}`}>${delivery.mechanism}</span>` : nothing;
+
 const taskDetails = (task) => html`
   <section>
     <h3>${task.task}<span class="quiet">@${task.version}</span> <span class="phase ${tone(task.phase)}">${words(task.phase)}</span></h3>
     ${task.progress && tone(task.phase) === 'busy' ? html`<p class="quiet">${bytes(task.progress)}</p>` : nothing}
     ${task.failure ? html`<p class="bad">${words(task.failure.code)}</p><pre tabindex="0">${task.failure.text}</pre>` : nothing}
     ${task.degraded ? html`<p class="bad"><span aria-hidden="true">▲ </span>degraded: ${words(task.degraded.code)}</p><pre tabindex="0">${task.degraded.text}</pre>` : nothing}
-    <p class="quiet">${[`deployment ${task.deployment}`, `run ${task.run}`, task.active && `process ${task.active.pid}`, ...remarks(task)].filter(Boolean).join(' · ')}</p>
+    <p class="quiet">${[`deployment ${task.deployment}`, `run ${task.run}`, task.active && `process ${task.active.pid}`, ...remarks(task)].filter(Boolean).join(' · ')}${travels(task)}</p>
   </section>`;

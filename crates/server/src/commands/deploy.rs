@@ -5,7 +5,7 @@ use task_proto::DeploymentId;
 use task_proto::api::{DeploymentList, DeploymentView};
 
 use super::output::{say, time};
-use super::view::{describe, phases, state};
+use super::view::{describe, describe_fully, phases, state};
 use super::{CommandError, Outcome, Session};
 
 /// What to do with deployments.
@@ -13,10 +13,13 @@ use super::{CommandError, Outcome, Session};
 pub enum Action {
     /// List deployments, the newest first
     List,
-    /// Show one deployment and where each robot stands
+    /// Show one deployment, how its bytes travel and why, and where each robot stands
     Info {
         /// Its id
         deployment: DeploymentId,
+        /// Say of each robot how its bytes travel
+        #[arg(long)]
+        robots: bool,
     },
     /// Interrupt one: where it is under way or has failed the version before it runs on; where it runs already it stays
     Cancel {
@@ -37,9 +40,9 @@ pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, Co
             session.output.result(&list, &HEADER, |list| list.deployments.iter().map(row).collect())?;
             return Ok(Outcome::Succeeded);
         }
-        Action::Info { deployment } => {
+        Action::Info { deployment, robots } => {
             let view: DeploymentView = session.client.get(&format!("/deployments/{deployment}"), &[]).await?;
-            session.output.described(&view, describe)?;
+            session.output.described(&view, |view| describe_fully(view, robots))?;
             return Ok(Outcome::Succeeded);
         }
         Action::Cancel { deployment } => (deployment, "cancel"),

@@ -4,7 +4,9 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::{Args, ValueEnum};
-use task_proto::api::{CreateDeployment, DeliveryChoice, DeploymentView, MatchedRobot, MatchedRobots};
+use task_proto::api::{
+    CreateDeployment, DeliveryChoice, DeploymentView, MAX_PRIORITY, MIN_PRIORITY, MatchedRobot, MatchedRobots,
+};
 use task_proto::selector::Selector;
 
 use super::confirm::confirm;
@@ -35,8 +37,12 @@ pub struct Push {
     #[arg(long, value_name = "N", requires = "to")]
     max_failures: Option<u64>,
     /// How the bytes travel
-    #[arg(long, value_enum, default_value_t = DeliveryName::PushPull, requires = "to")]
+    #[arg(long, value_enum, default_value_t = DeliveryName::Adaptive, requires = "to")]
     delivery: DeliveryName,
+    /// What comes first, on a robot and where transfers have to wait: the highest, from -100 to 100
+    #[arg(long, value_name = "N", allow_negative_numbers = true, default_value_t = 0, requires = "to",
+          value_parser = clap::value_parser!(i32).range(i64::from(MIN_PRIORITY)..=i64::from(MAX_PRIORITY)))]
+    priority: i32,
     /// When what is not done by then expires [default: the server's setting]
     #[arg(long, value_name = "TIME", value_parser = lifetime, requires = "to")]
     expires: Option<Duration>,
@@ -54,10 +60,28 @@ pub struct Push {
 /// How the bytes travel, by the name it has everywhere.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum DeliveryName {
+    /// The server's rules decide for each robot
+    Adaptive,
     /// The server announces, the robot pulls
     PushPull,
+    /// The bytes travel in MQTT messages, published once for all robots
+    DirectPush,
     /// The robot asks on its own timer
     Poll,
+    /// A small package rides inside the announcement
+    Inline,
+}
+
+impl From<DeliveryName> for DeliveryChoice {
+    fn from(name: DeliveryName) -> Self {
+        match name {
+            DeliveryName::Adaptive => Self::Adaptive,
+            DeliveryName::PushPull => Self::PushPull,
+            DeliveryName::DirectPush => Self::DirectPush,
+            DeliveryName::Poll => Self::Poll,
+            DeliveryName::Inline => Self::Inline,
+        }
+    }
 }
 
 /// What to pack.
@@ -92,11 +116,8 @@ pub(super) async fn run(session: &Session, push: Push) -> Result<Outcome, Comman
         package: packed.package.name.clone(),
         manifest: packed.package.manifest.digest,
         selector,
-        delivery: match push.delivery {
-            DeliveryName::PushPull => DeliveryChoice::PushPull,
-            DeliveryName::Poll => DeliveryChoice::Poll,
-        },
-        priority: 0,
+        delivery: push.delivery.into(),
+        priority: push.priority,
         batch: push.batch,
         max_failures: push.max_failures,
         expires_in_s: push.expires.map(|expires| expires.as_secs()),

@@ -3,12 +3,13 @@
 use clap::Subcommand;
 use task_proto::RobotName;
 use task_proto::api::{RobotList, RobotTask, RobotView};
-use task_proto::report::{Isolation, RosFacts};
+use task_proto::report::{Isolation, LinkFacts, RosFacts};
 use task_proto::selector::Selector;
 
 use super::confirm::always;
 use super::output::{printable, say, table, time};
 use super::{CommandError, Outcome, Session};
+use crate::delivery::Unit;
 
 /// What to do with robots.
 #[derive(Debug, Subcommand)]
@@ -119,6 +120,12 @@ fn describe(robot: &RobotView) -> String {
         }
         facts.push(("isolation", if host.isolation == Isolation::Cgroup { "cgroup" } else { "none" }.to_owned()));
         facts.push(("disk free", super::output::bytes(host.disk_free_bytes)));
+        if let Some(percent) = host.battery_percent {
+            facts.push(("battery", format!("{percent}%")));
+        }
+    }
+    if let Some(link) = &robot.link {
+        facts.push(("link", measured(link)));
     }
     if let Some(mqtt) = &robot.mqtt {
         facts.push(("connected", time(mqtt.since_ms)));
@@ -133,6 +140,18 @@ fn describe(robot: &RobotView) -> String {
         text.push_str(&table(&header, robot.tasks.iter().map(task_row).collect()));
     }
     text
+}
+
+/// What transfers have shown of a robot's way to the server, in words.
+fn measured(link: &LinkFacts) -> String {
+    let counted = |count: u32, one: &str, many: &str| format!("{count} {}", if count == 1 { one } else { many });
+    let parts = [
+        link.throughput_bytes_per_s.map(|rate| Unit::BytesPerSecond.show(rate)),
+        link.rtt_ms.map(|rtt_ms| format!("rtt {}", Unit::Milliseconds.show(rtt_ms.into()))),
+        Some(counted(link.losses, "transfer broke off", "transfers broke off")),
+        Some(format!("{} in an hour", counted(link.reconnects, "session lost", "sessions lost"))),
+    ];
+    parts.into_iter().flatten().collect::<Vec<_>>().join(", ")
 }
 
 /// How tasks meet ROS, in words.
@@ -166,5 +185,17 @@ fn problem(task: &RobotTask) -> String {
         (Some(failure), _) => failure.to_string(),
         (None, Some(degraded)) => format!("degraded: {degraded}"),
         (None, None) => "-".to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_link_is_told_as_far_as_it_was_measured() {
+        let link = LinkFacts { throughput_bytes_per_s: Some(2 << 20), rtt_ms: Some(31), reconnects: 1, losses: 2 };
+        assert_eq!(measured(&link), "2 MB/s, rtt 31 ms, 2 transfers broke off, 1 session lost in an hour");
+        assert_eq!(measured(&LinkFacts::default()), "0 transfers broke off, 0 sessions lost in an hour");
     }
 }

@@ -2,11 +2,13 @@
 
 use std::collections::BTreeMap;
 
-use task_proto::api::{AssignmentView, DeploymentState, DeploymentView, MatchedRobot, MatchedRobots};
+use task_proto::api::{AssignmentView, DeliveryDecision, DeploymentState, DeploymentView, MatchedRobot, MatchedRobots};
+use task_proto::desired::Delivery;
 use task_proto::report::Phase;
 
 use super::output::{printable, robots, table, time};
 use super::{CommandError, Session};
+use crate::delivery::{FELL_BEHIND, ORDERED};
 
 /// Reasons for waiting that are shown; a gate may give each robot one of its own.
 const MAX_REASONS: usize = 5;
@@ -29,16 +31,25 @@ pub(super) fn phases(view: &DeploymentView) -> String {
 
 /// A deployment for people: its facts, then a line per robot.
 pub(super) fn describe(view: &DeploymentView) -> String {
+    describe_fully(view, false)
+}
+
+/// The same; with `deliveries` it also says of each robot how its bytes travel.
+pub(super) fn describe_fully(view: &DeploymentView, deliveries: bool) -> String {
     let supersedes: Vec<_> = view.supersedes.iter().map(ToString::to_string).collect();
     let mut facts = vec![
         ("deployment", view.id.to_string()),
         ("package", format!("{} {} {}", view.package.name, view.package.version, view.package.manifest.digest)),
         ("selector", view.selector.to_string()),
+        ("delivery", view.delivery.to_string()),
         ("state", state(view.state).to_owned()),
         ("phases", phases(view)),
         ("created", time(view.created_at_ms)),
         ("expires", time(view.expires_at_ms)),
     ];
+    if view.priority != 0 {
+        facts.push(("priority", view.priority.to_string()));
+    }
     if let Some(batch) = view.batch {
         facts.push(("batch", batch.to_string()));
     }
@@ -46,16 +57,47 @@ pub(super) fn describe(view: &DeploymentView) -> String {
         facts.push(("supersedes", supersedes.join(" ")));
     }
     let assignments = view.assignments.as_deref().unwrap_or_default();
+    facts.extend(mechanisms(assignments).into_iter().map(|line| ("travels", line)));
     facts.extend(deferred(assignments).into_iter().map(|line| ("deferred", line)));
     let mut text: String = facts.iter().map(|(key, value)| format!("{key:<12}{}\n", printable(value))).collect();
     if let Some(assignments) = &view.assignments {
         text.push('\n');
-        text.push_str(&table(
-            &["robot", "state", "phase", "progress", "detail"],
-            assignments.iter().map(assignment_row).collect(),
-        ));
+        let header = ["robot", "state", "phase", "progress", "detail", "delivery"];
+        let columns = if deliveries { header.len() } else { header.len() - 1 };
+        let row = |assignment| assignment_row(assignment).into_iter().take(columns).collect();
+        text.push_str(&table(&header[..columns], assignments.iter().map(row).collect()));
     }
     text
+}
+
+/// How the bytes travel to how many robots and why, the most common way first.
+fn mechanisms(assignments: &[AssignmentView]) -> Vec<String> {
+    let mut ways: BTreeMap<(Delivery, &str), Vec<&str>> = BTreeMap::new();
+    for decision in assignments.iter().filter_map(|assignment| assignment.delivery.as_ref()) {
+        ways.entry((decision.mechanism, decision.rule.as_str())).or_default().push(&decision.because);
+    }
+    let mut ways: Vec<_> = ways.into_iter().collect();
+    ways.sort_by_key(|(_, reasons)| std::cmp::Reverse(reasons.len()));
+    let line = |((mechanism, rule), reasons): ((Delivery, &str), Vec<&str>)| {
+        let count = if assignments.len() == 1 { String::new() } else { format!("{}, ", robots(reasons.len() as u64)) };
+        let is_one = reasons.iter().all(|reason| *reason == reasons[0]);
+        let others = if is_one { "" } else { " and the like" };
+        format!("{count}{mechanism}: {}, {}{others}", rule_shown(rule), reasons[0])
+    };
+    ways.into_iter().map(line).collect()
+}
+
+fn rule_shown(rule: &str) -> String {
+    // The first two are no rules of anybody.
+    if matches!(rule, ORDERED | FELL_BEHIND) { rule.to_owned() } else { format!("rule {rule:?}") }
+}
+
+/// How the bytes travel to one robot and why.
+fn way(delivery: Option<&DeliveryDecision>) -> String {
+    let shown = |decision: &DeliveryDecision| {
+        format!("{}: {}, {}", decision.mechanism, rule_shown(&decision.rule), decision.because)
+    };
+    delivery.map_or_else(|| "-".to_owned(), shown)
 }
 
 /// How many robots wait for what, the most common reason first.
@@ -91,6 +133,7 @@ fn assignment_row(assignment: &AssignmentView) -> Vec<String> {
         assignment.phase.to_string(),
         progress.map_or_else(|| "-".to_owned(), |p| format!("{}%", p.done.min(p.total) * 100 / p.total)),
         detail,
+        way(assignment.delivery.as_ref()),
     ]
 }
 
@@ -128,6 +171,33 @@ mod tests {
             superseded_by: None,
             updated_at_ms: 0,
         }
+    }
+
+    #[test]
+    fn ways_are_counted_and_explained() {
+        let travelling = |mechanism, rule: &str, because: &str| AssignmentView {
+            delivery: Some(DeliveryDecision { mechanism, rule: rule.to_owned(), because: because.to_owned() }),
+            ..assignment(Phase::Fetching, None)
+        };
+        let pull = || travelling(Delivery::PushPull, "otherwise", "size 9.7 MB > 256 KB");
+        assert_eq!(mechanisms(&[pull()]), ["push-pull: rule \"otherwise\", size 9.7 MB > 256 KB"]);
+        let assignments = [
+            travelling(Delivery::DirectPush, "slow", "rtt 120 ms > 100 ms"),
+            pull(),
+            travelling(Delivery::DirectPush, "slow", "rtt 140 ms > 100 ms"),
+            travelling(Delivery::PushPull, "fell behind", "no progress"),
+            assignment(Phase::Assigned, None),
+        ];
+        assert_eq!(
+            mechanisms(&assignments),
+            [
+                "2 robots, direct-push: rule \"slow\", rtt 120 ms > 100 ms and the like",
+                "1 robot, push-pull: fell behind, no progress",
+                "1 robot, push-pull: rule \"otherwise\", size 9.7 MB > 256 KB",
+            ]
+        );
+        assert_eq!(assignment_row(&assignments[4])[5], "-");
+        assert_eq!(assignment_row(&assignments[3])[5], "push-pull: fell behind, no progress");
     }
 
     #[test]

@@ -10,6 +10,7 @@ use task_proto::report::{Condition, Phase, Report};
 use task_proto::selector::Selector;
 use task_proto::{Digest, Generation, MacAddress, RobotId, RobotName, TaskName};
 
+use super::deliveries;
 use super::rows::{from_json, from_optional_json, from_word, groups, id, json, number, priority, stored, values};
 use super::{Store, StoreError, Write};
 
@@ -296,7 +297,7 @@ const ROBOT_ROWS: &str = "SELECT r.id, r.name, r.mac, r.labels, r.enrolled_at_ms
 /// What each robot should have, and what it is still getting rid of. The first condition is that of an index, word for
 /// word: without it all that was ever ordered would be read.
 const TASK_ROWS: &str = "SELECT a.robot_id, a.task, a.deployment_id, a.wanted, a.run, a.phase, a.progress, a.failure,
-         d.version
+         a.mechanism, a.rule, a.because, d.version
      FROM assignments a JOIN deployments d ON d.id = a.deployment_id
      WHERE (a.desired = 1 OR a.ended = 0) AND (a.desired = 1 OR a.released = 1)";
 
@@ -409,6 +410,7 @@ fn robot_task(row: &sqlx::any::AnyRow) -> Result<RobotTask, StoreError> {
         deployment: id("assignments.deployment_id", row.try_get("deployment_id")?)?,
         wanted: from_word("assignments.wanted", row.try_get("wanted")?)?,
         run: number(row.try_get("run")?),
+        delivery: deliveries::decision(row)?,
         phase: Phase::from_text(row.try_get("phase")?),
         progress: from_optional_json("assignments.progress", row.try_get("progress")?)?,
         failure: from_optional_json("assignments.failure", row.try_get("failure")?)?,

@@ -286,7 +286,25 @@ async fn robots_and_deployments_are_shown_and_removed() {
     let deployment = deployment["id"].as_str().unwrap();
     let shown = bench.taskd(&["deploy", "info", deployment]).await.expect(0, "");
     assert!(shown.stdout.contains("robot-7") && shown.stdout.contains("assigned"), "{}", shown.stdout);
+    assert!(shown.stdout.contains("delivery    adaptive\n"), "{}", shown.stdout);
+    assert!(shown.stdout.contains("travels     inline: rule \"tiny\", size "), "{}", shown.stdout);
+    assert!(!shown.stdout.contains("DELIVERY"), "{}", shown.stdout);
+    let shown = bench.taskd(&["deploy", "info", deployment, "--robots"]).await.expect(0, "");
+    assert!(
+        shown.stdout.contains("DELIVERY") && shown.stdout.matches("rule \"tiny\"").count() == 2,
+        "{}",
+        shown.stdout
+    );
     assert!(bench.taskd(&["deploy", "list"]).await.expect(0, "").stdout.contains(deployment));
+    let (directory, ordered) = (bench.package("1", ""), ["--delivery", "poll", "--priority", "-7"]);
+    let urgent = bench.taskd(&[&["push", &directory, "--to", "*"], &ordered[..]].concat()).await.expect(0, "");
+    for said in ["delivery    poll\n", "priority    -7\n", "travels     poll: ordered, the order says poll\n"] {
+        assert!(urgent.stdout.contains(said), "{}", urgent.stdout);
+    }
+    let refused = bench.taskd(&["push", &directory, "--to", "*", "--priority", "101"]).await;
+    refused.expect(2, "101 is not in -100..=100");
+    let refused = bench.taskd(&["push", &directory, "--to", "*", "--delivery", "by-pigeon"]).await;
+    refused.expect(2, "[possible values: adaptive, push-pull, direct-push, poll, inline]");
     let cancelled = bench.taskd(&["deploy", "cancel", deployment, "-o", "json"]).await.expect(0, "cancel");
     assert_eq!(cancelled.json()["state"], "cancelled");
     bench.taskd(&["deploy", "info", "d0000000000000000"]).await.expect(1, "not_found");

@@ -197,6 +197,9 @@ impl<'a> Gathering<'a> {
             is_fresh: true,
             came_at: None,
         };
+        if self.map.as_ref().is_some_and(PartMap::is_whole) {
+            return Ok(Ok(()));
+        }
         if *ear.hearing.borrow_and_update() == Hearing::Away {
             return Ok(Err(GaveUp::NoSession));
         }

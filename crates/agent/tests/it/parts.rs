@@ -336,6 +336,18 @@ async fn what_a_power_cut_tore_is_found_and_pulled() {
 }
 
 #[tokio::test]
+async fn an_agent_that_died_with_all_parts_on_the_disk_needs_no_other() {
+    let rig = ended_half_way().await;
+    fs::write(rig.site.data.blob_parts(&rig.digest()), &rig.site.content).unwrap();
+    let bits = vec![0xff; 8 * rig.cut.count().div_ceil(64) as usize];
+    let note = [b"pt1\n", &PART_BYTES.to_be_bytes()[..], &bits].concat();
+    fs::write(rig.site.data.blob_parts_note(&rig.digest()), note).unwrap();
+    rig.peer.allows_parts.send_replace(false);
+    rig.ends_well(rig.gather(&CancellationToken::new())).await;
+    assert_eq!(rig.site.asked(), [0; 0]);
+}
+
+#[tokio::test]
 async fn a_note_that_is_wrong_is_no_note() {
     for spoil in [b"pt1\n".to_vec(), vec![0xff; 300], vec![0; 1 << 20]] {
         let rig = ended_half_way().await;

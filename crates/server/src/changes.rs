@@ -7,6 +7,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 use task_proto::{DeploymentId, RobotId, TaskName};
 use tokio::sync::{Notify, broadcast};
 
+use crate::part_requests::PartRequests;
+
 /// Notices a slow listener may fall behind before it misses some.
 const NOTICES: usize = 16 * 1024;
 
@@ -39,6 +41,7 @@ pub struct Consequences {
 pub struct Changes {
     notices: broadcast::Sender<Change>,
     bells: Arc<Bells>,
+    part_requests: PartRequests,
 }
 
 /// Robots to ring: a set, so however often a robot's desired state changes it waits here once.
@@ -60,7 +63,12 @@ pub struct Rings {
 impl Changes {
     /// Nothing announced yet.
     pub fn new() -> Self {
-        Self { notices: broadcast::Sender::new(NOTICES), bells: Arc::default() }
+        Self { notices: broadcast::Sender::new(NOTICES), bells: Arc::default(), part_requests: PartRequests::default() }
+    }
+
+    /// What robots say they lack.
+    pub fn part_requests(&self) -> &PartRequests {
+        &self.part_requests
     }
 
     /// Every notice from now on.

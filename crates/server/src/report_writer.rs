@@ -88,6 +88,7 @@ async fn write_all(
         let answers = match write_with_retries(&store, &chooser, &newest, &clock).await {
             Ok((answers, consequences)) => {
                 changes.publish(consequences);
+                newest.iter().for_each(|submission| changes.part_requests().hear(&submission.report));
                 Ok(answers)
             }
             Err(error) => {

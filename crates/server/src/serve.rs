@@ -22,6 +22,7 @@ use crate::collector;
 use crate::config::Config;
 use crate::data_directory::{Addresses, DataDirectory, DataError};
 use crate::downlink::Downlink;
+use crate::fan_out::FanOutWorker;
 use crate::gatekeeper::StoreGatekeeper;
 use crate::http::events::{EventFeed, EventSource};
 use crate::http::traffic::HttpTotals;
@@ -138,7 +139,7 @@ impl Server {
             data: data.path().to_owned(),
             stop: stop.clone(),
         };
-        start_tasks(&tasks, &app, config.blob_grace);
+        start_tasks(&tasks, &app, &config);
         tasks.spawn(watch_load(app.clone(), load));
         let router = crate::http::router(app);
         let http = listener::serve(http, router, http_limits(&config), http_traffic, stop.clone(), REQUEST_PATIENCE);
@@ -199,7 +200,7 @@ impl Server {
 }
 
 /// What runs beside the listeners.
-fn start_tasks(tasks: &TaskTracker, app: &App, blob_grace: Duration) {
+fn start_tasks(tasks: &TaskTracker, app: &App, config: &Config) {
     let downlink = Downlink {
         actions: app.actions.clone(),
         blobs: app.blobs.clone(),
@@ -211,8 +212,17 @@ fn start_tasks(tasks: &TaskTracker, app: &App, blob_grace: Duration) {
     let source = EventSource { store: app.store.clone(), presence: app.presence.clone(), clock: app.clock.clone() };
     tasks.spawn(app.events.clone().run(source, app.changes.clone(), app.stop.clone()));
     let (store, blobs, clock, stop) = (app.store.clone(), app.blobs.clone(), app.clock.clone(), app.stop.clone());
-    tasks.spawn(collector::run(store, blobs, clock, blob_grace, stop));
+    tasks.spawn(collector::run(store, blobs, clock, config.blob_grace, stop));
     tasks.spawn(expire_assignments(app.clone()));
+    let worker = FanOutWorker {
+        store: app.store.clone(),
+        actions: app.actions.clone(),
+        blobs: app.blobs.clone(),
+        broker: app.broker.clone(),
+        changes: app.changes.clone(),
+        settings: config.delivery.clone(),
+    };
+    tasks.spawn(worker.run(app.stop.clone()));
     tasks.spawn(notice_silence(app.clone()));
 }
 

@@ -3,6 +3,7 @@
 
 mod deployments;
 mod desired;
+mod fallen_behind;
 mod robots;
 mod tasks;
 

@@ -3,6 +3,7 @@
 
 use std::io;
 use std::ops::Range;
+use std::path::Path;
 use std::pin::Pin;
 use std::task::{Context, Poll, ready};
 
@@ -10,7 +11,7 @@ use bytes::Bytes;
 use http_body::{Body, Frame, SizeHint};
 use tokio::task::JoinHandle;
 
-use super::{Blob, Source};
+use super::{Blob, BlobError, Source, on_disk};
 
 /// The most bytes handed out at once.
 const SLICE_BYTES: u64 = 256 * 1024;
@@ -80,6 +81,24 @@ impl Body for BlobBody {
 
     fn size_hint(&self) -> SizeHint {
         SizeHint::with_exact(self.left.end - self.left.start)
+    }
+}
+
+impl Blob {
+    /// The bytes of `range`, which lies inside the blob: mapped ones are not copied, only brought into memory.
+    pub async fn slice(&self, range: Range<u64>) -> Result<Bytes, BlobError> {
+        debug_assert!(range.end <= self.size);
+        let blob = self.clone();
+        on_disk(move || {
+            let length = usize::try_from(range.end - range.start).unwrap_or(usize::MAX);
+            let slice = blob.read_at(range.start, length);
+            let slice = slice.map_err(BlobError::disk("read", Path::new(&blob.digest.hex())))?;
+            if let Source::Mapped(_) = blob.source {
+                bring_into_memory(&slice);
+            }
+            Ok(slice)
+        })
+        .await
     }
 }
 

@@ -332,7 +332,7 @@ impl Write {
         deployments(ended)
     }
 
-    async fn raise_generations(&mut self, robots: &[RobotId]) -> Result<(), StoreError> {
+    pub(super) async fn raise_generations(&mut self, robots: &[RobotId]) -> Result<(), StoreError> {
         for group in groups(robots) {
             let sql = format!(
                 "WITH v (id) AS ({}) UPDATE robots SET generation = generation + 1 FROM v WHERE robots.id = v.id",

@@ -7,6 +7,7 @@ mod adoption;
 mod assignments;
 mod deliveries;
 mod deployments;
+mod fan_outs;
 mod migrate;
 mod orders;
 mod outputs;

@@ -8,6 +8,7 @@ mod browser;
 mod cli;
 mod database;
 mod deliveries;
+mod direct_push;
 mod fleet;
 mod harness;
 mod logs;

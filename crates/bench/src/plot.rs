@@ -6,7 +6,7 @@ use std::fmt::Write as _;
 
 use crate::axis::{Axis, unit_of_setting, written};
 use crate::report::escaped;
-use crate::run::{Figure, Plot, Point, Quantity, Unit};
+use crate::run::{Figure, Plot, Point, Unit};
 
 const WIDTH: f64 = 720.0;
 const HEIGHT: f64 = 420.0;
@@ -78,8 +78,9 @@ fn gather<'a>(plot: &Plot, shown: &[&'a Point]) -> BTreeMap<&'a str, BTreeMap<u6
     series
 }
 
-fn middle(values: &[f64]) -> Option<f64> {
-    Quantity::of(Unit::Number, values.iter().copied()).map(|quantity| quantity.median)
+/// The mean, so that no bad point is hidden by good ones.
+fn mean(values: &[f64]) -> Option<f64> {
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
 
 impl Frame {
@@ -121,7 +122,7 @@ impl Frame {
         let place = |bits: &u64| f64::from_bits(*bits);
         let mut line = String::new();
         for (bits, spot) in spots {
-            if let Some(value) = middle(&spot.values) {
+            if let Some(value) = mean(&spot.values) {
                 let letter = if line.is_empty() { 'M' } else { 'L' };
                 let _ = write!(line, "{letter}{:.1} {:.1}", self.x_of(place(bits)), self.y_of(value));
             }
@@ -129,9 +130,9 @@ impl Frame {
         let _ = write!(svg, "<g class=\"s{colour}\"><path class=\"line\" d=\"{line}\"/>");
         for (bits, spot) in spots {
             let x = self.x_of(place(bits));
-            let value = middle(&spot.values);
+            let value = mean(&spot.values);
             let y = value.map_or(TOP + MARK * 2.0, |value| self.y_of(value));
-            if let (Some(_), Some(high)) = (value, middle(&spot.high)) {
+            if let (Some(_), Some(high)) = (value, mean(&spot.high)) {
                 let _ = write!(svg, "<path class=\"high\" d=\"M{x:.1} {y:.1}V{:.1}\"/>", self.y_of(high));
             }
             let at = written(place(bits), self.x_unit);

@@ -170,7 +170,7 @@ pub struct Plot {
     pub y: String,
     /// What is written there.
     pub y_label: String,
-    /// Which figure of it. Points of a series with the same `x` are drawn as the median of theirs.
+    /// Which figure of it. Points of a series with the same `x` are drawn as the mean of theirs.
     #[serde(default)]
     pub figure: Figure,
     /// Whether the horizontal axis is logarithmic.

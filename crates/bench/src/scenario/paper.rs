@@ -8,6 +8,7 @@ use clap::Args;
 
 use super::grid::{Cell, Extent, MOST_ROBOTS, Mechanism, plots, runs};
 use super::run_once::{OneOrder, Outcome, run_once};
+use crate::axis::written;
 use crate::fleet::Fleet;
 use crate::link::{Link, LinkQuality};
 use crate::progress::{RunProgress, say};
@@ -214,16 +215,18 @@ fn notes(flags: &PaperFlags) -> Vec<String> {
 }
 
 /// What adaptive chose, by size.
-fn decisions(results: &BTreeMap<Cell, Vec<Outcome>>) -> Vec<String> {
+fn decisions(results: &BTreeMap<Cell, Vec<Outcome>>) -> Option<String> {
     let mut chosen: BTreeMap<u64, BTreeSet<&str>> = BTreeMap::new();
     for (cell, outcomes) in results.iter().filter(|(cell, _)| cell.mechanism == Mechanism::Adaptive) {
         let all = outcomes.iter().flat_map(|outcome| outcome.decisions.iter().map(String::as_str));
         chosen.entry(cell.payload_bytes).or_default().extend(all);
     }
     let say = |(bytes, decisions): (u64, BTreeSet<&str>)| {
-        format!("adaptive at {bytes} B: {}", decisions.into_iter().collect::<Vec<_>>().join(", "))
+        let size = written(bytes as f64, Unit::Bytes);
+        format!("{size} by {}", decisions.into_iter().collect::<Vec<_>>().join(" or "))
     };
-    chosen.into_iter().map(say).collect()
+    let said: Vec<String> = chosen.into_iter().map(say).collect();
+    (!said.is_empty()).then(|| format!("Adaptive, with the rule that decided: {}.", said.join("; ")))
 }
 
 fn point(cell: &Cell, outcomes: &[Outcome]) -> Point {

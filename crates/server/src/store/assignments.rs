@@ -107,6 +107,7 @@ impl Write {
         .fetch_all(self.connection())
         .await?;
         let Some(&(_, last)) = batch.last() else { return Ok(Released::default()) };
+        self.changes_access();
         let robots = batch.iter().map(|(robot, _)| id("assignments.robot_id", robot)).collect::<Result<Vec<_>, _>>()?;
         self.adopt_diverged(&robots, now_ms).await?;
         sqlx::query(

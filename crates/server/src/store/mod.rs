@@ -3,6 +3,7 @@
 
 #![expect(clippy::disallowed_methods, reason = "SQL is at home here")]
 
+mod access;
 mod adoption;
 mod assignments;
 mod deliveries;
@@ -23,6 +24,7 @@ use std::time::Duration;
 use sqlx::any::{Any, AnyPoolOptions};
 use sqlx::{AnyConnection, AnyPool, Transaction};
 
+use access::{Access, Ending};
 pub use assignments::{Released, Revocable, TaskOrder};
 pub use deliveries::{Decided, DeliveryOrder, RobotFacts};
 pub use deployments::NewDeployment;
@@ -42,6 +44,7 @@ const PATIENCE: Duration = Duration::from_secs(30);
 pub struct Store {
     reads: AnyPool,
     writes: AnyPool,
+    access: Access,
 }
 
 /// Why the database did not do as it was told.
@@ -85,6 +88,7 @@ impl StoreError {
 pub struct Write {
     transaction: Transaction<'static, Any>,
     turn: u64,
+    ending: Ending,
 }
 
 impl Write {
@@ -93,9 +97,23 @@ impl Write {
         self.turn
     }
 
-    /// Makes it so.
+    /// Makes it so. Goes on to its end even if the caller does not wait for it.
     pub async fn commit(self) -> Result<(), StoreError> {
-        Ok(self.transaction.commit().await?)
+        let Self { transaction, ending, .. } = self;
+        let committing = tokio::spawn(async move {
+            let committed = transaction.commit().await;
+            drop(ending);
+            committed
+        });
+        match committing.await {
+            Ok(committed) => Ok(committed?),
+            Err(panic) => std::panic::resume_unwind(panic.into_panic()),
+        }
+    }
+
+    /// From now on this write is one that may change who may do what.
+    fn changes_access(&mut self) {
+        self.ending.is_due = true;
     }
 
     /// Where the store's own statements run.
@@ -127,7 +145,7 @@ impl Store {
         let writes = pool_options(url, 1).connect(url).await.map_err(open_error)?;
         migrate::run(&writes).await.map_err(|source| StoreError::Migrate { url: without_password(url), source })?;
         let reads = pool_options(url, READERS).connect(url).await.map_err(open_error)?;
-        Ok(Self { reads, writes })
+        Ok(Self { reads, writes, access: Access::default() })
     }
 
     /// Ends all connections, after the writes that are under way.
@@ -145,11 +163,18 @@ impl Store {
     /// Begins a write. Its first statement is an update of one row that every write updates, so on both databases a
     /// second write waits here, before it has read anything, until the first has ended.
     pub async fn begin(&self) -> Result<Write, StoreError> {
+        let mut write = self.begin_reports().await?;
+        write.changes_access();
+        Ok(write)
+    }
+
+    /// Begins a write of what robots report, which changes nobody's rights unless it moves a rollout on.
+    pub async fn begin_reports(&self) -> Result<Write, StoreError> {
         let mut transaction = self.writes.begin().await?;
         let turn: i64 = sqlx::query_scalar("UPDATE write_lock SET turn = turn + 1 WHERE id = 1 RETURNING turn")
             .fetch_one(&mut *transaction)
             .await?;
-        Ok(Write { transaction, turn: rows::number(turn) })
+        Ok(Write { transaction, turn: rows::number(turn), ending: self.access.until_ended() })
     }
 }
 

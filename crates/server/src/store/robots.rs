@@ -1,6 +1,7 @@
 //! Robots: who they are, and how the operator sees them.
 
 use std::collections::HashMap;
+use std::sync::Arc;
 
 use sqlx::{AssertSqlSafe, Row as _};
 use task_proto::api::{RobotTask, RobotView};
@@ -176,7 +177,11 @@ impl Store {
 
     /// By which order `robot` may fetch the blob, the one that comes first; `None`: by none, as it belongs to no package that
     /// the robot should have.
-    pub async fn fetched_by(&self, robot: &RobotId, digest: &Digest) -> Result<Option<FetchedBy>, StoreError> {
+    pub async fn fetched_by(&self, robot: &RobotId, digest: &Digest) -> Result<Option<Arc<FetchedBy>>, StoreError> {
+        if let Some(order) = self.access.fetched_by(robot, digest) {
+            return Ok(Some(order));
+        }
+        let asked = self.access.ask();
         let rows = sqlx::query(
             "SELECT d.package, d.priority, d.number, r.labels FROM assignments a JOIN deployments d ON d.id = a.deployment_id
              JOIN robots r ON r.id = a.robot_id
@@ -190,7 +195,8 @@ impl Store {
             if [package.manifest, package.config, package.content].iter().any(|blob| blob.digest == *digest) {
                 let labels = from_json("robots.labels", row.try_get("labels")?)?;
                 let (priority, number) = (priority(&row)?, number(row.try_get("number")?));
-                return Ok(Some(FetchedBy { priority, number, labels }));
+                let order = FetchedBy { priority, number, labels };
+                return Ok(Some(self.access.remember_fetch(asked, robot, digest, order)));
             }
         }
         Ok(None)

@@ -74,13 +74,22 @@ impl Store {
 
     /// The same for whoever shows the token to come in. A robot's first use of a token ends its other ones.
     pub async fn admit(&self, token: &Token, now_ms: u64) -> Result<Option<Admitted>, StoreError> {
+        if let Some(holder) = self.access.holder(token, now_ms) {
+            return Ok(Some(Admitted { holder, is_first_use: false }));
+        }
+        let asked = self.access.ask();
         let Some(row) = self.valid_token(token, now_ms).await? else { return Ok(None) };
         let is_unused = token.kind() == TokenKind::Robot && !row.is_used;
+        let expires_at_ms = row.expires_at_ms;
         let Some(holder) = row.holder(token.kind()) else { return Ok(None) };
         if is_unused && !self.use_first(token, now_ms).await? {
             // Somebody was faster: either with this token or with a later one.
             let holder = self.token_holder(token, now_ms).await?;
             return Ok(holder.map(|holder| Admitted { holder, is_first_use: false }));
+        }
+        // How often an enrolment token may be used is counted by those who use it.
+        if !is_unused && holder != TokenHolder::Enrolment {
+            self.access.remember_holder(asked, token, &holder, expires_at_ms);
         }
         Ok(Some(Admitted { holder, is_first_use: is_unused }))
     }

@@ -1,13 +1,17 @@
 //! The one writer of reports: a bounded queue, emptied in batches, each one write to the store. A caller's future resolves
 //! when its report is stored. Of several reports of a robot in a batch only the last is written; the others are
-//! acknowledged with it, since each is a whole snapshot.
+//! acknowledged with it, since each is a whole snapshot. What it wrote before it remembers ([`memory`]), so that a batch
+//! of robots that go on reporting reads nothing, and writes only what has changed.
+
+mod memory;
 
 use std::collections::{BTreeSet, HashMap};
+use std::hash::{DefaultHasher, Hasher as _};
 use std::time::Duration;
 
 use task_proto::api::ReportReply;
 use task_proto::report::{Report, TaskReport};
-use task_proto::{DeploymentId, RobotId};
+use task_proto::{DeploymentId, Generation, RobotId};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
 
@@ -16,6 +20,7 @@ use crate::changes::{Changes, Consequences};
 use crate::chooser::Chooser;
 use crate::clock::Clock;
 use crate::store::{OpenAssignment, ReportedRobot, Store, StoreError, Write};
+use memory::Memory;
 
 /// Reports that may wait; beyond it callers wait for room.
 const QUEUE: usize = 16 * 1024;
@@ -27,6 +32,8 @@ const MAX_BATCH: usize = 2048;
 const TRIES: u32 = 3;
 /// The pause before the second try; it doubles.
 const FIRST_PAUSE: Duration = Duration::from_millis(50);
+/// A robot's free disk space is news again when it has changed by about this much.
+const DISK_STEP_BYTES: u64 = 16 << 20;
 
 /// Where reports are handed in. Clones feed the same writer.
 #[derive(Debug, Clone)]
@@ -54,6 +61,7 @@ pub enum ReportError {
 #[derive(Debug)]
 struct Submission {
     report: Report,
+    fingerprint: u64,
     token_number: u64,
     answer: oneshot::Sender<Result<ReportReply, ReportError>>,
 }
@@ -69,7 +77,7 @@ impl ReportWriter {
     /// the commit.
     pub async fn submit(&self, report: Report, token_number: u64) -> Result<ReportReply, ReportError> {
         let (answer, answered) = oneshot::channel();
-        let submission = Submission { report, token_number, answer };
+        let submission = Submission { fingerprint: fingerprint(&report), report, token_number, answer };
         self.queue.send_timeout(submission, PATIENCE).await.map_err(|_| ReportError::Busy)?;
         answered.await.map_err(|_| ReportError::Busy)?
     }
@@ -83,9 +91,10 @@ async fn write_all(
     chooser: Chooser,
 ) {
     let mut batch = Vec::with_capacity(MAX_BATCH);
+    let mut memory = Memory::default();
     while submissions.recv_many(&mut batch, MAX_BATCH).await > 0 {
         let newest = newest_by_robot(&batch);
-        let answers = match write_with_retries(&store, &chooser, &newest, &clock).await {
+        let answers = match write_with_retries(&store, &chooser, &mut memory, &newest, &clock).await {
             Ok((answers, consequences)) => {
                 changes.publish(consequences);
                 newest.iter().for_each(|submission| changes.part_requests().hear(&submission.report));
@@ -100,7 +109,7 @@ async fn write_all(
                 Err(ReportError::NotStored)
             }
         };
-        for Submission { report, token_number, answer } in batch.drain(..) {
+        for Submission { report, token_number, answer, .. } in batch.drain(..) {
             let reply =
                 answers.as_ref().map_err(Clone::clone).and_then(|answers| match answers.get(&report.robot_id) {
                     None => Err(ReportError::RobotNotFound(report.robot_id)),
@@ -111,6 +120,20 @@ async fn write_all(
             let _ = answer.send(reply);
         }
     }
+}
+
+/// The same for reports that differ only in what passes: times, and how far a phase has come. That is not worth writing
+/// a report again; where assignments stand is stored apart from it.
+fn fingerprint(report: &Report) -> u64 {
+    let mut lasting = report.clone();
+    (lasting.seq, lasting.uptime_ms, lasting.observed_generation) = (0, 0, Generation(0));
+    lasting.host.disk_free_bytes /= DISK_STEP_BYTES;
+    for task in &mut lasting.tasks {
+        (task.phase_ms, task.progress, task.missing_parts) = (0, None, None);
+    }
+    let mut hasher = DefaultHasher::new();
+    hasher.write(&serde_json::to_vec(&lasting).unwrap_or_default());
+    hasher.finish()
 }
 
 /// The last report of each robot in a batch.
@@ -143,85 +166,151 @@ type Answers = HashMap<RobotId, Answer>;
 async fn write_with_retries(
     store: &Store,
     chooser: &Chooser,
+    memory: &mut Memory,
     reports: &[&Submission],
     clock: &Clock,
 ) -> Result<(Answers, Consequences), StoreError> {
     let mut pause = FIRST_PAUSE;
-    for _ in 1..TRIES {
-        match write_batch(store, chooser, reports, clock.now_ms()).await {
+    let mut tries = 1;
+    loop {
+        let error = match write_batch(store, chooser, memory, reports, clock.now_ms()).await {
             Ok(written) => return Ok(written),
-            Err(error) => tracing::warn!(
-                error = &error as &dyn std::error::Error,
-                reports = reports.len(),
-                "reports are tried again"
-            ),
+            Err(error) => error,
+        };
+        // What the batch was about to change is remembered already.
+        memory.forget();
+        if tries == TRIES {
+            return Err(error);
         }
+        tracing::warn!(error = &error as &dyn std::error::Error, reports = reports.len(), "reports are tried again");
         tokio::time::sleep(pause).await;
         pause *= 2;
+        tries += 1;
     }
-    write_batch(store, chooser, reports, clock.now_ms()).await
 }
 
 /// Stores a batch and what follows from it, in one write.
 async fn write_batch(
     store: &Store,
     chooser: &Chooser,
+    memory: &mut Memory,
     reports: &[&Submission],
     now_ms: u64,
 ) -> Result<(Answers, Consequences), StoreError> {
-    let mut write = store.begin().await?;
-    let robots: Vec<RobotId> = reports.iter().map(|submission| submission.report.robot_id.clone()).collect();
-    let mut known: HashMap<RobotId, ReportedRobot> =
-        write.reported_robots(&robots).await?.into_iter().map(|robot| (robot.id.clone(), robot)).collect();
+    let mut write = store.begin_reports().await?;
+    let turn = write.turn();
+    memory.learn(&mut write, reports.iter().map(|submission| &submission.report.robot_id)).await?;
     // A report that is older than the stored one is acknowledged, so that it is not sent again, and ignored.
     let is_news = |submission: &&Submission| {
-        known.get(&submission.report.robot_id).is_some_and(|robot| {
-            submission.token_number >= robot.token_number && position(&submission.report) > robot.last_report
+        memory.get(&submission.report.robot_id).is_some_and(|known| {
+            submission.token_number >= known.robot.token_number
+                && position(&submission.report) > known.robot.last_report
         })
     };
-    let news: Vec<&Report> = reports.iter().copied().filter(is_news).map(|submission| &submission.report).collect();
+    let news: Vec<&Submission> = reports.iter().copied().filter(is_news).collect();
     let mut consequences = Consequences::default();
-    consequences.robots.extend(news.iter().map(|report| report.robot_id.clone()));
-    let moved = write_standings(&mut write, &news, now_ms).await?;
-    write.store_reports(&news, now_ms).await?;
+    consequences.robots.extend(news.iter().map(|submission| submission.report.robot_id.clone()));
+    let moved = write_standings(&mut write, memory, &news, now_ms).await?;
+    write_reports(&mut write, memory, &news, now_ms).await?;
     consequences.deployments.extend(moved.iter().cloned());
-    advance(&mut write, chooser, moved, now_ms, &mut consequences).await?;
+    let rolls = advance_waiting(&mut write, chooser, memory, moved, now_ms, &mut consequences).await?;
+    let mut answers: Answers = reports
+        .iter()
+        .filter_map(|submission| memory.get(&submission.report.robot_id))
+        .map(|known| answer(known.robot.clone()))
+        .collect();
     // A batch that has just been released may have raised generations.
-    let rung: Vec<RobotId> = consequences.rings.iter().filter(|robot| known.contains_key(*robot)).cloned().collect();
-    known.extend(write.reported_robots(&rung).await?.into_iter().map(|robot| (robot.id.clone(), robot)));
+    let rung: Vec<RobotId> = consequences.rings.iter().filter(|robot| answers.contains_key(*robot)).cloned().collect();
+    answers.extend(write.reported_robots(&rung).await?.into_iter().map(answer));
     write.commit().await?;
-    let answer = |robot: ReportedRobot| {
-        let reply = ReportReply { generation: robot.generation, name: robot.name, labels: robot.labels };
-        (robot.id, Answer { reply, token_number: robot.token_number })
-    };
-    Ok((known.into_values().map(answer).collect(), consequences))
+    if rolls {
+        memory.forget();
+    } else {
+        memory.committed(turn);
+    }
+    Ok((answers, consequences))
 }
 
-/// Stores where the robots' assignments stand after `reports`. Returns the deployments of which some phase has changed.
+fn answer(robot: ReportedRobot) -> (RobotId, Answer) {
+    let reply = ReportReply { generation: robot.generation, name: robot.name, labels: robot.labels };
+    (robot.id, Answer { reply, token_number: robot.token_number })
+}
+
+/// Moves on those of the deployments that have robots whose batch has not begun. Says whether there were any: then
+/// generations and assignments may have changed.
+async fn advance_waiting(
+    write: &mut Write,
+    chooser: &Chooser,
+    memory: &mut Memory,
+    moved: BTreeSet<DeploymentId>,
+    now_ms: u64,
+    consequences: &mut Consequences,
+) -> Result<bool, StoreError> {
+    let mut waiting = BTreeSet::new();
+    for deployment in moved.into_iter().filter(|deployment| memory.may_wait(deployment)).collect::<Vec<_>>() {
+        if write.rollout(&deployment).await?.is_some() {
+            waiting.insert(deployment);
+        } else {
+            memory.has_begun(deployment);
+        }
+    }
+    let rolls = !waiting.is_empty();
+    advance(write, chooser, waiting, now_ms, consequences).await?;
+    Ok(rolls)
+}
+
+/// Stores where the robots' assignments stand after `news`. Returns the deployments of which some phase has changed.
 async fn write_standings(
     write: &mut Write,
-    reports: &[&Report],
+    memory: &mut Memory,
+    news: &[&Submission],
     now_ms: u64,
 ) -> Result<BTreeSet<DeploymentId>, StoreError> {
-    let by_robot: HashMap<&RobotId, &Report> = reports.iter().map(|report| (&report.robot_id, *report)).collect();
-    let robots: Vec<RobotId> = by_robot.keys().map(|robot| (*robot).clone()).collect();
-    let mut moved = BTreeSet::new();
-    let mut changed = Vec::new();
-    for mut assignment in write.open_assignments(&robots).await? {
-        let Some(report) = by_robot.get(&assignment.robot) else { continue };
-        let next = match task_of(report, &assignment) {
-            Some(task) => assignment.standing.after(task),
-            None => assignment.standing.after_absence(assignment.removed, report.observed_generation),
-        };
-        let Some(next) = next else { continue };
-        if next.phase != assignment.standing.phase {
-            moved.insert(assignment.deployment.clone());
+    let mut deployments = BTreeSet::new();
+    let (mut moved, mut progressed) = (Vec::new(), Vec::new());
+    for Submission { report, .. } in news {
+        let Some(known) = memory.get_mut(&report.robot_id) else { continue };
+        for assignment in &mut known.open {
+            let next = match task_of(report, assignment) {
+                Some(task) => assignment.standing.after(task),
+                None => assignment.standing.after_absence(assignment.removed, report.observed_generation),
+            };
+            let Some(next) = next else { continue };
+            let is_moved = next.phase != assignment.standing.phase;
+            assignment.standing = next;
+            if is_moved {
+                deployments.insert(assignment.deployment.clone());
+                moved.push(assignment.clone());
+            } else {
+                progressed.push(assignment.clone());
+            }
         }
-        assignment.standing = next;
-        changed.push(assignment);
+        known.open.retain(|assignment| !assignment.standing.phase.is_final());
     }
-    write.store_standings(&changed, now_ms).await?;
-    Ok(moved)
+    write.store_standings(&moved, now_ms).await?;
+    write.store_progress(&progressed, now_ms).await?;
+    Ok(deployments)
+}
+
+/// Stores the reports; of one that says the same as the one before, only which it was.
+async fn write_reports(
+    write: &mut Write,
+    memory: &mut Memory,
+    news: &[&Submission],
+    now_ms: u64,
+) -> Result<(), StoreError> {
+    let (mut whole, mut repeated) = (Vec::new(), Vec::new());
+    for submission in news {
+        let Some(known) = memory.get_mut(&submission.report.robot_id) else { continue };
+        known.robot.last_report = position(&submission.report);
+        if known.fingerprint.replace(submission.fingerprint) == Some(submission.fingerprint) {
+            repeated.push(&submission.report);
+        } else {
+            whole.push(&submission.report);
+        }
+    }
+    write.store_reports(&whole, now_ms).await?;
+    write.store_repeated(&repeated, now_ms).await
 }
 
 fn task_of<'a>(report: &'a Report, assignment: &OpenAssignment) -> Option<&'a TaskReport> {

@@ -124,6 +124,30 @@ impl Write {
         Ok(())
     }
 
+    /// The same for reports that say nothing new: only which each was. The stored ones stay, with the times and the progress
+    /// of when they were written.
+    pub async fn store_repeated(&mut self, reports: &[&Report], now_ms: u64) -> Result<(), StoreError> {
+        for group in groups(reports) {
+            let sql = format!(
+                "WITH v (id, start, seq, observed) AS ({})
+                 UPDATE robots SET report_start = v.start, report_seq = v.seq, observed_generation = v.observed,
+                     last_seen_ms = $1
+                 FROM v WHERE robots.id = v.id",
+                values(2, group.len(), &["TEXT", "BIGINT", "BIGINT", "BIGINT"])
+            );
+            let mut query = sqlx::query(AssertSqlSafe(sql)).bind(stored(now_ms));
+            for report in group {
+                query = query
+                    .bind(report.robot_id.as_str())
+                    .bind(stored(report.start))
+                    .bind(stored(report.seq))
+                    .bind(stored(report.observed_generation.min(MAX_GENERATION).0));
+            }
+            query.execute(self.connection()).await?;
+        }
+        Ok(())
+    }
+
     /// Stores where assignments stand now. One that has run or ended does not expire any more.
     pub async fn store_standings(&mut self, assignments: &[OpenAssignment], now_ms: u64) -> Result<(), StoreError> {
         for group in groups(assignments) {
@@ -147,6 +171,30 @@ impl Write {
                     .bind(standing.failure.as_ref().map(json))
                     .bind(i64::from(standing.attempts))
                     .bind(i64::from(ended || standing.phase == Phase::Running));
+            }
+            query.execute(self.connection()).await?;
+        }
+        Ok(())
+    }
+
+    /// The same for assignments that are still in the phase they were in: what no index is made of.
+    pub async fn store_progress(&mut self, assignments: &[OpenAssignment], now_ms: u64) -> Result<(), StoreError> {
+        for group in groups(assignments) {
+            let sql = format!(
+                "WITH v (deployment_id, robot_id, progress, failure, attempts) AS ({})
+                 UPDATE assignments SET progress = v.progress, failure = v.failure, attempts = v.attempts,
+                     updated_at_ms = $1
+                 FROM v WHERE assignments.deployment_id = v.deployment_id AND assignments.robot_id = v.robot_id",
+                values(2, group.len(), &["TEXT", "TEXT", "TEXT", "TEXT", "BIGINT"])
+            );
+            let mut query = sqlx::query(AssertSqlSafe(sql)).bind(stored(now_ms));
+            for OpenAssignment { deployment, robot, standing, .. } in group {
+                query = query
+                    .bind(deployment.as_str())
+                    .bind(robot.as_str())
+                    .bind(standing.progress.as_ref().map(json))
+                    .bind(standing.failure.as_ref().map(json))
+                    .bind(i64::from(standing.attempts));
             }
             query.execute(self.connection()).await?;
         }

@@ -1,0 +1,85 @@
+//! What the writer remembers of the database from one batch to the next, so that robots that keep reporting are not read
+//! again each time. Every write takes the next turn: as long as this writer had the last one too, nobody else, in this
+//! process or another, has changed anything. Otherwise all is forgotten. It never decides anything.
+
+use std::collections::{HashMap, HashSet};
+
+use task_proto::{DeploymentId, RobotId};
+
+use crate::store::{OpenAssignment, ReportedRobot, StoreError, Write};
+
+/// Robots remembered before a batch; it may add its own.
+const MAX_ROBOTS: usize = 20_000;
+
+/// What is known to be stored.
+#[derive(Default)]
+pub(super) struct Memory {
+    /// The turn of the last write that is remembered.
+    turn: u64,
+    robots: HashMap<RobotId, Remembered>,
+    /// Deployments without a robot whose batch has not begun: nothing moves them on.
+    begun: HashSet<DeploymentId>,
+}
+
+/// One robot as it is stored.
+pub(super) struct Remembered {
+    pub(super) robot: ReportedRobot,
+    pub(super) open: Vec<OpenAssignment>,
+    /// The fingerprint of the stored report; `None`: not known.
+    pub(super) fingerprint: Option<u64>,
+}
+
+impl Memory {
+    /// Makes sure that all is known of those of `robots` that are registered, as it stands in `write`.
+    pub(super) async fn learn(
+        &mut self,
+        write: &mut Write,
+        robots: impl Iterator<Item = &RobotId>,
+    ) -> Result<(), StoreError> {
+        if write.turn() != self.turn + 1 {
+            self.forget();
+        }
+        if self.robots.len() > MAX_ROBOTS {
+            self.robots.clear();
+        }
+        let unknown: Vec<RobotId> = robots.filter(|robot| !self.robots.contains_key(*robot)).cloned().collect();
+        for robot in write.reported_robots(&unknown).await? {
+            let remembered = Remembered { robot, open: Vec::new(), fingerprint: None };
+            self.robots.insert(remembered.robot.id.clone(), remembered);
+        }
+        for assignment in write.open_assignments(&unknown).await? {
+            if let Some(remembered) = self.robots.get_mut(&assignment.robot) {
+                remembered.open.push(assignment);
+            }
+        }
+        Ok(())
+    }
+
+    pub(super) fn get(&self, robot: &RobotId) -> Option<&Remembered> {
+        self.robots.get(robot)
+    }
+
+    pub(super) fn get_mut(&mut self, robot: &RobotId) -> Option<&mut Remembered> {
+        self.robots.get_mut(robot)
+    }
+
+    /// Whether robots of the deployment may still wait for their batch.
+    pub(super) fn may_wait(&self, deployment: &DeploymentId) -> bool {
+        !self.begun.contains(deployment)
+    }
+
+    /// The deployment has no robot left whose batch has not begun.
+    pub(super) fn has_begun(&mut self, deployment: DeploymentId) {
+        self.begun.insert(deployment);
+    }
+
+    /// The write with this turn was committed, and what it changed is remembered.
+    pub(super) fn committed(&mut self, turn: u64) {
+        self.turn = turn;
+    }
+
+    /// Nothing is certain any more.
+    pub(super) fn forget(&mut self) {
+        *self = Self::default();
+    }
+}

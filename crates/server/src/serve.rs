@@ -26,7 +26,7 @@ use crate::fan_out::FanOutWorker;
 use crate::gatekeeper::StoreGatekeeper;
 use crate::http::events::{EventFeed, EventSource};
 use crate::http::traffic::HttpTotals;
-use crate::http::{App, listener};
+use crate::http::{App, AppParts, listener};
 use crate::mqtt_access::MqttAccess;
 use crate::presence::Presence;
 use crate::report_writer::ReportWriter;
@@ -118,7 +118,7 @@ impl Server {
         let transfers = Transfers::new(&config.transfers, config.delivery.site_label.clone());
         let (stop, tasks) = (CancellationToken::new(), TaskTracker::new());
         let http_traffic = Arc::new(HttpTotals::default());
-        let app = App {
+        let app = App::new(AppParts {
             clock,
             store: store.clone(),
             actions,
@@ -138,7 +138,7 @@ impl Server {
             http_traffic: http_traffic.clone(),
             data: data.path().to_owned(),
             stop: stop.clone(),
-        };
+        });
         start_tasks(&tasks, &app, &config);
         tasks.spawn(watch_load(app.clone(), load));
         let router = crate::http::router(app);

@@ -15,6 +15,9 @@ use super::{Blob, BlobError, Source, on_disk};
 
 /// The most bytes handed out at once.
 const SLICE_BYTES: u64 = 256 * 1024;
+/// The most bytes that are looked at ahead for whether they are in memory, in one system call. They may be thrown out again
+/// before they are sent; then a page is read where it should not be, which costs other connections a moment.
+const LOOK_AHEAD_BYTES: usize = 1024 * 1024;
 /// Reading one byte in each of these brings a slice into memory; no page is smaller.
 const PAGE_BYTES: usize = 4096;
 
@@ -22,6 +25,8 @@ const PAGE_BYTES: usize = 4096;
 pub struct BlobBody {
     blob: Blob,
     left: Range<u64>,
+    /// Up to where it was in memory when that was looked at last.
+    in_memory_until: u64,
     /// The next slice, while it is being fetched from the disk.
     pending: Option<JoinHandle<io::Result<Bytes>>>,
 }
@@ -29,7 +34,7 @@ pub struct BlobBody {
 impl BlobBody {
     pub(super) fn new(blob: Blob, range: Range<u64>) -> Self {
         debug_assert!(range.end <= blob.size);
-        Self { blob, left: range, pending: None }
+        Self { blob, in_memory_until: range.start, left: range, pending: None }
     }
 
     /// The next slice if it is in memory; else starts to fetch it.
@@ -39,7 +44,14 @@ impl BlobBody {
         let blob = self.blob.clone();
         if let Source::Mapped(_) = self.blob.source {
             let slice = blob.read_at(start, length)?;
-            if is_in_memory(&slice) {
+            if start + length as u64 <= self.in_memory_until {
+                return Ok(Some(slice));
+            }
+            let left = usize::try_from(self.left.end - start).unwrap_or(LOOK_AHEAD_BYTES);
+            let ahead = blob.read_at(start, left.min(LOOK_AHEAD_BYTES))?;
+            let resident = bytes_in_memory(&ahead);
+            self.in_memory_until = start + resident as u64;
+            if resident >= length {
                 return Ok(Some(slice));
             }
             self.pending = Some(tokio::task::spawn_blocking(move || {
@@ -102,17 +114,22 @@ impl Blob {
     }
 }
 
-/// Whether reading these mapped bytes would not wait for the disk. An answer of "no" costs only a detour.
-fn is_in_memory(slice: &[u8]) -> bool {
+/// How many of these mapped bytes, counted from the first, can be read without waiting for the disk. Too few cost only a
+/// detour.
+fn bytes_in_memory(slice: &[u8]) -> usize {
     // SAFETY: `sysconf` only reads its argument.
-    let page = usize::try_from(unsafe { libc::sysconf(libc::_SC_PAGESIZE) }).unwrap_or(PAGE_BYTES);
+    let page = usize::try_from(unsafe { libc::sysconf(libc::_SC_PAGESIZE) }).unwrap_or(PAGE_BYTES).max(PAGE_BYTES);
     let before = slice.as_ptr().addr() % page;
-    let length = before + slice.len();
-    let mut resident = vec![0_u8; length.div_ceil(page)];
-    // SAFETY: the range lies in one mapping, since a mapping begins on a page and the slice is part of it; the vector has
-    // a byte for each of its pages.
+    let mut resident = [0_u8; LOOK_AHEAD_BYTES / PAGE_BYTES + 1];
+    let length = (before + slice.len()).min(resident.len() * page);
+    // SAFETY: the range lies in one mapping, since a mapping begins on a page and the slice is part of it; there is a byte
+    // for each of its pages.
     let status = unsafe { libc::mincore(slice.as_ptr().sub(before).cast_mut().cast(), length, resident.as_mut_ptr()) };
-    status == 0 && resident.iter().all(|byte| byte & 1 == 1)
+    if status != 0 {
+        return 0;
+    }
+    let pages = resident.iter().take_while(|byte| **byte & 1 == 1).count();
+    (pages * page).saturating_sub(before).min(slice.len())
 }
 
 fn bring_into_memory(slice: &[u8]) {

@@ -128,6 +128,7 @@ struct Shared {
 pub struct Blob {
     digest: Digest,
     size: u64,
+    quoted_digest: Bytes,
     source: Source,
 }
 
@@ -318,12 +319,18 @@ impl Blob {
             }
             BlobRead::Mmap | BlobRead::Pread => Source::File(Arc::new(file)),
         };
-        Ok(Self { digest, size, source })
+        let quoted_digest = format!("\"{digest}\"").into();
+        Ok(Self { digest, size, quoted_digest, source })
     }
 
     /// What it hashes to.
     pub fn digest(&self) -> Digest {
         self.digest
+    }
+
+    /// The digest's text in double quotes, as HTTP writes a tag. It is shared: every answer has it.
+    pub fn quoted_digest(&self) -> &Bytes {
+        &self.quoted_digest
     }
 
     /// Its size in bytes.

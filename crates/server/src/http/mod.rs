@@ -23,6 +23,7 @@ mod tasks;
 pub mod traffic;
 mod views;
 
+use std::ops::Deref;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
@@ -53,9 +54,12 @@ use crate::web;
 use auth::{Access, Gate, guard};
 use error::ApiError;
 
-/// What handlers work with. Clones share everything.
+/// What handlers work with. Clones are the same: a request makes several on its way.
 #[derive(Clone)]
-pub struct App {
+pub struct App(Arc<AppParts>);
+
+/// What an [`App`] is made of.
+pub struct AppParts {
     /// The time.
     pub clock: Clock,
     /// The database.
@@ -94,6 +98,21 @@ pub struct App {
     pub data: PathBuf,
     /// Cancelled when the server stops.
     pub stop: CancellationToken,
+}
+
+impl App {
+    /// Of these parts.
+    pub fn new(parts: AppParts) -> Self {
+        Self(Arc::new(parts))
+    }
+}
+
+impl Deref for App {
+    type Target = AppParts;
+
+    fn deref(&self) -> &AppParts {
+        &self.0
+    }
 }
 
 impl FromRef<App> for oci::Registry {

@@ -4,6 +4,7 @@ use std::ops::Range;
 
 use axum::body::Body;
 use axum::response::Response;
+use bytes::Bytes;
 use http::header::{
     ACCEPT_RANGES, CACHE_CONTROL, CONTENT_LENGTH, CONTENT_RANGE, CONTENT_TYPE, ETAG, IF_NONE_MATCH, IF_RANGE, RANGE,
 };
@@ -63,8 +64,9 @@ async fn read(registry: &Registry, digest: Digest, request: &Parts) -> Answer {
 
 /// Answers with the part of a blob that the request's headers ask for.
 pub(super) fn serve(blob: &Blob, request: &Parts, content_type: HeaderValue, cache: HeaderValue) -> Answer {
-    let digest = header_value(blob.digest().to_string())?;
-    let etag = header_value(format!("\"{}\"", blob.digest()))?;
+    let quoted = blob.quoted_digest();
+    let digest = header_value(quoted.slice(1..quoted.len() - 1))?;
+    let etag = header_value(quoted.clone())?;
     let common = [
         (ETAG, etag.clone()),
         (HeaderName::from_static("docker-content-digest"), digest),
@@ -73,7 +75,7 @@ pub(super) fn serve(blob: &Blob, request: &Parts, content_type: HeaderValue, cac
     ];
     let headers = &request.headers;
     let mut response = if has_it(headers, &etag) {
-        let mut response = Response::new(Body::empty());
+        let mut response = with_room(Body::empty());
         *response.status_mut() = StatusCode::NOT_MODIFIED;
         response
     } else {
@@ -83,11 +85,12 @@ pub(super) fn serve(blob: &Blob, request: &Parts, content_type: HeaderValue, cac
             Wanted::Nothing => return unsatisfiable(blob),
         };
         let length = range.end - range.start;
-        let content_range = format!("bytes {}-{}/{}", range.start, range.end.saturating_sub(1), blob.size());
         let is_head = request.method == Method::HEAD;
-        let mut response = Response::new(if is_head { Body::empty() } else { Body::new(blob.body(range)) });
+        let content_range = (status == StatusCode::PARTIAL_CONTENT)
+            .then(|| format!("bytes {}-{}/{}", range.start, range.end.saturating_sub(1), blob.size()));
+        let mut response = with_room(if is_head { Body::empty() } else { Body::new(blob.body(range)) });
         *response.status_mut() = status;
-        if status == StatusCode::PARTIAL_CONTENT {
+        if let Some(content_range) = content_range {
             response.headers_mut().insert(CONTENT_RANGE, header_value(content_range)?);
         }
         response.headers_mut().insert(CONTENT_LENGTH, HeaderValue::from(length));
@@ -98,8 +101,16 @@ pub(super) fn serve(blob: &Blob, request: &Parts, content_type: HeaderValue, cac
     Ok(response)
 }
 
-fn header_value(text: String) -> Result<HeaderValue, OciError> {
-    HeaderValue::try_from(text).map_err(|_| OciError::blob_unknown())
+/// An answer with room for all the headers it will get, those for browsers included.
+fn with_room(body: Body) -> Response {
+    const HEADERS: usize = 24;
+    let mut response = Response::new(body);
+    response.headers_mut().reserve(HEADERS);
+    response
+}
+
+fn header_value(text: impl Into<Bytes>) -> Result<HeaderValue, OciError> {
+    HeaderValue::from_maybe_shared(text.into()).map_err(|_| OciError::blob_unknown())
 }
 
 fn unsatisfiable(blob: &Blob) -> Answer {

@@ -3,13 +3,18 @@
 
 pub mod axis;
 pub mod clock;
+pub mod compare;
+mod downloads;
+mod enrolment;
 pub mod fleet;
 pub mod link;
 pub mod load;
 pub mod load_report;
 pub mod machine;
 pub mod measure;
+mod mqtt;
 pub mod package;
+mod peer;
 pub mod plot;
 pub mod process;
 pub mod progress;

@@ -286,9 +286,9 @@ fn host_and_port(text: &str) -> Result<(String, u16), String> {
 }
 
 /// Each connection is an open file; many systems allow a program 1024 unless it asks for more.
-fn allow_files(needed: u64) -> anyhow::Result<()> {
+pub(crate) fn allow_files(needed: u64) -> anyhow::Result<()> {
     let (soft, hard) = getrlimit(Resource::RLIMIT_NOFILE).context("the limit of open files")?;
-    ensure!(needed <= hard, "--robots: {needed} open files are needed, this system allows {hard} (ulimit -Hn)");
+    ensure!(needed <= hard, "{needed} open files are needed, this system allows {hard} (ulimit -Hn)");
     if soft < needed {
         setrlimit(Resource::RLIMIT_NOFILE, needed, hard).context("the limit of open files")?;
     }

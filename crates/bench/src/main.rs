@@ -6,12 +6,16 @@ use std::process::ExitCode;
 
 use anyhow::Context as _;
 use clap::{Parser, Subcommand};
+use taskbench::compare::{CompareFlags, compare};
 use taskbench::load::{Load, LoadFlags};
 use taskbench::progress::say;
 use taskbench::report::page;
 use taskbench::run::Run;
+use taskbench::scenario::blob::{self, BlobFlags};
+use taskbench::scenario::broker::{self, BrokerFlags};
 use taskbench::scenario::fleet::{self, FleetFlags};
 use taskbench::scenario::paper::{self, PaperFlags};
+use taskbench::scenario::status::{self, StatusFlags};
 use tokio::signal::unix::{SignalKind, signal};
 
 /// Measures taskd
@@ -62,6 +66,27 @@ enum Command {
     /// The process of a scenario's robots; it is started by the scenario
     #[command(hide = true)]
     Robots,
+    /// Fetch blobs over HTTP, in turns with nginx where it is installed
+    ///
+    /// One large blob to few and to many connections, a small one to very many, and different large ones from the disk
+    /// while the API is probed. Every connection is another robot's. Processor time is the server's own.
+    #[command(after_help = "Example:\n  taskbench blob --runs 7 --out results")]
+    Blob(BlobFlags),
+
+    /// Send a short message to each of many connected robots, in turns with mosquitto where it is installed
+    ///
+    /// The front is measured by itself: `cargo build --release -p taskd --example front` makes the program for that. The
+    /// first message to each client is timed apart from the later ones.
+    #[command(after_help = "Example:\n  taskbench broker --clients 10000 --runs 7 --out results")]
+    Broker(BrokerFlags),
+
+    /// Report at fixed rates, and time when reports are stored, with SQLite and Postgres
+    #[command(after_help = "Example:\n  taskbench status --rate 10000 --postgres postgres://postgres@localhost/bench")]
+    Status(StatusFlags),
+
+    /// Show what has changed between two results of the same scenario
+    #[command(after_help = "Example:\n  taskbench compare old/blob.json new/blob.json --least 5")]
+    Compare(CompareFlags),
 
     /// Draw the HTML page of a result again, from its JSON file
     #[command(after_help = "Example:\n  taskbench report taskbench-results/paper.json paper.html")]
@@ -87,6 +112,13 @@ async fn run(command: Command) -> anyhow::Result<ExitCode> {
         Command::Paper(flags) => concluded(until_interrupted(paper::run(flags)).await?),
         Command::Fleet(flags) => concluded(until_interrupted(fleet::run(flags)).await?),
         Command::Robots => taskbench::robots::run().await.map(|()| ExitCode::SUCCESS),
+        Command::Blob(flags) => concluded(until_interrupted(blob::run(flags)).await?),
+        Command::Broker(flags) => concluded(until_interrupted(broker::run(flags)).await?),
+        Command::Status(flags) => concluded(until_interrupted(status::run(flags)).await?),
+        Command::Compare(flags) => {
+            print(&compare(&flags)?)?;
+            Ok(ExitCode::SUCCESS)
+        }
         Command::Report { json, html } => {
             let run = Run::read(&json).with_context(|| json.display().to_string())?;
             let html = html.unwrap_or_else(|| json.with_extension("html"));
@@ -129,6 +161,12 @@ async fn load(flags: LoadFlags) -> anyhow::Result<ExitCode> {
         code = complain(&error);
     }
     Ok(code)
+}
+
+/// Prints a result.
+fn print(text: &str) -> anyhow::Result<()> {
+    use std::io::Write as _;
+    std::io::stdout().write_all(text.as_bytes()).context("stdout")
 }
 
 /// Says on stderr what went wrong, with all causes.

@@ -213,6 +213,14 @@ impl Process {
     pub fn usage(&self) -> Usage {
         self.pid().and_then(Usage::of).unwrap_or_default()
     }
+
+    /// The same of it and its children, for a server whose workers are processes.
+    pub fn family_usage(&self) -> Usage {
+        let Some(pid) = self.pid() else { return Usage::default() };
+        let children = std::fs::read_to_string(format!("/proc/{pid}/task/{pid}/children")).unwrap_or_default();
+        let children = children.split_whitespace().filter_map(|child| child.parse().ok());
+        std::iter::once(pid).chain(children).filter_map(Usage::of).fold(Usage::default(), Usage::plus)
+    }
 }
 
 /// What a process has used, and holds.
@@ -227,6 +235,14 @@ pub struct Usage {
 }
 
 impl Usage {
+    fn plus(self, other: Self) -> Self {
+        Self {
+            cpu_s: self.cpu_s + other.cpu_s,
+            anonymous_bytes: self.anonymous_bytes + other.anonymous_bytes,
+            resident_bytes: self.resident_bytes + other.resident_bytes,
+        }
+    }
+
     /// Of a process that lives.
     pub fn of(pid: u32) -> Option<Self> {
         let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;

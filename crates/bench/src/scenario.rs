@@ -1,6 +1,10 @@
 //! The scenarios with simulated robots, each on its own.
 
+pub mod blob;
+pub mod broker;
+mod cold;
 pub mod fleet;
 mod grid;
 pub mod paper;
 mod run_once;
+pub mod status;

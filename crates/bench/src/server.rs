@@ -6,7 +6,7 @@ use reqwest::{Method, RequestBuilder, Response, StatusCode, Url};
 use serde::de::DeserializeOwned;
 use task_proto::api::{
     CreateDeployment, CreateEnrollmentToken, DeploymentView, EnrollRequest, EnrollResponse, EnrollmentToken, ErrorBody,
-    IDEMPOTENCY_KEY, RobotList, ServerInfo,
+    IDEMPOTENCY_KEY, RobotList, RobotView, ServerInfo,
 };
 use task_proto::desired::BlobRef;
 use task_proto::oci::{ImageManifest, MANIFEST_TYPE};
@@ -69,6 +69,11 @@ impl Server {
     pub async fn robots(&self, selector: &Selector) -> Result<RobotList, ServerError> {
         let get = self.request(Method::GET, "/api/v1/robots");
         read("the list of robots", get.query(&[("selector", selector.to_string())])).await
+    }
+
+    /// One robot.
+    pub async fn robot(&self, robot: &RobotId) -> Result<RobotView, ServerError> {
+        read("a robot", self.request(Method::GET, &format!("/api/v1/robots/{robot}"))).await
     }
 
     /// Removes a robot.

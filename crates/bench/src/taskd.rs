@@ -54,6 +54,7 @@ impl Default for TaskdOrder {
 /// A server that runs. Dropping it kills it.
 pub struct Taskd {
     process: Process,
+    program: Program,
     dir: TempDir,
     /// Where HTTP listens.
     pub http: SocketAddr,
@@ -80,8 +81,7 @@ impl Taskd {
             Some(dir) => builder.tempdir_in(dir).with_context(|| format!("--data {}", dir.display()))?,
             None => builder.tempdir().context("a temporary directory")?,
         };
-        let (data, log) = (dir.path().join("data"), dir.path().join("taskd.log"));
-        let configuration = dir.path().join("taskd.toml");
+        let (data, configuration) = (dir.path().join("data"), dir.path().join("taskd.toml"));
         std::fs::write(&configuration, &order.configuration).context("the server's configuration file")?;
         let any = SocketAddr::new(order.listen, 0).to_string();
         let mut program =
@@ -90,14 +90,39 @@ impl Taskd {
         for (name, value) in &order.settings {
             program = program.variable(name, value);
         }
+        Self::launch(program, dir).await
+    }
+
+    /// Ends it and starts it again on the same data, as new: nothing is in its memory. Its ports are others.
+    pub async fn restart(self) -> anyhow::Result<Self> {
+        let Self { process, program, dir, .. } = self;
+        process.end().await;
+        Self::launch(program, dir).await
+    }
+
+    async fn launch(program: Program, dir: TempDir) -> anyhow::Result<Self> {
+        let (data, log) = (dir.path().join("data"), dir.path().join("taskd.log"));
+        let addresses = data.join("addresses.json");
+        // Those of an earlier start.
+        let _ = std::fs::remove_file(&addresses);
         let mut process = program.start(&log)?;
-        let addresses = wait_for_addresses(&mut process, &data.join("addresses.json"), &log).await?;
+        let addresses = wait_for_addresses(&mut process, &addresses, &log).await?;
         let token = std::fs::read_to_string(data.join("operator.token")).context("the server's operator.token")?;
         let token: Token = token.trim().parse().context("the server's operator.token")?;
         let base: Url = format!("http://{}", addresses.http).parse().context("the server's address")?;
         let server = Server::new(base, &token)?;
         let version = server.info().await.context("the server does not answer")?.version;
-        Ok(Self { process, dir, http: addresses.http, mqtt: addresses.mqtt, server, version })
+        Ok(Self { process, program, dir, http: addresses.http, mqtt: addresses.mqtt, server, version })
+    }
+
+    /// Where its blobs lie, each under the hexadecimal digits of its digest.
+    pub fn blobs(&self) -> PathBuf {
+        self.dir.path().join("data/blobs/sha256")
+    }
+
+    /// Its directory, for what else a scenario has to write.
+    pub fn dir(&self) -> &Path {
+        self.dir.path()
     }
 
     /// What it has used until now.

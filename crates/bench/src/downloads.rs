@@ -1,0 +1,175 @@
+//! Many connections that fetch one path over and over, as cheaply as the kernel allows: the bytes are counted and thrown
+//! away unread, so that what is measured is the server's work. It knows neither digests nor tokens.
+
+use std::io;
+use std::net::SocketAddr;
+use std::os::fd::AsRawFd as _;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, bail, ensure};
+use nix::sys::socket::{MsgFlags, recv};
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _, Interest};
+use tokio::net::TcpStream;
+use tokio::sync::Barrier;
+
+/// The most bytes thrown away by one call.
+const DISCARD_BYTES: usize = 1024 * 1024;
+/// A longer head is not one of the servers that are measured.
+const MAX_HEAD_BYTES: usize = 16 * 1024;
+/// How long a server may take to accept and answer.
+const PATIENCE: Duration = Duration::from_secs(120);
+/// Connections opened at a time.
+const CONNECTS_AT_ONCE: usize = 64;
+
+/// What is fetched.
+#[derive(Clone)]
+pub struct Target {
+    /// Where.
+    pub address: SocketAddr,
+    /// The path with its leading slash.
+    pub path: String,
+    /// The bearer token, if one is needed.
+    pub token: Option<String>,
+    /// The body's size: another one is a failure.
+    pub size: u64,
+}
+
+impl Target {
+    fn request(&self) -> Vec<u8> {
+        let token = self.token.as_ref().map_or(String::new(), |token| format!("Authorization: Bearer {token}\r\n"));
+        format!("GET {} HTTP/1.1\r\nHost: {}\r\n{token}\r\n", self.path, self.address).into_bytes()
+    }
+}
+
+/// How long each connection goes on.
+#[derive(Debug, Clone, Copy)]
+pub enum Until {
+    /// This many fetches.
+    Fetches(u64),
+    /// This long.
+    Elapsed(Duration),
+}
+
+/// What the connections got, from when all were open to when the last was done.
+#[derive(Debug, Clone, Copy)]
+pub struct Got {
+    /// Whole answers.
+    pub fetches: u64,
+    /// Bytes in their bodies.
+    pub bytes: u64,
+    /// From the first request to the end of the last answer.
+    pub wall: Duration,
+}
+
+/// Opens one connection for each of `targets` and fetches until all are done. `started` is called once all are open, right before the
+/// first request. One failed fetch fails the run: a server that refuses some has an easy life.
+pub async fn download(targets: &[Target], until: Until, started: impl FnOnce()) -> anyhow::Result<Got> {
+    let streams = connect_all(targets).await?;
+    let (start, stop) = (Arc::new(Barrier::new(targets.len() + 1)), Arc::new(AtomicBool::new(false)));
+    let counts = Arc::new([AtomicU64::new(0), AtomicU64::new(0)]);
+    let tasks: Vec<_> = streams
+        .into_iter()
+        .zip(targets.iter().cloned())
+        .map(|(mut stream, target)| {
+            let (start, stop, counts) = (start.clone(), stop.clone(), counts.clone());
+            tokio::spawn(async move {
+                let request = target.request();
+                start.wait().await;
+                let mut left = match until {
+                    Until::Fetches(fetches) => fetches,
+                    Until::Elapsed(_) => u64::MAX,
+                };
+                while left > 0 && !stop.load(Ordering::Relaxed) {
+                    fetch(&mut stream, &request, target.size).await?;
+                    counts[0].fetch_add(1, Ordering::Relaxed);
+                    counts[1].fetch_add(target.size, Ordering::Relaxed);
+                    left -= 1;
+                }
+                anyhow::Ok(())
+            })
+        })
+        .collect();
+    started();
+    let begun = Instant::now();
+    start.wait().await;
+    if let Until::Elapsed(time) = until {
+        tokio::time::sleep(time).await;
+        stop.store(true, Ordering::Relaxed);
+    }
+    for task in tasks {
+        task.await.context("a download broke down")??;
+    }
+    let [fetches, bytes] = [0, 1].map(|index: usize| counts[index].load(Ordering::Relaxed));
+    Ok(Got { fetches, bytes, wall: begun.elapsed() })
+}
+
+async fn connect_all(targets: &[Target]) -> anyhow::Result<Vec<TcpStream>> {
+    let mut streams = Vec::with_capacity(targets.len());
+    for group in targets.chunks(CONNECTS_AT_ONCE) {
+        let opening = group.iter().map(|target| TcpStream::connect(target.address));
+        for opened in futures_util::future::join_all(opening).await {
+            streams.push(opened.context("the server does not accept a connection")?);
+        }
+    }
+    Ok(streams)
+}
+
+async fn fetch(stream: &mut TcpStream, request: &[u8], size: u64) -> anyhow::Result<()> {
+    let whole = async {
+        stream.write_all(request).await.context("the request could not be sent")?;
+        let after_head = read_head(stream, size).await?;
+        let left = size.checked_sub(after_head).context("more came than the answer's length")?;
+        discard(stream, left).await.context("the answer broke off")
+    };
+    tokio::time::timeout(PATIENCE, whole).await.context("the server does not answer")?
+}
+
+/// Reads an answer's head; gives how many bytes of the body came with it.
+async fn read_head(stream: &mut TcpStream, size: u64) -> anyhow::Result<u64> {
+    let mut bytes = Vec::with_capacity(1024);
+    loop {
+        if stream.read_buf(&mut bytes).await.context("the answer's head broke off")? == 0 {
+            bail!("the server closed the connection instead of answering");
+        }
+        if let Some(end) = bytes.windows(4).position(|four| four == b"\r\n\r\n") {
+            check_head(&bytes[..end], size)?;
+            return Ok((bytes.len() - end - 4) as u64);
+        }
+        ensure!(bytes.len() < MAX_HEAD_BYTES, "the answer's head has no end");
+        bytes.reserve(1024);
+    }
+}
+
+fn check_head(head: &[u8], size: u64) -> anyhow::Result<()> {
+    let head = String::from_utf8_lossy(head);
+    let mut lines = head.split("\r\n");
+    let status = lines.next().unwrap_or_default();
+    ensure!(status.starts_with("HTTP/1.1 200 "), "the server answers {status:?}");
+    let length = lines
+        .filter_map(|line| line.split_once(':'))
+        .find(|(name, _)| name.eq_ignore_ascii_case("content-length"))
+        .and_then(|(_, value)| value.trim().parse::<u64>().ok());
+    ensure!(length == Some(size), "an answer of {length:?} bytes instead of {size}");
+    Ok(())
+}
+
+/// Throws `left` bytes away where they are: with MSG_TRUNC a TCP socket copies nothing.
+async fn discard(stream: &TcpStream, mut left: u64) -> io::Result<()> {
+    // Never written to, so it takes no memory.
+    let mut unused = vec![0_u8; DISCARD_BYTES];
+    while left > 0 {
+        let most = usize::try_from(left).unwrap_or(DISCARD_BYTES).min(DISCARD_BYTES);
+        let taken = stream
+            .async_io(Interest::READABLE, || {
+                recv(stream.as_raw_fd(), &mut unused[..most], MsgFlags::MSG_TRUNC).map_err(io::Error::from)
+            })
+            .await?;
+        if taken == 0 {
+            return Err(io::ErrorKind::UnexpectedEof.into());
+        }
+        left -= taken as u64;
+    }
+    Ok(())
+}

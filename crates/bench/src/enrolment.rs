@@ -1,0 +1,33 @@
+//! Robots of a server under measurement: enrolled through its API like any other, with nobody behind them.
+
+use anyhow::Context as _;
+use futures_util::{StreamExt as _, TryStreamExt as _};
+use task_proto::MacAddress;
+use task_proto::api::{CreateEnrollmentToken, EnrollRequest, EnrollResponse};
+use task_proto::id::Labels;
+
+use crate::server::Server;
+
+/// Enrolments under way at a time.
+const AT_ONCE: usize = 16;
+/// How long the enrolment token is good for.
+const TOKEN_TTL_S: u64 = 3600;
+
+/// Enrols `count` robots, named by their numbers.
+pub async fn enrol(server: &Server, count: usize) -> anyhow::Result<Vec<EnrollResponse>> {
+    let uses = Some(count as u64);
+    let order = CreateEnrollmentToken { ttl_s: Some(TOKEN_TTL_S), uses, ..Default::default() };
+    let token = server.create_enrollment_token(&order).await?.token;
+    let enrolling = (0..count).map(|number| {
+        let token = &token;
+        async move {
+            let [_, _, _, _, a, b, c, d] = (number as u64).to_be_bytes();
+            // Locally administered.
+            let mac = MacAddress::from_octets([0x02, 0, a, b, c, d]).context("no MAC")?;
+            let name = Some(format!("bench-{number:05}").parse()?);
+            let request = EnrollRequest { mac, name, labels: Labels::new() };
+            anyhow::Ok(server.enroll(token, &request).await?)
+        }
+    });
+    futures_util::stream::iter(enrolling).buffered(AT_ONCE).try_collect().await
+}

@@ -1,0 +1,120 @@
+//! The programs that taskd is measured beside, with the settings that make them fastest. Where one is not installed, that is
+//! said and the run goes on without it.
+
+use std::net::{Ipv4Addr, SocketAddr};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::{Context as _, bail};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::time::Instant;
+
+use crate::process::{Process, Program, Usage};
+
+/// Where programs lie that are not on an ordinary user's `PATH`.
+const SYSTEM_DIRECTORIES: [&str; 2] = ["/usr/sbin", "/usr/local/sbin"];
+/// How long one may take to accept connections.
+const START_TIMEOUT: Duration = Duration::from_secs(20);
+/// How often that is tried.
+const LOOK_INTERVAL: Duration = Duration::from_millis(20);
+
+/// A program that runs. Dropping it kills it.
+pub struct Peer {
+    process: Process,
+    /// Where it listens.
+    pub address: SocketAddr,
+    /// What it says of its version.
+    pub version: String,
+}
+
+impl Peer {
+    /// nginx, which serves the files in `root`. `None` if it is not installed.
+    pub async fn nginx(dir: &Path, root: &Path) -> anyhow::Result<Option<Self>> {
+        let Some(path) = find("nginx") else { return Ok(None) };
+        let address = free_address().await?;
+        let workers = std::thread::available_parallelism().map_or(1, usize::from);
+        let prefix = dir.join("nginx");
+        std::fs::create_dir_all(&prefix).context("nginx's directory")?;
+        let configuration = format!(
+            "daemon off; user root; worker_processes {workers}; pid nginx.pid; error_log error.log crit;
+             worker_rlimit_nofile 20000;
+             events {{ worker_connections 8192; multi_accept on; }}
+             http {{
+                 access_log off; etag on; sendfile on; sendfile_max_chunk 0; tcp_nopush on; tcp_nodelay on;
+                 keepalive_requests 1000000000; open_file_cache max=1000 inactive=600s; open_file_cache_valid 600s;
+                 default_type application/octet-stream;
+                 client_body_temp_path .; proxy_temp_path .; fastcgi_temp_path .; uwsgi_temp_path .; scgi_temp_path .;
+                 server {{ listen {address} backlog=4096; root {}; }}
+             }}\n",
+            root.display()
+        );
+        let file = prefix.join("nginx.conf");
+        std::fs::write(&file, configuration).context("nginx's configuration")?;
+        let program = Program::named(path).args([Path::new("-p"), &prefix, Path::new("-c"), &file]);
+        // It says its version on stderr; what matters is which Debian or upstream release it is.
+        Self::start(program, &dir.join("nginx.log"), address, "nginx").await.map(Some)
+    }
+
+    /// mosquitto, which lets everybody in and bounds nobody. `None` if it is not installed.
+    pub async fn mosquitto(dir: &Path) -> anyhow::Result<Option<Self>> {
+        let Some(path) = find("mosquitto") else { return Ok(None) };
+        let address = free_address().await?;
+        let configuration = format!(
+            "listener {} {}\nallow_anonymous true\nmax_connections -1\nmax_inflight_messages 0\nmax_queued_messages 0\n\
+             set_tcp_nodelay true\nlog_type error\npersistence false\n",
+            address.port(),
+            address.ip()
+        );
+        let file = dir.join("mosquitto.conf");
+        std::fs::write(&file, configuration).context("mosquitto's configuration")?;
+        let program = Program::named(path).args([Path::new("-c"), &file]);
+        Self::start(program, &dir.join("mosquitto.log"), address, "mosquitto").await.map(Some)
+    }
+
+    async fn start(program: Program, log: &Path, address: SocketAddr, name: &str) -> anyhow::Result<Self> {
+        let mut process = program.start(log)?;
+        let deadline = Instant::now() + START_TIMEOUT;
+        let mut tick = tokio::time::interval(LOOK_INTERVAL);
+        loop {
+            tick.tick().await;
+            if TcpStream::connect(address).await.is_ok() {
+                return Ok(Self { process, address, version: version(name).await });
+            }
+            if let Some(how) = process.ended() {
+                bail!("{how}: {}", std::fs::read_to_string(log).unwrap_or_default().trim());
+            }
+            if Instant::now() >= deadline {
+                bail!("{name} accepts no connection within {START_TIMEOUT:?}");
+            }
+        }
+    }
+
+    /// What it and its workers have used until now.
+    pub fn usage(&self) -> Usage {
+        self.process.family_usage()
+    }
+
+    /// Ends it.
+    pub async fn end(self) {
+        self.process.end().await;
+    }
+}
+
+/// The program on the `PATH` or where the system keeps its servers.
+fn find(name: &str) -> Option<PathBuf> {
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    let directories = std::env::split_paths(&path).chain(SYSTEM_DIRECTORIES.map(PathBuf::from));
+    directories.map(|directory| directory.join(name)).find(|path| path.is_file())
+}
+
+/// The version of the package that brought the program, where dpkg knows it.
+async fn version(name: &str) -> String {
+    let query = Program::named("dpkg-query").args(["-W", "-f", "${Version}", name]);
+    query.output().await.unwrap_or_else(|_| "unknown".to_owned())
+}
+
+/// A loopback address that was free a moment ago, for programs that can't say which one they took.
+async fn free_address() -> anyhow::Result<SocketAddr> {
+    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).await.context("no free port")?;
+    listener.local_addr().context("no free port")
+}

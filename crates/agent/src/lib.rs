@@ -15,6 +15,7 @@ pub mod disk;
 pub mod driver;
 pub mod durable;
 pub mod effects;
+pub mod endpoint;
 pub mod environment;
 pub mod fetch;
 pub mod foreign_file;

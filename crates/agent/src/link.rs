@@ -5,7 +5,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use task_proto::api::ReportReply;
+use task_proto::api::{MqttEndpoint, ReportReply};
 use task_proto::desired::Inline;
 use task_proto::envelope::Envelope;
 use task_proto::report::Report;
@@ -65,8 +65,14 @@ pub struct Shared {
     pub confirmed: watch::Sender<u64>,
     /// Whether the robot keeps to the state it has for some time; otherwise the server is asked for all of it again.
     pub settled: watch::Sender<bool>,
+    /// Where the MQTT session goes; `None`: where whoever keeps it was told at first.
+    pub endpoint: watch::Sender<Option<MqttEndpoint>>,
+    /// Asks the server where it goes.
+    pub find: Arc<Notify>,
     /// Whether a session is up.
     pub mqtt_up: watch::Sender<bool>,
+    /// Whether one is up whose acknowledgements come from the server itself: then it takes reports.
+    pub mqtt_stores: watch::Sender<bool>,
     /// Says that the server did not accept the token.
     pub token_refused: Arc<Notify>,
     /// Asks for a poll now.
@@ -117,7 +123,10 @@ impl Shared {
             reports: watch::Sender::new(None),
             confirmed: watch::Sender::new(0),
             settled: watch::Sender::new(false),
+            endpoint: watch::Sender::new(None),
+            find: Arc::default(),
             mqtt_up: watch::Sender::new(false),
+            mqtt_stores: watch::Sender::new(false),
             token_refused: Arc::default(),
             poll: Arc::default(),
             post: Arc::default(),
@@ -191,21 +200,25 @@ fn heard_of(outcome: Result<Option<Sent>, ServerError>) -> Heard {
     }
 }
 
-/// Delivers reports over HTTP while MQTT is down, and now and then while it is up, until the agent ends.
+/// Delivers reports over HTTP while no MQTT session stores them, and now and then while one does, until the agent ends.
 pub async fn post(server: Server, shared: Shared, heard: mpsc::Sender<Heard>) {
-    let (mut reports, mut mqtt_up) = (shared.reports.subscribe(), shared.mqtt_up.subscribe());
+    let (mut reports, mut mqtt_stores) = (shared.reports.subscribe(), shared.mqtt_stores.subscribe());
     let mut asked = true;
     let mut failures = 0;
     loop {
         let newest = reports.borrow_and_update().clone();
-        let up = *mqtt_up.borrow_and_update();
-        let due = newest.filter(|report| asked || (!up && report.seq > *shared.confirmed.borrow()));
+        let stores = *mqtt_stores.borrow_and_update();
+        let due = newest.filter(|report| asked || (!stores && report.seq > *shared.confirmed.borrow()));
         let mut retry = Duration::MAX;
         if let Some(report) = due {
             match server.report(&report).await {
                 Ok(reply) => {
                     (asked, failures) = (false, 0);
                     shared.confirmed.send_modify(|confirmed| *confirmed = (*confirmed).max(report.seq));
+                    // A broker that is not the server's may have lost the doorbell.
+                    if !stores && *shared.mqtt_up.borrow() && reply.generation > report.observed_generation {
+                        shared.poll.notify_one();
+                    }
                     if heard.send(Heard::Confirmed { seq: report.seq, reply: Some(reply) }).await.is_err() {
                         return;
                     }
@@ -236,7 +249,7 @@ pub async fn post(server: Server, shared: Shared, heard: mpsc::Sender<Heard>) {
             // Cancel-safe: a watch remembers that it changed, a timer is made anew.
             () = newer => {}
             // Cancel-safe: a watch remembers that it changed.
-            Ok(()) = mqtt_up.changed() => {}
+            Ok(()) = mqtt_stores.changed() => {}
             // Cancel-safe: a permit that was not taken stays.
             () = shared.post.notified() => asked = true,
             // Cancel-safe: a token can be awaited again.

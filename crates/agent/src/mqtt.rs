@@ -1,7 +1,7 @@
 //! The MQTT half of the link, and the only place that names rumqttc: one session after another, each with a last will;
 //! the doorbell, questions and the parts of packages in, status, the newest report, answers and log lines out. A report
-//! is confirmed by its PUBACK, which the server sends once the report is stored. It never decides what to do with what
-//! it hears.
+//! is confirmed by its PUBACK, which the server sends once the report is stored; a broker that is not the server's own
+//! gets none. It never decides what to do with what it hears.
 //!
 //! What is heard is acknowledged by hand: a part once it was written, all else at once. A part that nobody takes is all
 //! that is held here; until somebody does, nothing more is read.
@@ -16,6 +16,7 @@ use rumqttc::{
     Publish, QoS, StateError,
 };
 use task_proto::RobotId;
+use task_proto::api::{ExternalBroker, MqttEndpoint};
 use task_proto::desired::{Doorbell, MAX_DOORBELL_BYTES};
 use task_proto::report::Status;
 use task_proto::request::Request;
@@ -54,10 +55,10 @@ const MAX_MESSAGE_BYTES: u64 = 256 * 1024 * 1024 - 1;
 /// What a message has around its bytes: topic, packet id, a part's header.
 const AROUND_MESSAGE_BYTES: usize = 4096;
 
-/// Where and as whom to connect.
+/// Where and as whom to connect, if [`Shared::endpoint`] says nothing else.
 #[derive(Clone)]
 pub struct MqttAccess {
-    /// Host name or address.
+    /// Host name or address; also of an endpoint that names none.
     pub host: String,
     /// TCP port.
     pub port: u16,
@@ -65,7 +66,7 @@ pub struct MqttAccess {
     pub prefix: TopicPrefix,
     /// Client id and user name.
     pub robot: RobotId,
-    /// The password.
+    /// The password at the server's own broker.
     pub token: Credential,
     /// What every status says; `connection` counts up from it.
     pub status: Status,
@@ -79,6 +80,8 @@ enum Ended {
     Refused,
     /// A part of a wanted package is larger than what this session can read.
     TooNarrow,
+    /// The server says that it goes elsewhere.
+    Moved,
     /// Anything else.
     Lost(ConnectionError),
     /// The agent ends.
@@ -90,12 +93,23 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
     let mut failures = 0u32;
     // Whether the server has been seen to send packages as messages larger than usual.
     let mut sends_large = false;
+    let mut endpoint = shared.endpoint.subscribe();
     loop {
         access.status.connection += 1;
         let begun = Instant::now();
         let room = MessageRoom::of(&access, &shared, sends_large);
-        let ended = session(&access, &shared, &heard, &mut talk, room).await;
+        let (there, external) = access.at(endpoint.borrow_and_update().as_ref());
+        let session = session(&there, external.as_ref(), &shared, &heard, &mut talk, room);
+        let ended = tokio::select! {
+            // Cancel-safe: nothing follows. The broker notices that the session is gone.
+            ended = session => ended,
+            Ok(()) = endpoint.changed() => Ended::Moved,
+        };
         let was_up = shared.mqtt_up.send_replace(false);
+        shared.mqtt_stores.send_replace(false);
+        if !was_up {
+            shared.find.notify_one();
+        }
         // Whoever waits for parts need not give up if the next session comes at once.
         shared.listening.session(matches!(ended, Ended::TooNarrow));
         failures = if begun.elapsed() >= GOOD_SESSION { 1 } else { failures.saturating_add(1) };
@@ -103,6 +117,10 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
             Ended::Closed => return,
             Ended::TooNarrow => {
                 sends_large = true;
+                continue;
+            }
+            Ended::Moved => {
+                failures = 0;
                 continue;
             }
             Ended::Refused => {
@@ -123,9 +141,22 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
         tokio::select! {
             // Cancel-safe: a timer that is made anew each time.
             () = tokio::time::sleep(wait) => {}
+            // Cancel-safe: a watch remembers that it changed.
+            Ok(()) = endpoint.changed() => failures = 0,
             // Cancel-safe: a token can be awaited again.
             () = shared.shutdown.cancelled() => return,
         }
+    }
+}
+
+impl MqttAccess {
+    /// What holds at `endpoint`, and what is otherwise there than at the server's own broker.
+    fn at(&self, endpoint: Option<&MqttEndpoint>) -> (Self, Option<ExternalBroker>) {
+        let Some(MqttEndpoint { host, port, prefix, external }) = endpoint.cloned() else {
+            return (self.clone(), None);
+        };
+        let host = host.unwrap_or_else(|| self.host.clone());
+        (Self { host, port, prefix, ..self.clone() }, external)
     }
 }
 
@@ -171,13 +202,14 @@ enum Published {
 
 async fn session(
     access: &MqttAccess,
+    external: Option<&ExternalBroker>,
     shared: &Shared,
     heard: &mpsc::Sender<Heard>,
     talk: &mut Talk,
     room: MessageRoom,
 ) -> Ended {
     let Talk { requests, messages, lines } = talk;
-    let (client, mut event_loop) = AsyncClient::new(options(access, room), QUEUED_REQUESTS);
+    let (client, mut event_loop) = AsyncClient::new(options(access, external, room), QUEUED_REQUESTS);
     event_loop.network_options.set_connection_timeout(CONNECT_TIMEOUT_S);
     // An acknowledgement that waits for another packet to be answered would hold the sender up.
     event_loop.network_options.set_tcp_nodelay(true);
@@ -189,6 +221,7 @@ async fn session(
     tokio::pin!(pump, acknowledgements);
     let mut session = Session {
         access,
+        is_external: external.is_some(),
         shared,
         heard,
         requests,
@@ -269,6 +302,7 @@ async fn acknowledge_all(client: AsyncClient, mut due: mpsc::Receiver<Due>) {
 
 struct Session<'a> {
     access: &'a MqttAccess,
+    is_external: bool,
     shared: &'a Shared,
     heard: &'a mpsc::Sender<Heard>,
     requests: &'a mpsc::Sender<Request>,
@@ -331,6 +365,7 @@ impl Session<'_> {
     fn begin(&mut self) {
         self.up = true;
         self.shared.mqtt_up.send_replace(true);
+        self.shared.mqtt_stores.send_replace(!self.is_external);
         tracing::info!(host = self.access.host, port = self.access.port, "connected to MQTT");
         for topic in [RobotTopic::Desired, RobotTopic::Request] {
             // The queue is empty at the start of a session, and a lost session is noticed by the pump.
@@ -364,6 +399,10 @@ impl Session<'_> {
             }
             Some(Topic::Robot(robot, RobotTopic::Desired)) if robot == self.access.robot => {
                 self.hear_desired(&message.payload).await;
+                if self.is_external {
+                    // It is also how a server that has lost sight of its robots finds out who is there.
+                    self.publish(RobotTopic::Status, status_payload(self.access, true), Published::Status);
+                }
             }
             _ => {}
         }
@@ -436,7 +475,7 @@ impl Session<'_> {
     fn publish_report(&mut self) {
         let busy = self.is_under_way(|published| matches!(published, Published::Report { .. }));
         let Some(report) = self.shared.reports.borrow().clone() else { return };
-        if !self.up || busy || report.seq <= *self.shared.confirmed.borrow() {
+        if !self.up || self.is_external || busy || report.seq <= *self.shared.confirmed.borrow() {
             return;
         }
         match serde_json::to_vec(&*report) {
@@ -453,9 +492,10 @@ impl Session<'_> {
     }
 }
 
-fn options(access: &MqttAccess, room: MessageRoom) -> MqttOptions {
+fn options(access: &MqttAccess, external: Option<&ExternalBroker>, room: MessageRoom) -> MqttOptions {
     let mut options = MqttOptions::new(access.robot.as_str(), &access.host, access.port);
-    options.set_credentials(access.robot.as_str(), access.token.current());
+    let password = external.map_or_else(|| access.token.current(), |external| external.password.clone());
+    options.set_credentials(access.robot.as_str(), password);
     options.set_clean_session(true);
     options.set_keep_alive(KEEP_ALIVE);
     options.set_manual_acks(true);

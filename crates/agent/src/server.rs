@@ -8,7 +8,7 @@ use reqwest::{Method, StatusCode, Url};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use task_proto::RobotId;
-use task_proto::api::{EnrollRequest, EnrollResponse, ErrorBody, ReportReply, RobotToken};
+use task_proto::api::{EnrollRequest, EnrollResponse, ErrorBody, MqttEndpoint, ReportReply, RobotToken};
 use task_proto::envelope::Envelope;
 use task_proto::report::Report;
 
@@ -117,6 +117,13 @@ impl Server {
     pub async fn report(&self, report: &Report) -> Result<ReportReply, ServerError> {
         let url = at(&self.base, &format!("robots/{}/report", self.robot));
         let answer = self.ask(Method::POST, url, Some(report), None).await?;
+        parse(&answer.body)
+    }
+
+    /// Asks where the robot's MQTT session goes.
+    pub async fn mqtt_endpoint(&self) -> Result<MqttEndpoint, ServerError> {
+        let url = at(&self.base, &format!("robots/{}/mqtt", self.robot));
+        let answer = self.ask::<()>(Method::GET, url, None, None).await?;
         parse(&answer.body)
     }
 

@@ -31,7 +31,7 @@ use crate::mqtt::{self, MqttAccess};
 use crate::outputs::Registry;
 use crate::rotation::Rotation;
 use crate::server::{self, Server};
-use crate::{clock, confinement, process};
+use crate::{clock, confinement, endpoint, process};
 
 /// Messages from the link that the driver has not taken yet.
 const QUEUED_MESSAGES: usize = 16;
@@ -97,7 +97,7 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
     tokio::spawn(link::poll(server.clone(), shared.clone(), intervals, heard.clone()));
     tokio::spawn(link::post(server.clone(), shared.clone(), heard.clone()));
     let rotation = Rotation {
-        server,
+        server: server.clone(),
         credential: credential.clone(),
         identity: identity.clone(),
         path: data.identity(),
@@ -105,8 +105,10 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
     };
     tokio::spawn(rotation.run(shared.clone(), clock::wall_ms));
     if config.mqtt {
-        let host = identity.mqtt.host.clone().or_else(|| base.host_str().map(str::to_owned)).unwrap_or_default();
+        let host = base.host_str().map(str::to_owned).unwrap_or_default();
         let (port, prefix) = (identity.mqtt.port, identity.mqtt.prefix.clone());
+        shared.endpoint.send_replace(Some(identity.mqtt));
+        tokio::spawn(endpoint::follow(server, shared.clone(), config.poll_interval));
         let (robot_id, message_bytes) = (identity.robot_id, mqtt::MESSAGE_BYTES);
         let access = MqttAccess { host, port, prefix, robot: robot_id, token: credential, status, message_bytes };
         converse(access, shared, heard, data, &config, robot);

@@ -73,9 +73,13 @@ impl Process {
 
     /// SIGTERM, and its exit code.
     pub fn terminate(&mut self) -> Option<i32> {
-        let pid = nix::unistd::Pid::from_raw(i32::try_from(self.0.id()).expect("pid"));
-        nix::sys::signal::kill(pid, nix::sys::signal::Signal::SIGTERM).expect("signalled");
+        self.signal(nix::sys::signal::Signal::SIGTERM);
         self.0.wait().expect("reaped").code()
+    }
+
+    pub fn signal(&self, signal: nix::sys::signal::Signal) {
+        let pid = nix::unistd::Pid::from_raw(i32::try_from(self.0.id()).expect("pid"));
+        nix::sys::signal::kill(pid, signal).expect("signalled");
     }
 }
 
@@ -103,6 +107,13 @@ impl Server {
 
     /// Starts with further `TASKD_*` settings.
     pub async fn start_with(data: &Path, settings: &[(&str, &str)]) -> Self {
+        let server = Self::start_unready(data, settings).await;
+        server.wait_ready().await;
+        server
+    }
+
+    /// Starts though something is missing that it would need to be ready.
+    pub async fn start_unready(data: &Path, settings: &[(&str, &str)]) -> Self {
         let _ = rustls::crypto::ring::default_provider().install_default();
         let any: SocketAddr = ([127, 0, 0, 1], 0).into();
         let mut server = Self {
@@ -133,11 +144,24 @@ impl Server {
         .await;
         let address = |key: &str| found[key].as_str().and_then(|a| a.parse().ok()).unwrap_or_else(|| panic!("{found}"));
         (self.http, self.mqtt) = (address("http"), address("mqtt"));
-        let url = self.url("/readyz");
-        eventually("taskd to be ready", async || {
-            self.client.get(&url).send().await.ok().filter(|answer| answer.status().is_success())
-        })
-        .await;
+    }
+
+    pub async fn wait_ready(&self) {
+        eventually("taskd to be ready", async || (self.readiness().await?["status"] == "ready").then_some(())).await;
+    }
+
+    /// What `/readyz` says.
+    pub async fn readiness(&self) -> Option<Value> {
+        self.client.get(self.url("/readyz")).send().await.ok()?.json().await.ok()
+    }
+
+    /// Ends it and starts it again with another setting, `None`: without it. It listens for MQTT elsewhere then.
+    pub async fn restart_with(&mut self, name: &str, value: Option<&str>) {
+        self.terminate();
+        self.settings.retain(|(known, _)| known != name);
+        self.settings.extend(value.map(|value| (name.to_owned(), value.to_owned())));
+        self.mqtt.set_port(0);
+        self.launch().await;
     }
 
     pub fn data(&self) -> &Path {
@@ -155,6 +179,7 @@ impl Server {
     /// Starts it again on the same data and ports.
     pub async fn restart(&mut self) {
         self.launch().await;
+        self.wait_ready().await;
     }
 
     pub fn url(&self, path: &str) -> String {

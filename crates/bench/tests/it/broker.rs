@@ -1,0 +1,292 @@
+//! The whole system through a broker that is not its own: a real mosquitto, with the files that the server writes for it.
+#![expect(clippy::disallowed_methods, reason = "the broker is a process")]
+
+use std::net::{SocketAddr, TcpListener};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use nix::sys::signal::Signal;
+use rumqttc::{AsyncClient, Event, EventLoop, MqttOptions, Packet, QoS};
+use serde_json::Value;
+use task_proto::RobotId;
+use task_proto::api::{LogsFrom, LogsView, ServerInfo};
+use task_proto::report::Phase;
+use tempfile::TempDir;
+use tokio::net::TcpStream;
+
+use crate::harness::{PATIENCE, Process, Robot, Server, eventually, write_package};
+
+const PASSWORD: &str = "the-servers-password";
+
+/// A mosquitto without any state of its own, on one port as long as the test lasts.
+struct Mosquitto {
+    process: Option<Process>,
+    dir: PathBuf,
+    address: SocketAddr,
+}
+
+impl Mosquitto {
+    async fn start(dir: &Path) -> Self {
+        let mut mosquitto = Self::new(dir);
+        mosquitto.launch().await;
+        mosquitto
+    }
+
+    /// Known, and not started yet.
+    fn new(dir: &Path) -> Self {
+        let dir = dir.join("mosquitto");
+        std::fs::create_dir(&dir).expect("directory");
+        // Nothing else is likely to take the port until mosquitto does: it can't be given one that is bound.
+        let free = TcpListener::bind("127.0.0.1:0").expect("port");
+        let address = free.local_addr().expect("bound");
+        let path = dir.display();
+        let user = if nix::unistd::geteuid().is_root() { "user root\n" } else { "" };
+        let conf = format!(
+            "listener {} 127.0.0.1\n{user}allow_anonymous false\npersistence false\n\
+             acl_file {path}/acl\npassword_file {path}/passwd\nlog_dest file {path}/log\n",
+            address.port()
+        );
+        for (name, text) in [("conf", conf.as_str()), ("acl", ""), ("passwd", "")] {
+            std::fs::write(dir.join(name), text).expect("written");
+        }
+        Self { process: None, dir, address }
+    }
+
+    async fn launch(&mut self) {
+        // Not on every user's path.
+        let mut command = ["/usr/sbin/mosquitto", "/usr/local/sbin/mosquitto"]
+            .iter()
+            .find(|path| Path::new(path).exists())
+            .map_or_else(|| Command::new("mosquitto"), Command::new);
+        self.process = Some(Process::spawn(command.arg("-c").arg(self.dir.join("conf"))));
+        eventually("mosquitto to listen", async || TcpStream::connect(self.address).await.ok()).await;
+    }
+
+    /// `kill -9`: all that it knew is gone.
+    fn kill(&mut self) {
+        self.process.take().expect("it runs").kill();
+    }
+
+    /// What the server's setting says.
+    fn url(&self) -> String {
+        format!("mqtt://taskd:{PASSWORD}@{}", self.address)
+    }
+
+    /// What an operator does after robots were enrolled: new files, then SIGHUP.
+    async fn learn(&self, server: &Server) {
+        for file in ["acl", "passwd"] {
+            let text = server.operate(["broker", file]).await;
+            assert!(!text.contains(PASSWORD));
+            std::fs::write(self.dir.join(file), text).expect("written");
+        }
+        if let Some(process) = &self.process {
+            process.signal(Signal::SIGHUP);
+        }
+    }
+}
+
+/// How many robots the server knows to be at the broker.
+async fn connected(server: &Server) -> Option<u64> {
+    let info: ServerInfo = serde_json::from_value(server.get("/api/v1/server").await?).ok()?;
+    Some(info.traffic.robots_connected)
+}
+
+async fn wait_connected(server: &Server, robots: u64) {
+    eventually(&format!("{robots} robots at the broker"), async || (connected(server).await? == robots).then_some(()))
+        .await;
+}
+
+async fn says(server: &Server, what: &str) {
+    eventually(&format!("/readyz to say {what:?}"), async || {
+        let said = server.readiness().await?;
+        (said["status"] == "not_ready" && said["broker"].as_str()?.contains(what)).then_some(())
+    })
+    .await;
+}
+
+/// A service that says something on both streams.
+fn worker(dir: &Path, version: &str) -> PathBuf {
+    let package = dir.join(format!("worker-{version}"));
+    let script = format!("echo hello {version}; echo oops {version} >&2; exec sleep 1000\n");
+    write_package(&package, "worker", version, "service", &script);
+    package
+}
+
+async fn runs(server: &Server, robot: &str, version: &str) {
+    eventually(&format!("{robot} to run {version}"), async || {
+        let view = server.robot(robot).await?;
+        let task = view.tasks.into_iter().find(|task| task.task.as_str() == "worker")?;
+        (task.phase == Phase::Running && task.active?.version.as_str() == version).then_some(())
+    })
+    .await;
+}
+
+async fn logs(server: &Server, robot: &str) -> LogsView {
+    let out = server.operate(["logs", robot, "-o", "json"]).await;
+    serde_json::from_str(&out).unwrap_or_else(|error| panic!("{error}: {out}"))
+}
+
+fn server_log(server: &Server) -> String {
+    std::fs::read_to_string(server.data().with_extension("server.log")).expect("log")
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_fleet_works_through_mosquitto_and_survives_the_loss_of_all_its_sessions() {
+    let dir = TempDir::new().expect("temp dir");
+    let mut mosquitto = Mosquitto::start(dir.path()).await;
+    let mut server = Server::start_unready(&dir.path().join("server"), &[("TASKD_BROKER", &mosquitto.url())]).await;
+    says(&server, "does not accept the user taskd with the password in `broker`").await;
+    mosquitto.learn(&server).await;
+    server.wait_ready().await;
+
+    let mut robots = Vec::new();
+    for number in 1..=2 {
+        robots.push(Robot::start(&server, dir.path(), &format!("robot-{number}"), number).await);
+    }
+    // They are refused until the broker has learned of them.
+    mosquitto.learn(&server).await;
+    wait_connected(&server, 2).await;
+    server.push(&worker(dir.path(), "1.0.0"), "*").await;
+    for robot in ["robot-1", "robot-2"] {
+        runs(&server, robot, "1.0.0").await;
+        let view = eventually("its lines", async || {
+            let view = logs(&server, robot).await;
+            (view.lines.len() >= 2).then_some(view)
+        })
+        .await;
+        assert_eq!(view.from, LogsFrom::Robot, "asked over the broker");
+    }
+
+    // The broker dies in the middle of an order and comes back knowing nobody.
+    server.push(&worker(dir.path(), "2.0.0"), "*").await;
+    mosquitto.kill();
+    says(&server, "the broker at").await;
+    mosquitto.launch().await;
+    for robot in ["robot-1", "robot-2"] {
+        runs(&server, robot, "2.0.0").await;
+    }
+    server.wait_ready().await;
+    wait_connected(&server, 2).await;
+
+    // The server comes back to a broker where the robots have stayed.
+    server.kill();
+    server.restart().await;
+    wait_connected(&server, 2).await;
+    server.operate(["stop", "worker", "--on", "robot-1"]).await;
+    server.wait_phase("robot-1", "worker", Phase::Stopped).await;
+
+    // The will of a robot that is cut off, and what it published before.
+    robots[1].kill();
+    wait_connected(&server, 1).await;
+    eventually("the server's memory of robot-2", async || {
+        let output = server.try_operate(["logs", "robot-2", "-o", "json"]).await;
+        let view: LogsView = serde_json::from_slice(&output.stdout).ok()?;
+        (view.from == LogsFrom::Server).then_some(())
+    })
+    .await;
+    assert!(!server_log(&server).contains(PASSWORD));
+}
+
+/// A client with a robot's own name and password at the broker.
+async fn spy(mosquitto: &Mosquitto, robot: &Robot, id: &str) -> (AsyncClient, EventLoop) {
+    let identity: Value =
+        serde_json::from_slice(&std::fs::read(robot.data().join("identity.json")).expect("identity")).expect("json");
+    let password = identity["mqtt"]["external"]["password"].as_str().expect("a password from the enrolment");
+    assert_ne!(identity["token"], password, "the token is not shown to the broker");
+    let mut options = MqttOptions::new(id, mosquitto.address.ip().to_string(), mosquitto.address.port());
+    options.set_credentials(robot.id.as_str(), password);
+    AsyncClient::new(options, 16)
+}
+
+async fn next(events: &mut EventLoop) -> Packet {
+    loop {
+        if let Event::Incoming(packet) =
+            tokio::time::timeout(PATIENCE, events.poll()).await.expect("in time").expect("a session")
+        {
+            return packet;
+        }
+    }
+}
+
+fn status(online: bool) -> String {
+    format!(r#"{{"online":{online},"start":1000,"instance":"i00000000000000a1","connection":1}}"#)
+}
+
+async fn publish(client: &AsyncClient, events: &mut EventLoop, robot: &RobotId, topic: &str, text: String) {
+    client.publish(format!("taskd/v1/r/{robot}/{topic}"), QoS::AtLeastOnce, false, text).await.expect("queued");
+    while !matches!(next(events).await, Packet::PubAck(_)) {}
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_robots_password_at_mosquitto_opens_its_own_topics_only() {
+    let dir = TempDir::new().expect("temp dir");
+    let mosquitto = Mosquitto::start(dir.path()).await;
+    let server = Server::start_unready(&dir.path().join("server"), &[("TASKD_BROKER", &mosquitto.url())]).await;
+    let mut robots = Vec::new();
+    for number in 1..=2 {
+        let mut robot = Robot::start(&server, dir.path(), &format!("robot-{number}"), number).await;
+        robot.terminate();
+        robots.push(robot);
+    }
+    mosquitto.learn(&server).await;
+    server.wait_ready().await;
+    let (own, other) = (&robots[0].id, &robots[1].id);
+    let (client, mut events) = spy(&mosquitto, &robots[0], own.as_str()).await;
+    for filter in ["#", "taskd/v1/#", "taskd/v1/r/+/desired", "taskd/v1/r/+/status", "taskd/v1/server"] {
+        // Mosquitto grants any filter, and passes on what the ACL allows.
+        client.subscribe(filter, QoS::AtLeastOnce).await.expect("queued");
+        while !matches!(next(&mut events).await, Packet::SubAck(_)) {}
+    }
+
+    // Another's status is not taken from it, its own is.
+    publish(&client, &mut events, other, "status", status(true)).await;
+    publish(&client, &mut events, own, "status", status(true)).await;
+    wait_connected(&server, 1).await;
+    let view = server.robot(own.as_str()).await.expect("known");
+    assert!(view.online, "{view:?}");
+    // An order for the other is rung first, and does not come here; its own does.
+    server.push(&worker(dir.path(), "1.0.0"), "robot-2").await;
+    server.push(&worker(dir.path(), "1.1.0"), "robot-1").await;
+    let desired = format!("taskd/v1/r/{own}/desired");
+    let mut rung = 0;
+    // Its state as it was when it came, and with the order.
+    while rung < 2 {
+        if let Packet::Publish(message) = next(&mut events).await {
+            assert_eq!(message.topic, desired);
+            rung += 1;
+        }
+    }
+    publish(&client, &mut events, own, "status", status(false)).await;
+    wait_connected(&server, 0).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn robots_follow_the_server_from_broker_to_broker_without_enrolling_again() {
+    let dir = TempDir::new().expect("temp dir");
+    let mut mosquitto = Mosquitto::new(dir.path());
+    let mut server = Server::start(&dir.path().join("server")).await;
+    let refused = server.try_operate(["broker", "passwd"]).await;
+    assert!(String::from_utf8_lossy(&refused.stderr).contains("no_external_broker"), "{refused:?}");
+    let often = [("TASK_AGENT_POLL_INTERVAL_S", "3"), ("TASK_AGENT_POLL_INTERVAL_WITHOUT_MQTT_S", "2")];
+    let _robot = Robot::start_with(&server, dir.path(), "robot-1", 1, &server.url(""), &often).await;
+    wait_connected(&server, 1).await;
+
+    // The broker is down: HTTP works, robots poll, and it heals by itself.
+    server.restart_with("TASKD_BROKER", Some(&mosquitto.url())).await;
+    says(&server, "can't be reached").await;
+    server.push(&worker(dir.path(), "1.0.0"), "*").await;
+    runs(&server, "robot-1", "1.0.0").await;
+    mosquitto.learn(&server).await;
+    mosquitto.launch().await;
+    server.wait_ready().await;
+    wait_connected(&server, 1).await;
+    server.push(&worker(dir.path(), "2.0.0"), "*").await;
+    runs(&server, "robot-1", "2.0.0").await;
+
+    // Back again, while mosquitto lives on and holds the robot's session.
+    server.restart_with("TASKD_BROKER", None).await;
+    server.wait_ready().await;
+    wait_connected(&server, 1).await;
+    server.push(&worker(dir.path(), "3.0.0"), "*").await;
+    runs(&server, "robot-1", "3.0.0").await;
+}

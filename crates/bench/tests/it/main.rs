@@ -4,6 +4,7 @@ mod broker;
 mod confinement;
 mod corridor;
 mod crash;
+mod delivery;
 mod harness;
 mod hostile;
 mod load;

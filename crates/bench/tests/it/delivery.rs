@@ -1,0 +1,63 @@
+//! The ways a package may take, as the operator's order names them, through the real programs.
+
+use task_proto::api::DeploymentView;
+use task_proto::desired::Delivery;
+use task_proto::report::Phase;
+
+use crate::harness::{Robot, Server, write_package};
+use crate::proxy::Proxy;
+
+/// A package that does not compress.
+fn package(dir: &std::path::Path, bytes: usize) -> std::path::PathBuf {
+    let package = dir.join("worker");
+    write_package(&package, "worker", "1.0.0", "service", "exec sleep 1000\n");
+    let ballast: Vec<u8> = (0..bytes).map(|_| rand::random()).collect();
+    std::fs::write(package.join("ballast"), ballast).expect("ballast");
+    package
+}
+
+/// Orders the package so, waits until it runs, and gives how its bytes were to travel.
+async fn deliver(server: &Server, package: &std::path::Path, delivery: &str) -> Delivery {
+    let package = package.to_str().expect("utf-8 path");
+    let order = ["push", package, "--to", "robot-1", "--yes", "--delivery", delivery, "-o", "json"];
+    let view: DeploymentView = serde_json::from_str(&server.operate(order).await).expect("json");
+    server.wait_phase("robot-1", "worker", Phase::Running).await;
+    let view = server.deployment(view.id.as_str()).await.expect("known");
+    view.assignments.expect("assignments")[0].delivery.clone().expect("its batch has begun").mechanism
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_small_package_comes_with_the_order_and_nothing_of_it_over_http() {
+    const BYTES: usize = 24_000;
+    let dir = tempfile::tempdir().expect("temp dir");
+    let server = Server::start(&dir.path().join("server")).await;
+    let proxy = Proxy::start(server.http, u64::MAX).await;
+    let _robot = Robot::start_with(&server, dir.path(), "robot-1", 1, &format!("http://{}", proxy.address), &[]).await;
+    let online = async || server.robot("robot-1").await.filter(|robot| robot.online);
+    crate::harness::eventually("the robot to be online", online).await;
+    let package = package(dir.path(), BYTES);
+    let before = proxy.bytes_to_clients();
+    assert_eq!(deliver(&server, &package, "inline").await, Delivery::Inline);
+    let passed = proxy.bytes_to_clients() - before;
+    assert!(passed < BYTES as u64 / 2, "{passed} bytes came over HTTP");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_order_that_is_not_announced_is_found_by_the_robots_own_timer() {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let server = Server::start(&dir.path().join("server")).await;
+    let often = [("TASK_AGENT_POLL_INTERVAL_S", "1")];
+    let _robot = Robot::start_with(&server, dir.path(), "robot-1", 1, &server.url(""), &often).await;
+    assert_eq!(deliver(&server, &package(dir.path(), 100), "poll").await, Delivery::Poll);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_robot_without_mqtt_pulls_what_is_pushed() {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let server = Server::start(&dir.path().join("server")).await;
+    let alone = [("TASK_AGENT_MQTT", "false"), ("TASK_AGENT_POLL_INTERVAL_WITHOUT_MQTT_S", "1")];
+    let _robot = Robot::start_with(&server, dir.path(), "robot-1", 1, &server.url(""), &alone).await;
+    // On a slow machine the server may have told it so meanwhile.
+    let mechanism = deliver(&server, &package(dir.path(), 100_000), "direct-push").await;
+    assert!(matches!(mechanism, Delivery::DirectPush | Delivery::PushPull), "{mechanism}");
+}

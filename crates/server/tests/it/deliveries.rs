@@ -22,6 +22,7 @@ on_both_databases! {
     a_decision_of_an_older_version_is_the_orders,
     blobs_ride_along_until_the_robot_has_them,
     a_link_is_kept_until_another_is_measured,
+    who_waits_for_parts_is_known_until_it_has_them_or_pulls,
 }
 
 /// A rule with one condition, named like it.
@@ -245,4 +246,28 @@ async fn a_link_is_kept_until_another_is_measured(database: TestDatabase) {
     robots[0].link = Some(newer);
     fleet.report(&mut robots[0]).await;
     assert_eq!(fleet.view(&robots[0]).await.link, Some(newer));
+}
+
+async fn who_waits_for_parts_is_known_until_it_has_them_or_pulls(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let mut robots = fleet.enroll(2).await;
+    let content = package("1", TaskKind::Service).package.content.digest;
+    let id = fleet.deploy("1", |order| order.delivery = DeliveryChoice::DirectPush).await;
+    let store = fleet.database.store.clone();
+    let waiting = async || store.awaiting_parts(&content).await.expect("read");
+    let part = |robot: &Robot| (id.clone(), robot.id.clone());
+    assert_eq!(waiting().await, [part(&robots[0]), part(&robots[1])]);
+    fleet.follow(&mut robots[0], Phase::Running).await;
+    assert_eq!(waiting().await, [part(&robots[1])]);
+    let generation = fleet.desired(&robots[1]).await.expect("a state").generation;
+    // Who has all of it is left alone, whatever is asked.
+    let both = [part(&robots[0]), part(&robots[1])];
+    for _ in 0..2 {
+        fleet.actions.pull_instead(&both, "it held up the others").await.expect("ordered");
+    }
+    assert_eq!(fleet.desired(&robots[1]).await.expect("a state").generation.0, generation.0 + 1);
+    let told = decision(Delivery::PushPull, "fell behind", "it held up the others");
+    let ordered = decision(Delivery::DirectPush, "ordered", "the order says direct-push");
+    assert_eq!(decisions(&fleet, &id).await, [ordered, told]);
+    assert_eq!((waiting().await, store.direct_pushes().await.expect("read").len()), (Vec::new(), 0));
 }

@@ -241,7 +241,7 @@ fn plots(megabytes: u64) -> Vec<Plot> {
         x_label: "clients".to_owned(),
         y: y.to_owned(),
         y_label: y_label.to_owned(),
-        only: [("payload_bytes".to_owned(), (size, size))].into(),
+        only: [("payload_bytes".to_owned(), (size, size * 1.1))].into(),
         series: ["taskd", "nginx"].map(str::to_owned).to_vec(),
         ..Plot::default()
     };

@@ -48,7 +48,11 @@ async fn an_order_that_is_not_announced_is_found_by_the_robots_own_timer() {
     let server = Server::start(&dir.path().join("server")).await;
     let often = [("TASK_AGENT_POLL_INTERVAL_S", "1")];
     let _robot = Robot::start_with(&server, dir.path(), "robot-1", 1, &server.url(""), &often).await;
+    crate::harness::eventually("the robot to be connected", async || server.robot("robot-1").await?.mqtt).await;
     assert_eq!(deliver(&server, &package(dir.path(), 100), "poll").await, Delivery::Poll);
+    // One message can only be the state that a robot is sent when it connects.
+    let session = server.robot("robot-1").await.and_then(|robot| robot.mqtt).expect("still connected");
+    assert!(session.traffic.messages_out <= 1, "{session:?}");
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -4,15 +4,14 @@ use task_proto::api::DeploymentView;
 use task_proto::desired::Delivery;
 use task_proto::report::Phase;
 
-use crate::harness::{Robot, Server, write_package};
+use crate::harness::{Robot, Server, add_ballast, eventually, write_package};
 use crate::proxy::Proxy;
 
 /// A package that does not compress.
 fn package(dir: &std::path::Path, bytes: usize) -> std::path::PathBuf {
     let package = dir.join("worker");
     write_package(&package, "worker", "1.0.0", "service", "exec sleep 1000\n");
-    let ballast: Vec<u8> = (0..bytes).map(|_| rand::random()).collect();
-    std::fs::write(package.join("ballast"), ballast).expect("ballast");
+    add_ballast(&package, bytes);
     package
 }
 
@@ -34,7 +33,7 @@ async fn a_small_package_comes_with_the_order_and_nothing_of_it_over_http() {
     let proxy = Proxy::start(server.http, u64::MAX).await;
     let _robot = Robot::start_with(&server, dir.path(), "robot-1", 1, &format!("http://{}", proxy.address), &[]).await;
     let online = async || server.robot("robot-1").await.filter(|robot| robot.online);
-    crate::harness::eventually("the robot to be online", online).await;
+    eventually("the robot to be online", online).await;
     let package = package(dir.path(), BYTES);
     let before = proxy.bytes_to_clients();
     assert_eq!(deliver(&server, &package, "inline").await, Delivery::Inline);
@@ -48,7 +47,7 @@ async fn an_order_that_is_not_announced_is_found_by_the_robots_own_timer() {
     let server = Server::start(&dir.path().join("server")).await;
     let often = [("TASK_AGENT_POLL_INTERVAL_S", "1")];
     let _robot = Robot::start_with(&server, dir.path(), "robot-1", 1, &server.url(""), &often).await;
-    crate::harness::eventually("the robot to be connected", async || server.robot("robot-1").await?.mqtt).await;
+    eventually("the robot to be connected", async || server.robot("robot-1").await?.mqtt).await;
     assert_eq!(deliver(&server, &package(dir.path(), 100), "poll").await, Delivery::Poll);
     // One message can only be the state that a robot is sent when it connects.
     let session = server.robot("robot-1").await.and_then(|robot| robot.mqtt).expect("still connected");

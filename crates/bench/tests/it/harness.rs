@@ -13,6 +13,8 @@ use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use nix::poll::{PollFd, PollFlags};
+use nix::sys::signal::Signal;
+use rand::{RngExt as _, SeedableRng as _};
 use serde_json::Value;
 use task_proto::RobotId;
 use task_proto::api::{DeploymentView, RobotView};
@@ -73,11 +75,12 @@ impl Process {
 
     /// SIGTERM, and its exit code.
     pub fn terminate(&mut self) -> Option<i32> {
-        self.signal(nix::sys::signal::Signal::SIGTERM);
+        self.signal(Signal::SIGTERM);
         self.0.wait().expect("reaped").code()
     }
 
-    pub fn signal(&self, signal: nix::sys::signal::Signal) {
+    /// Whatever a signal does.
+    pub fn signal(&self, signal: Signal) {
         let pid = nix::unistd::Pid::from_raw(i32::try_from(self.0.id()).expect("pid"));
         nix::sys::signal::kill(pid, signal).expect("signalled");
     }
@@ -158,10 +161,15 @@ impl Server {
     /// Ends it and starts it again with another setting, `None`: without it. It listens for MQTT elsewhere then.
     pub async fn restart_with(&mut self, name: &str, value: Option<&str>) {
         self.terminate();
-        self.settings.retain(|(known, _)| known != name);
-        self.settings.extend(value.map(|value| (name.to_owned(), value.to_owned())));
+        self.set(name, value);
         self.mqtt.set_port(0);
         self.launch().await;
+    }
+
+    /// A setting that holds from the next start on; `None`: its default does.
+    pub fn set(&mut self, name: &str, value: Option<&str>) {
+        self.settings.retain(|(known, _)| known != name);
+        self.settings.extend(value.map(|value| (name.to_owned(), value.to_owned())));
     }
 
     pub fn data(&self) -> &Path {
@@ -239,8 +247,14 @@ impl Server {
 
     /// Uploads `package` and orders it for `selector`; gives the deployment.
     pub async fn push(&self, package: &Path, selector: &str) -> DeploymentView {
+        self.push_with(package, selector, &[]).await
+    }
+
+    /// The same with further options.
+    pub async fn push_with(&self, package: &Path, selector: &str, options: &[&str]) -> DeploymentView {
         let package = package.to_str().expect("utf-8 path");
-        let out = self.operate(["push", package, "--to", selector, "--yes", "-o", "json"]).await;
+        let args = [&["push", package, "--to", selector, "--yes", "-o", "json"], options].concat();
+        let out = self.operate(args).await;
         serde_json::from_str(&out).unwrap_or_else(|error| panic!("{error}: {out}"))
     }
 
@@ -310,6 +324,16 @@ impl Robot {
 
     pub fn terminate(&mut self) -> Option<i32> {
         self.process.take().expect("agent runs").terminate()
+    }
+
+    /// SIGSTOP: it is there, and does nothing.
+    pub fn freeze(&self) {
+        self.process.as_ref().expect("agent runs").signal(Signal::SIGSTOP);
+    }
+
+    /// SIGCONT.
+    pub fn thaw(&self) {
+        self.process.as_ref().expect("agent runs").signal(Signal::SIGCONT);
     }
 
     pub fn data(&self) -> &Path {
@@ -426,6 +450,13 @@ pub fn write_package(dir: &Path, name: &str, version: &str, kind: &str, script: 
     );
     std::fs::write(dir.join("task.toml"), toml).expect("task.toml");
     std::fs::write(dir.join("main.sh"), script).expect("main.sh");
+}
+
+/// Adds bytes to a package that do not compress, so that as many travel.
+pub fn add_ballast(package: &Path, bytes: usize) {
+    let mut ballast = vec![0; bytes];
+    rand::rngs::SmallRng::seed_from_u64(1).fill(&mut ballast[..]);
+    std::fs::write(package.join("ballast.bin"), ballast).expect("ballast");
 }
 
 /// Whether any user may run the Python of the ROS that the tests use; a Python in root's home is for root only.

@@ -5,6 +5,7 @@ mod confinement;
 mod corridor;
 mod crash;
 mod delivery;
+mod direct_push;
 mod harness;
 mod hostile;
 mod load;

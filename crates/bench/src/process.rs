@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::Duration;
 
-use nix::sys::signal::{Signal, kill};
+use nix::sys::signal::{Signal, kill, killpg};
 use nix::unistd::Pid;
 use tokio::process::{Child, ChildStdin, ChildStdout, Command};
 
@@ -178,7 +178,7 @@ pub fn run_now(path: &str, arguments: &[&str]) -> bool {
     command.status().is_ok_and(|status| status.success())
 }
 
-/// A program that runs. Dropping it kills it.
+/// A program that runs. Dropping it kills it, with all of its process group: a server's workers outlive its main process.
 #[derive(Debug)]
 pub struct Process {
     child: Child,
@@ -206,7 +206,16 @@ impl Process {
         if pid.is_some_and(|pid| kill(Pid::from_raw(pid), Signal::SIGTERM).is_ok()) {
             let _ = tokio::time::timeout(END_TIMEOUT, self.child.wait()).await;
         }
+        self.kill_group();
         let _ = self.child.kill().await;
+    }
+
+    /// Kills it and what it started in its process group, unless it was waited for: until then its pid, and with it that of
+    /// the group, is nobody else's.
+    fn kill_group(&self) {
+        if let Some(pid) = self.pid().and_then(|pid| i32::try_from(pid).ok()) {
+            let _ = killpg(Pid::from_raw(pid), Signal::SIGKILL);
+        }
     }
 
     /// What it has used until now; nothing, once it has ended.
@@ -220,6 +229,12 @@ impl Process {
         let children = std::fs::read_to_string(format!("/proc/{pid}/task/{pid}/children")).unwrap_or_default();
         let children = children.split_whitespace().filter_map(|child| child.parse().ok());
         std::iter::once(pid).chain(children).filter_map(Usage::of).fold(Usage::default(), Usage::plus)
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        self.kill_group();
     }
 }
 

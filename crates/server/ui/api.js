@@ -29,6 +29,6 @@ export const robotOutputs = async (robot) => ask('GET', `/outputs?robot=${robot}
 
 /** Everything the page shows, as it is now. */
 export async function lists() {
-  const [robots, deployments, packages] = await Promise.all(['/robots', '/deployments', '/packages'].map((path) => ask('GET', path)));
-  return { robots: robots.robots, deployments: deployments.deployments, packages: packages.packages };
+  const [robots, deployments] = await Promise.all(['/robots', '/deployments'].map((path) => ask('GET', path)));
+  return { robots: robots.robots, deployments: deployments.deployments };
 }

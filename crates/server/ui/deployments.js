@@ -23,15 +23,15 @@ export function deploymentList(fleet, isAllShown, now, actions) {
       <ol class="deployments">
         ${shown.map((deployment) => deploymentRow(deployment, fleet, now, actions))}
       </ol>
-      ${deployments.length || !fleet.isLoaded ? nothing : noDeployments(fleet)}
+      ${deployments.length || !fleet.isLoaded ? nothing : noDeployments()}
       ${isAllShown && deployments.length > MOST ? html`<p class="quiet">Older ones: <code>taskd deploy list</code></p>` : nothing}
     </section>`;
 }
 
-const noDeployments = ({ packages: [newest] }) => html`
+const noDeployments = () => html`
   <div class="empty">
-    <p class="quiet">Nothing is deployed yet. ${newest ? 'A package is there already; bring it to every robot with' : 'Push a directory to every robot with'}</p>
-    ${command(newest ? `taskd deploy ${newest.package.name}@${newest.package.version} --to '*'` : "taskd push ./my_pkg --to '*'")}
+    <p class="quiet">Nothing is deployed yet. Push a directory to every robot with</p>
+    ${command("taskd push ./my_pkg --to '*'")}
   </div>`;
 
 function deploymentRow(deployment, fleet, now, actions) {

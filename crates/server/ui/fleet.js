@@ -20,7 +20,6 @@ const urgency = (task) => ({ failed: 0, rolled_back: 0, unmet: 0, expired: 0, ru
 export class Fleet {
   robots = new Map();
   deployments = [];
-  packages = [];
   /** The robots to show, sorted and filtered. */
   shown = [];
   online = 0;
@@ -30,10 +29,9 @@ export class Fleet {
   #isUnordered = false;
   #orderedAt = 0;
 
-  load({ robots, deployments, packages }) {
+  load({ robots, deployments }) {
     this.robots = new Map(robots.map((robot) => [robot.id, robot]));
     this.deployments = deployments;
-    this.packages = packages;
     this.isLoaded = true;
     this.order();
   }

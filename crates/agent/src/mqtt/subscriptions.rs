@@ -11,7 +11,9 @@ use tokio::time::Instant;
 
 use crate::parts::{Hearing, Listening, Wish};
 
-/// How long to wait on average after a refusal.
+/// How long to wait on average after a refusal: a little at first, because the server may just be about to begin, then twice as
+/// long each time, up to the most.
+const FIRST_RETRY: Duration = Duration::from_millis(50);
 const RETRY: Duration = Duration::from_secs(1);
 /// How far a timer is set when there is nothing to wait for.
 const LONG: Duration = Duration::from_secs(3600);
@@ -29,6 +31,7 @@ pub(super) struct Subscriptions {
 struct Subscription {
     wish: Wish,
     stands: Stands,
+    refusals: u32,
 }
 
 enum Stands {
@@ -69,7 +72,9 @@ impl Subscriptions {
             subscription.stands = Stands::Granted;
             listening.tell(&wish, Hearing::Yes);
         } else {
-            subscription.stands = Stands::Due(Instant::now() + RETRY.mul_f64(0.5 + rand::random::<f64>()));
+            let pause = FIRST_RETRY.saturating_mul(1 << subscription.refusals.min(8)).min(RETRY);
+            subscription.refusals = subscription.refusals.saturating_add(1);
+            subscription.stands = Stands::Due(Instant::now() + pause.mul_f64(0.5 + rand::random::<f64>()));
             listening.tell(&wish, Hearing::Refused);
         }
         None
@@ -99,8 +104,8 @@ impl Subscriptions {
             !is_over
         });
         for wish in wanted {
-            let subscription =
-                self.contents.entry(wish.digest).or_insert(Subscription { wish, stands: Stands::Due(now) });
+            let new = Subscription { wish, stands: Stands::Due(now), refusals: 0 };
+            let subscription = self.contents.entry(wish.digest).or_insert(new);
             let is_due = matches!(subscription.stands, Stands::Due(at) if at <= now);
             if subscription.wish == wish && !is_due {
                 continue;

@@ -148,6 +148,15 @@ impl FanOut {
         }
     }
 
+    /// Waits until somebody has begun to listen since this was waited for last. Through an external broker only
+    /// [`Self::told`] says so.
+    pub async fn joined(&self) {
+        match &self.0 {
+            Way::Embedded(Granted { grant, .. }) => grant.joined().await,
+            Way::External(_) => std::future::pending().await,
+        }
+    }
+
     /// The robot may no longer hear it.
     pub fn withdraw(&self, robot: &RobotId) {
         match &self.0 {

@@ -28,7 +28,7 @@ use crate::store::{Store, StoreError};
 const MAX_AT_ONCE: usize = 4;
 /// How often it is looked for something to do, if nothing has changed.
 const LOOK_INTERVAL: Duration = Duration::from_secs(5);
-/// How soon after a change; what changes meanwhile is looked at together.
+/// How long after one look comes the next, whatever changes: what changes meanwhile is looked at together.
 const LOOK_PAUSE: Duration = Duration::from_millis(200);
 
 /// What fanning out needs. Clones share it.
@@ -76,6 +76,7 @@ impl FanOutWorker {
         let mut notices = self.changes.subscribe();
         let mut under_way = UnderWay::default();
         loop {
+            let looked_at = Instant::now();
             match self.wanted().await {
                 Ok(wanted) => self.begin(wanted, &mut under_way),
                 Err(error) => tracing::warn!(
@@ -83,10 +84,9 @@ impl FanOutWorker {
                     "what is to be fanned out could not be read; it is tried again"
                 ),
             }
-            let again_at = Instant::now() + LOOK_INTERVAL;
             loop {
                 tokio::select! {
-                    () = tokio::time::sleep_until(again_at) => break,
+                    () = tokio::time::sleep_until(looked_at + LOOK_INTERVAL) => break,
                     Some(ended) = under_way.tasks.join_next() => {
                         under_way.ended(ended);
                         break;
@@ -98,7 +98,7 @@ impl FanOutWorker {
                     },
                 }
             }
-            tokio::time::sleep(LOOK_PAUSE).await;
+            tokio::time::sleep_until(looked_at + LOOK_PAUSE).await;
             notices = notices.resubscribe();
         }
     }

@@ -22,6 +22,8 @@ use crate::store::StoreError;
 
 /// How often it is looked who listens, and whether it is time for the next step.
 const TURN: Duration = Duration::from_millis(250);
+/// How long to wait for others once somebody has begun to listen: they tend to come together.
+const JOIN_PAUSE: Duration = Duration::from_millis(20);
 /// How often the database is asked who still needs the package, if nothing is known to have changed.
 const SYNC_INTERVAL: Duration = Duration::from_secs(2);
 /// How long the last parts may take to be acknowledged before robots are waited for in another way.
@@ -138,6 +140,7 @@ impl Package<'_> {
         tokio::select! {
             () = self.changed.notified() => {}
             () = self.requests.news() => {}
+            () = self.fan_out.joined() => tokio::time::sleep(JOIN_PAUSE).await,
             () = tokio::time::sleep(TURN) => {}
         }
     }

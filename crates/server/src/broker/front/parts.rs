@@ -31,6 +31,7 @@ pub(in crate::broker) struct Grant {
     window: u64,
     progress: Mutex<Progress>,
     moved: Notify,
+    joined: Notify,
 }
 
 struct Progress {
@@ -99,7 +100,8 @@ impl Grants {
         }
         let window = (WINDOW_BYTES / part_bytes.max(1) as u64).clamp(1, WINDOW_PARTS);
         let progress = Progress::begin(robots, now);
-        let grant = Arc::new(Grant { digest, qos, window, progress: Mutex::new(progress), moved: Notify::new() });
+        let (moved, joined) = (Notify::new(), Notify::new());
+        let grant = Arc::new(Grant { digest, qos, window, progress: Mutex::new(progress), moved, joined });
         table.insert(digest, grant.clone());
         Ok(grant)
     }
@@ -162,6 +164,11 @@ impl Grant {
     /// The bytes of the parts that are held for listeners.
     pub(in crate::broker) fn queued_bytes(&self) -> usize {
         self.progress().parts.iter().map(Part::len).sum()
+    }
+
+    /// Waits until a robot has begun to listen since this was waited for last. For one caller at a time; cancel-safe.
+    pub(in crate::broker) async fn joined(&self) {
+        self.joined.notified().await;
     }
 
     /// Waits until no listener is a whole window behind. For one caller at a time; cancel-safe.
@@ -299,6 +306,7 @@ impl Member {
             progress.leave(&before, grant.window, now);
         }
         drop(progress);
+        grant.joined.notify_one();
         Some(Self { grant, robot: robot.clone() })
     }
 

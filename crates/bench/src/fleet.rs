@@ -1,4 +1,4 @@
-//! A run's view of its simulated robots: it registers them, starts the process they live in, and hears from it who has
+//! A run's view of its simulated robots: it registers them, starts the processes they live in, and hears from these who has
 //! verified what, when.
 
 use std::path::{Path, PathBuf};
@@ -25,18 +25,24 @@ use crate::taskd::Taskd;
 
 /// Enrolments under way at a time.
 const REQUESTS_AT_ONCE: usize = 16;
-/// Words from the robots' process that were not read yet.
+/// Robots in one process: each takes about [`FILES_PER_ROBOT`] open files, of which systems grant 20,000 and more.
+pub const ROBOTS_PER_PROCESS: usize = 3000;
+/// Open files a robot has at most: MQTT, HTTP connections, what it writes.
+pub const FILES_PER_ROBOT: usize = 5;
+/// Words from the robots' processes that were not read yet.
 const QUEUED_WORDS: usize = 1024;
 /// Where robots have their data: memory, because every real robot has a disk of its own and here they would share one.
 const MEMORY: &str = "/dev/shm";
+/// What their processes say beside their words.
+const LOG: &str = "robots.log";
 /// How long putting all robots together may take.
 const ASSEMBLY_LIMIT: Duration = Duration::from_secs(300);
 
 /// Simulated robots that run. Dropping it kills them.
 pub struct Fleet {
-    process: Process,
-    input: ChildStdin,
-    words: mpsc::Receiver<Word>,
+    processes: Vec<(Process, ChildStdin)>,
+    /// `None`: a process has ended.
+    words: mpsc::Receiver<Option<Word>>,
     dir: TempDir,
     /// How many there are.
     pub robots: usize,
@@ -69,40 +75,58 @@ impl Fleet {
     /// Registers `robots` robots at `taskd` and puts them together; they do not run yet.
     pub async fn assemble(taskd: &Taskd, robots: usize, poll: Duration, link: Option<&Link>) -> anyhow::Result<Self> {
         let (members, enrolments, key) = enrol(taskd, robots).await?;
-        let mut builder = tempfile::Builder::new();
-        builder.prefix("taskbench-robots-");
-        let memory = Path::new(MEMORY);
-        let dir = if memory.is_dir() { builder.tempdir_in(memory) } else { builder.tempdir() };
-        let dir = dir.context("a directory for the robots")?;
-        let crew = Crew {
-            server: format!("http://{}", taskd.http),
-            mqtt_host: taskd.mqtt.ip().to_string(),
-            key,
-            data: dir.path().to_owned(),
-            poll_ms: u64::try_from(poll.as_millis())?,
-            own_addresses: link.is_none(),
-            members,
+        let dir = memory_directory("taskbench-robots-")?;
+        let (said, words) = mpsc::channel(QUEUED_WORDS);
+        let mut fleet = Self { processes: Vec::new(), words, dir, robots, enrolments };
+        let mut members = members.into_iter();
+        for first in (0..robots).step_by(ROBOTS_PER_PROCESS) {
+            let crew = Crew {
+                server: format!("http://{}", taskd.http),
+                mqtt_host: taskd.mqtt.ip().to_string(),
+                key: key.clone(),
+                data: fleet.dir.path().to_owned(),
+                poll_ms: u64::try_from(poll.as_millis())?,
+                own_addresses: link.is_none(),
+                first,
+                members: members.by_ref().take(ROBOTS_PER_PROCESS).collect(),
+            };
+            fleet.add(&crew, link, said.clone()).await?;
+        }
+        let ready = async {
+            for _ in 0..fleet.processes.len() {
+                match fleet.words.recv().await {
+                    Some(Some(Word::Ready)) => {}
+                    _ => return Err(fleet.lost("ended")),
+                }
+            }
+            Ok(())
         };
+        match tokio::time::timeout(ASSEMBLY_LIMIT, ready).await {
+            Ok(ready) => ready?,
+            Err(_) => return Err(fleet.lost(&format!("was not ready within {ASSEMBLY_LIMIT:?}"))),
+        }
+        Ok(fleet)
+    }
+
+    /// Starts a further process with these robots, which puts them together.
+    async fn add(&mut self, crew: &Crew, link: Option<&Link>, said: mpsc::Sender<Option<Word>>) -> anyhow::Result<()> {
         let mut program = Program::beside("taskbench", None)?.args(["robots"]);
         if let Some(link) = link {
             program = program.within(link.inside());
         }
-        let (process, input, output) = program.converse(&dir.path().join("robots.log"))?;
-        let (said, words) = mpsc::channel(QUEUED_WORDS);
+        let (process, input, output) = program.converse(&self.dir.path().join(LOG))?;
         tokio::spawn(read_words(output, said));
-        let mut fleet = Self { process, input, words, dir, robots, enrolments };
-        fleet.tell(&serde_json::to_vec(&crew)?).await?;
-        match tokio::time::timeout(ASSEMBLY_LIMIT, fleet.words.recv()).await {
-            Ok(Some(Word::Ready)) => Ok(fleet),
-            Ok(word) => Err(fleet.lost(&format!("said {word:?} instead of being ready"))),
-            Err(_) => Err(fleet.lost(&format!("was not ready within {ASSEMBLY_LIMIT:?}"))),
-        }
+        self.processes.push((process, input));
+        self.tell(self.processes.len() - 1, &serde_json::to_vec(crew)?).await
     }
 
     /// Lets all robots begin at once; gives each one's time until it keeps to the server's state and the server knows.
     pub async fn start(&mut self, limit: Duration) -> anyhow::Result<Arrivals> {
         let begun_ns = monotonic_ns();
-        self.tell(&serde_json::to_vec(&Order::Start)?).await?;
+        let start = serde_json::to_vec(&Order::Start)?;
+        for process in 0..self.processes.len() {
+            self.tell(process, &start).await?;
+        }
         let news = |word: Word| match word {
             Word::Reconciled { robot, at_ns } => Some((robot, Ok(at_ns))),
             _ => None,
@@ -139,7 +163,7 @@ impl Fleet {
         let mut heard = vec![false; robots];
         while heard.contains(&false) {
             let Ok(word) = tokio::time::timeout_at(deadline, self.words.recv()).await else { break };
-            let Some(word) = word else { return Err(self.lost("ended")) };
+            let Some(word) = word.flatten() else { return Err(self.lost("ended")) };
             let Some((robot, outcome)) = news(word) else { continue };
             if heard.get(robot) != Some(&false) {
                 continue;
@@ -165,40 +189,56 @@ impl Fleet {
 
     /// What all robots together have used until now.
     pub fn usage(&self) -> Usage {
-        self.process.usage()
+        let each = self.processes.iter().map(|(process, _)| process.usage());
+        each.fold(Usage::default(), Usage::plus)
     }
 
     /// Ends the robots.
     pub async fn end(self) -> anyhow::Result<()> {
-        drop(self.input);
-        self.process.end().await;
+        for (process, input) in self.processes {
+            // Its end is the sign to end.
+            drop(input);
+            process.end().await;
+        }
         self.dir.close().context("the robots' directory can't be removed")
     }
 
-    async fn tell(&mut self, line: &[u8]) -> anyhow::Result<()> {
+    async fn tell(&mut self, process: usize, line: &[u8]) -> anyhow::Result<()> {
+        let (_, input) = self.processes.get_mut(process).context("no such process")?;
         let told = async {
-            self.input.write_all(line).await?;
-            self.input.write_all(b"\n").await?;
-            self.input.flush().await
+            input.write_all(line).await?;
+            input.write_all(b"\n").await?;
+            input.flush().await
         };
         let told = told.await;
         told.map_err(|error| self.lost(&format!("can't be told anything: {error}")))
     }
 
     fn lost(&self, what: &str) -> anyhow::Error {
-        let log = std::fs::read_to_string(self.dir.path().join("robots.log")).unwrap_or_default();
-        anyhow!("the robots' process {what}: {}", log.trim().lines().next_back().unwrap_or("it said nothing"))
+        let log = std::fs::read_to_string(self.dir.path().join(LOG)).unwrap_or_default();
+        anyhow!("a process of robots {what}: {}", log.trim().lines().next_back().unwrap_or("it said nothing"))
     }
 }
 
-async fn read_words(output: ChildStdout, said: mpsc::Sender<Word>) {
+/// A directory in memory, or a usual temporary one where the system has none.
+pub fn memory_directory(prefix: &str) -> anyhow::Result<TempDir> {
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(prefix);
+    let memory = Path::new(MEMORY);
+    let dir = if memory.is_dir() { builder.tempdir_in(memory) } else { builder.tempdir() };
+    dir.context("a directory for what robots write")
+}
+
+async fn read_words(output: ChildStdout, said: mpsc::Sender<Option<Word>>) {
     let mut lines = BufReader::new(output).lines();
     while let Ok(Some(line)) = lines.next_line().await {
-        let Ok(word) = serde_json::from_str(&line) else { return };
-        if said.send(word).await.is_err() {
+        let Ok(word) = serde_json::from_str(&line) else { break };
+        if said.send(Some(word)).await.is_err() {
             return;
         }
     }
+    // If nobody listens any more, nobody needs to know.
+    let _ = said.send(None).await;
 }
 
 /// Registers robots named `r0000`, `r0001`, … with addresses that no hardware has.

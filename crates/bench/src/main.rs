@@ -15,6 +15,7 @@ use taskbench::scenario::blob::{self, BlobFlags};
 use taskbench::scenario::broker::{self, BrokerFlags};
 use taskbench::scenario::fleet::{self, FleetFlags};
 use taskbench::scenario::paper::{self, PaperFlags};
+use taskbench::scenario::pull::{self, PullFlags};
 use taskbench::scenario::status::{self, StatusFlags};
 use tokio::signal::unix::{SignalKind, signal};
 
@@ -73,6 +74,13 @@ enum Command {
     #[command(after_help = "Example:\n  taskbench blob --runs 7 --out results")]
     Blob(BlobFlags),
 
+    /// One order for a large package, in turns with curl, openssl and tar, which fetch the same from nginx
+    ///
+    /// From the order until all robots have verified and unpacked it, against as many shells side by side that fetch, hash
+    /// and unpack one step after the other. Processor time is everybody's: server, robots, programs.
+    #[command(after_help = "Example:\n  taskbench pull --robots 8 --runs 7 --out results")]
+    Pull(PullFlags),
+
     /// Send a short message to each of many connected robots, in turns with mosquitto where it is installed
     ///
     /// The front is measured by itself: `cargo build --release -p taskd --example front` makes the program for that. The
@@ -113,6 +121,7 @@ async fn run(command: Command) -> anyhow::Result<ExitCode> {
         Command::Fleet(flags) => concluded(until_interrupted(fleet::run(flags)).await?),
         Command::Robots => taskbench::robots::run().await.map(|()| ExitCode::SUCCESS),
         Command::Blob(flags) => concluded(until_interrupted(blob::run(flags)).await?),
+        Command::Pull(flags) => concluded(until_interrupted(pull::run(flags)).await?),
         Command::Broker(flags) => concluded(until_interrupted(broker::run(flags)).await?),
         Command::Status(flags) => concluded(until_interrupted(status::run(flags)).await?),
         Command::Compare(flags) => {

@@ -9,7 +9,9 @@ use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::Duration;
 
+use nix::sys::resource::{UsageWho, getrusage};
 use nix::sys::signal::{Signal, kill, killpg};
+use nix::sys::time::TimeVal;
 use nix::unistd::Pid;
 use tokio::process::{Child, ChildStdin, ChildStdout, Command};
 
@@ -178,6 +180,13 @@ pub fn run_now(path: &str, arguments: &[&str]) -> bool {
     command.status().is_ok_and(|status| status.success())
 }
 
+/// Processor seconds of all children that have ended and were waited for, and of theirs.
+pub fn ended_children_cpu_s() -> io::Result<f64> {
+    let usage = getrusage(UsageWho::RUSAGE_CHILDREN)?;
+    let seconds = |time: TimeVal| time.tv_sec() as f64 + time.tv_usec() as f64 / 1e6;
+    Ok(seconds(usage.user_time()) + seconds(usage.system_time()))
+}
+
 /// A program that runs. Dropping it kills it, with all of its process group: a server's workers outlive its main process.
 #[derive(Debug)]
 pub struct Process {
@@ -250,7 +259,9 @@ pub struct Usage {
 }
 
 impl Usage {
-    fn plus(self, other: Self) -> Self {
+    /// Of both together.
+    #[must_use]
+    pub fn plus(self, other: Self) -> Self {
         Self {
             cpu_s: self.cpu_s + other.cpu_s,
             anonymous_bytes: self.anonymous_bytes + other.anonymous_bytes,

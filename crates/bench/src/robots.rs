@@ -1,4 +1,4 @@
-//! The process of a run's robots: `taskbench robots`, which the run starts and talks to. Each robot is the agent's own
+//! A process of a run's robots: `taskbench robots`, which the run starts and talks to. Each robot is the agent's own
 //! driver, plan, link, MQTT session, fetch and verification around a [`Body`] that starts nothing. It measures nothing
 //! but moments, and ends when its input does.
 
@@ -55,14 +55,15 @@ pub async fn run() -> anyhow::Result<()> {
     let (words, said) = mpsc::channel(QUEUED_WORDS);
     std::thread::spawn(move || write_words(said));
     let mut robots = Vec::with_capacity(crew.members.len());
-    for (number, member) in crew.members.iter().enumerate() {
-        robots.push(assemble(&crew, number, member).await.with_context(|| format!("robot {number}"))?);
+    for (number, member) in (crew.first..).zip(&crew.members) {
+        let robot = assemble(&crew, number, member).await.with_context(|| format!("robot {number}"))?;
+        robots.push((number, robot));
     }
     words.send(Word::Ready).await.map_err(|_| anyhow!("nobody listens"))?;
     while let Some(line) = lines.recv().await {
         match serde_json::from_str::<Order>(&line).context("a line is no order")? {
             Order::Start => {
-                for (number, robot) in robots.drain(..).enumerate() {
+                for (number, robot) in robots.drain(..) {
                     start(number, robot, &crew, words.clone());
                 }
             }

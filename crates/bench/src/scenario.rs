@@ -6,5 +6,6 @@ mod cold;
 pub mod fleet;
 mod grid;
 pub mod paper;
+pub mod pull;
 mod run_once;
 pub mod status;

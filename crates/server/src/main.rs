@@ -21,6 +21,8 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
 /// What may still run on a blocking thread when everything else has ended.
 const LEFTOVER_PATIENCE: Duration = Duration::from_millis(500);
+/// Open files beside connections: the database, blobs that travel, the system's own.
+const OTHER_FILES: usize = 500;
 
 /// See [`commands::Outcome`].
 const EXIT_CODES: &str = "Exit codes: 0 done, 1 failed, 2 the command line, a setting or the package is wrong or no robot \
@@ -66,8 +68,11 @@ async fn serve(flags: &ServeFlags) -> anyhow::Result<ExitCode> {
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal())
         .init();
-    let config = Config::load(flags, std::env::vars_os())?;
-    allow_open_files(config.max_http_connections + config.max_mqtt_connections);
+    let mut config = Config::load(flags, std::env::vars_os())?;
+    match open_files() {
+        Ok(files) => fit_to(&mut config, files),
+        Err(error) => tracing::warn!(%error, "the limit on open files can't be raised"),
+    }
     // Installed before anything is started, so that an early signal stops it softly as well.
     let mut signals = Signals::install().context("signals can't be caught")?;
     let server = Server::start(config, Clock::system()).await?;
@@ -86,21 +91,25 @@ async fn serve(flags: &ServeFlags) -> anyhow::Result<ExitCode> {
     }
 }
 
-/// Lets the process have as many open files as the system grants it: usually 1,024 are free to use, and each robot takes one.
-fn allow_open_files(connections: usize) {
-    let granted = getrlimit(Resource::RLIMIT_NOFILE).and_then(|(allowed, most)| {
-        if allowed < most {
-            setrlimit(Resource::RLIMIT_NOFILE, most, most)?;
-        }
-        Ok(most)
-    });
-    match granted {
-        Ok(files) if files < connections as u64 => {
-            tracing::warn!(files, connections, "fewer files may be open than connections are allowed; see ulimit -n");
-        }
-        Ok(_) => {}
-        Err(error) => tracing::warn!(%error, "the limit on open files can't be raised"),
+/// Lets the process have as many open files as the system grants it, usually 1,024 are free to use; says how many.
+fn open_files() -> nix::Result<usize> {
+    let (allowed, most) = getrlimit(Resource::RLIMIT_NOFILE)?;
+    if allowed < most {
+        setrlimit(Resource::RLIMIT_NOFILE, most, most)?;
     }
+    Ok(usize::try_from(most).unwrap_or(usize::MAX))
+}
+
+/// Leaves room for the database and blobs, and for robots' sessions before requests, which come and go.
+fn fit_to(config: &mut Config, files: usize) {
+    let room = files.saturating_sub(OTHER_FILES).max(2);
+    if config.max_http_connections + config.max_mqtt_connections <= room {
+        return;
+    }
+    config.max_http_connections = config.max_http_connections.min((room / 3).max(1));
+    config.max_mqtt_connections = config.max_mqtt_connections.min(room - config.max_http_connections);
+    let (http, mqtt) = (config.max_http_connections, config.max_mqtt_connections);
+    tracing::warn!(files, http, mqtt, "so few files may be open that fewer connections are allowed; see ulimit -n");
 }
 
 /// On stdout: where the server is, and the first three things to do with it.

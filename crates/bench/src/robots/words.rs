@@ -10,7 +10,7 @@ use task_proto::envelope::PublicKey;
 use task_proto::{DeploymentId, MacAddress};
 
 /// The first line to the process: which robots there are. Every further line is an [`Order`].
-#[derive(Clone, Serialize, Deserialize)]
+#[derive(Serialize, Deserialize)]
 pub struct Crew {
     /// The server's URL.
     pub server: String,
@@ -24,7 +24,9 @@ pub struct Crew {
     pub poll_ms: u64,
     /// Whether each robot connects over HTTP from an address of its own below 127.0.0.0/16.
     pub own_addresses: bool,
-    /// The robots. A word calls each by its place here.
+    /// The number of the first of the robots; those after it count on.
+    pub first: usize,
+    /// The robots.
     pub members: Vec<Member>,
 }
 
@@ -45,7 +47,7 @@ pub enum Order {
     Start,
 }
 
-/// What the process says. A robot is its place among the members.
+/// What the process says. A robot is its number.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Word {

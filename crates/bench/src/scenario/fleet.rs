@@ -8,17 +8,15 @@ use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use task_proto::api::DeliveryChoice;
 
 use super::run_once::{OneOrder, run_once};
-use crate::fleet::Fleet;
+use crate::fleet::{FILES_PER_ROBOT, Fleet, ROBOTS_PER_PROCESS};
 use crate::progress::{RunProgress, say};
 use crate::run::{Figure, Plot, Point, Run, RunFlags, Unit};
 use crate::taskd::{Taskd, TaskdFlags, TaskdOrder};
 
 /// As the agent's own default.
 const POLL: Duration = Duration::from_secs(300);
-/// Open files a robot has at most, on each side: MQTT, two HTTP connections, what it writes.
-const FILES_PER_ROBOT: u64 = 5;
-/// Open files beside those.
-const OTHER_FILES: u64 = 500;
+/// Open files of a process beside those of its robots.
+const OTHER_FILES: usize = 500;
 /// The most robots: what the addresses and ports of one machine are good for.
 const MOST_ROBOTS: u32 = 20_000;
 
@@ -69,8 +67,10 @@ impl Choice {
 /// Runs all sizes, one after the other.
 pub async fn run(flags: FleetFlags) -> anyhow::Result<Run> {
     let begun = Instant::now();
-    let most = flags.robots.iter().copied().max().unwrap_or(1);
-    allow_files(u64::from(most) * FILES_PER_ROBOT + OTHER_FILES)?;
+    let most = flags.robots.iter().map(|robots| *robots as usize).max().unwrap_or(1);
+    // The server has all sessions, and fewer HTTP connections at a time if there is no room for more.
+    let needed = most.min(ROBOTS_PER_PROCESS) * FILES_PER_ROBOT;
+    allow_files((needed.max(most + most / 2) + OTHER_FILES) as u64)?;
     let seed = flags.run.seed();
     let mut run = Run::begin("fleet", seed).await;
     run.plots = plots();
@@ -118,13 +118,12 @@ async fn measure(flags: &FleetFlags, robots: usize, seed: u64) -> anyhow::Result
 
     let memory = taskd.watch_memory();
     let one = OneOrder { choice: flags.delivery.ordered(), payload_bytes: flags.payload, robots, seed, limit };
-    let before = (taskd.usage(), fleet.usage());
     let outcome = run_once(&taskd, &mut fleet, one).await?;
-    let (after, memory) = ((taskd.usage(), fleet.usage()), memory.most().await);
+    let memory = memory.most().await;
     point.measure("delay", Unit::Milliseconds, outcome.arrivals.delays_ms());
     point.measure("arrival", Unit::Percent, [100.0 * outcome.arrivals.arrived.len() as f64 / robots as f64]);
-    point.measure("server_cpu", Unit::Seconds, [after.0.cpu_s - before.0.cpu_s]);
-    point.measure("robots_cpu", Unit::Seconds, [after.1.cpu_s - before.1.cpu_s]);
+    point.measure("server_cpu", Unit::Seconds, [outcome.server_cpu_s]);
+    point.measure("robots_cpu", Unit::Seconds, [outcome.robots_cpu_s]);
     point.measure("server_anonymous", Unit::Bytes, [memory.anonymous_bytes as f64]);
     point.measure("load_mqtt", Unit::Bytes, [outcome.mqtt_bytes as f64]);
     point.measure("load_http", Unit::Bytes, [outcome.http_bytes as f64]);

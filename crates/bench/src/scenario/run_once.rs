@@ -43,6 +43,10 @@ pub struct Outcome {
     pub mqtt_bytes: u64,
     /// Likewise.
     pub http_bytes: u64,
+    /// Processor seconds of the server, from the order to the last answer.
+    pub server_cpu_s: f64,
+    /// Likewise of all robots together.
+    pub robots_cpu_s: f64,
     /// The decisions that were made: mechanism and rule.
     pub decisions: Vec<String>,
     /// Robots that were told to pull because they were too slow.
@@ -68,6 +72,7 @@ pub async fn run_once(taskd: &Taskd, fleet: &mut Fleet, order: OneOrder) -> anyh
         dry_run: false,
     };
     let (before, own) = own_bytes(taskd).await?;
+    let (server, robots) = (taskd.usage(), fleet.usage());
     let ordered_ns = monotonic_ns();
     let deployment = match taskd.server.order(&create).await {
         Ok(deployment) => deployment,
@@ -78,11 +83,14 @@ pub async fn run_once(taskd: &Taskd, fleet: &mut Fleet, order: OneOrder) -> anyh
         }
     };
     let arrivals = fleet.verified(&deployment.id, order.robots, ordered_ns, order.limit).await?;
+    let (server_cpu_s, robots_cpu_s) = (taskd.usage().cpu_s - server.cpu_s, fleet.usage().cpu_s - robots.cpu_s);
     let after = taskd.server.info().await?;
     let view = taskd.server.deployment(&deployment.id).await?;
     let mut outcome = Outcome {
         mqtt_bytes: mqtt_bytes(&after) - mqtt_bytes(&before),
         http_bytes: (http_bytes(&after) - http_bytes(&before)).saturating_sub(own),
+        server_cpu_s,
+        robots_cpu_s,
         arrivals,
         ..Outcome::default()
     };

@@ -3,7 +3,7 @@
 use std::convert::Infallible;
 use std::io;
 use std::net::SocketAddr;
-use std::pin::Pin;
+use std::pin::{Pin, pin};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Context, Poll, ready};
 use std::time::{Duration, Instant};
@@ -18,12 +18,12 @@ use http_body::{Frame, SizeHint};
 use hyper::body::Incoming;
 use hyper::server::conn::http1;
 use hyper_util::rt::{TokioIo, TokioTimer};
-use hyper_util::server::graceful::GracefulShutdown;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::Semaphore;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 use tokio::time::Sleep;
 use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
 use tower::ServiceExt as _;
 
 use super::traffic::HttpTotals;
@@ -43,7 +43,7 @@ const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 /// How many connections there may be.
 #[derive(Debug, Clone, Copy)]
 pub struct Limits {
-    /// At a time; more wait in the listener's backlog.
+    /// At a time; when there are as many, those without a request end, and more wait in the listener's backlog.
     pub max_connections: usize,
     /// Those of one address that have not sent a request yet; a further one takes the place of the oldest.
     pub max_silent_per_address: usize,
@@ -58,25 +58,34 @@ pub async fn serve(
     stop: CancellationToken,
     patience: Duration,
 ) {
-    let places = Arc::new(Semaphore::new(limits.max_connections));
+    let places = Places::new(limits.max_connections);
     let anteroom = Anteroom::new(limits.max_silent_per_address);
-    let graceful = GracefulShutdown::new();
+    let connections = TaskTracker::new();
     let abort = CancellationToken::new();
     loop {
-        let accepted = tokio::select! {
+        let (stream, peer, place) = tokio::select! {
             () = stop.cancelled() => break,
             accepted = accept(&listener, &places) => accepted,
         };
-        let (stream, peer, place) = accepted;
         let silent = anteroom.enter(peer.ip(), Instant::now());
         let leave = silent.leave().clone();
+        let spoken = CancellationToken::new();
         let stream = PatientStream { stream, stalled: None, traffic: traffic.clone() };
-        let connection = graceful.watch(connection(stream, peer, silent, router.clone()));
+        let connection = connection(stream, peer, silent, spoken.clone(), router.clone());
+        let asked_to_end = asked_to_end(stop.clone(), spoken, places.crowded.subscribe());
         let abort = abort.clone();
-        tokio::spawn(async move {
+        connections.spawn(async move {
+            let ended = async {
+                let mut connection = pin!(connection);
+                tokio::select! {
+                    ended = connection.as_mut() => return ended,
+                    () = asked_to_end => connection.as_mut().graceful_shutdown(),
+                }
+                connection.await
+            };
             // A client that breaks off or dawdles is no event worth a line in the log.
             let _ = tokio::select! {
-                ended = connection => ended,
+                ended = ended => ended,
                 () = leave.cancelled() => Ok(()),
                 () = abort.cancelled() => Ok(()),
             };
@@ -84,18 +93,57 @@ pub async fn serve(
         });
     }
     drop(listener);
-    if tokio::time::timeout(patience, graceful.shutdown()).await.is_err() {
+    connections.close();
+    if tokio::time::timeout(patience, connections.wait()).await.is_err() {
         tracing::warn!("requests did not end in time and are cut off");
     }
     abort.cancel();
 }
 
-async fn accept(
-    listener: &TcpListener,
-    places: &Arc<Semaphore>,
-) -> (TcpStream, SocketAddr, Option<tokio::sync::OwnedSemaphorePermit>) {
-    // The semaphore is never closed, so there is always a permit; without one the connection would only be uncounted.
-    let place = places.clone().acquire_owned().await.ok();
+/// The connections there may be.
+struct Places {
+    free: Arc<Semaphore>,
+    most: usize,
+    /// Whether all are taken, or nearly all were since they last were.
+    crowded: watch::Sender<bool>,
+}
+
+impl Places {
+    fn new(most: usize) -> Self {
+        Self { free: Arc::new(Semaphore::new(most)), most, crowded: watch::Sender::new(false) }
+    }
+
+    /// Takes one. If there is none, whoever has spoken and asks for nothing now has to end.
+    async fn take(&self) -> Option<OwnedSemaphorePermit> {
+        if let Ok(place) = self.free.clone().try_acquire_owned() {
+            let is_roomy = self.free.available_permits() > self.most / 8;
+            self.crowded.send_if_modified(|crowded| is_roomy && std::mem::take(crowded));
+            return Some(place);
+        }
+        self.crowded.send_replace(true);
+        // The semaphore is never closed, so there is always a permit; without one the connection would only be uncounted.
+        self.free.clone().acquire_owned().await.ok()
+    }
+}
+
+/// Resolves when a connection has to end as soon as it has no request: the server stops, or the places are needed and this
+/// one has had its turn.
+async fn asked_to_end(stop: CancellationToken, spoken: CancellationToken, mut crowded: watch::Receiver<bool>) {
+    let needed = async {
+        spoken.cancelled().await;
+        if crowded.wait_for(|crowded| *crowded).await.is_err() {
+            // Nobody takes places any more.
+            std::future::pending().await
+        }
+    };
+    tokio::select! {
+        () = stop.cancelled() => {}
+        () = needed => {}
+    }
+}
+
+async fn accept(listener: &TcpListener, places: &Places) -> (TcpStream, SocketAddr, Option<OwnedSemaphorePermit>) {
+    let place = places.take().await;
     loop {
         match listener.accept().await {
             Ok((stream, peer)) => return (stream, peer, place),
@@ -117,6 +165,7 @@ fn connection(
     stream: PatientStream,
     peer: SocketAddr,
     silent: Place,
+    spoken: CancellationToken,
     router: Router,
 ) -> http1::Connection<
     TokioIo<PatientStream>,
@@ -128,6 +177,7 @@ fn connection(
     traffic.connection();
     let silent = Mutex::new(Some(silent));
     let service = hyper::service::service_fn(move |request: Request<Incoming>| {
+        spoken.cancel();
         drop(silent.lock().unwrap_or_else(PoisonError::into_inner).take());
         traffic.request();
         let mut request = request.map(|body| Body::new(PatientBody::new(body)));

@@ -45,6 +45,24 @@ async fn a_second_server_on_the_same_directory_is_refused() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn when_all_places_are_taken_those_without_a_request_end() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let server = TestServer::start_in(directory, |config| config.max_http_connections = 2).await;
+    let (mut streams, request) = (Vec::new(), b"GET /healthz HTTP/1.1\r\nhost: x\r\n\r\n");
+    for _ in 0..5 {
+        let mut stream = TcpStream::connect(&server.server.addresses().http).await.expect("a connection");
+        stream.write_all(request).await.expect("sent");
+        let mut answer = [0; 12];
+        // Sooner than anybody is sent away for having no request.
+        let read = tokio::time::timeout(Duration::from_secs(15), stream.read_exact(&mut answer)).await;
+        read.expect("a place in time").expect("an answer");
+        assert_eq!(&answer, b"HTTP/1.1 200");
+        // Each stays open on this side.
+        streams.push(stream);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_restart_keeps_everything() {
     let server = TestServer::start().await;
     let mut robot = server.enroll("atlas").await;

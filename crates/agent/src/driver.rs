@@ -383,7 +383,11 @@ impl<E: Effects> Driver<E> {
         let Some(record) = self.ledger.tasks.get(task) else { return };
         let view = self.views.entry(task.clone()).or_default();
         if view.prepared.is_none() {
-            view.prepared = Some(self.effects.prepared(&record.order.package).await);
+            let prepared = self.effects.prepared(&record.order.package).await;
+            if self.robot.labels.is_none() && requires_labels(&prepared) {
+                self.shared.post.notify_one();
+            }
+            view.prepared = Some(prepared);
         }
         if view.process.is_none() || view.process == Some(ProcessState::Unknown) {
             view.process = Some(match record.active.as_ref().and_then(|active| active.process.as_ref()) {
@@ -462,6 +466,11 @@ impl<E: Effects> Driver<E> {
         }
         !self.dirty
     }
+}
+
+/// Whether the robot's labels, which the server's answer to a posted report says, decide if it can run this.
+fn requires_labels(prepared: &Prepared) -> bool {
+    prepared.manifest.as_ref().is_some_and(|manifest| !manifest.requires.labels.is_empty())
 }
 
 #[cfg(test)]

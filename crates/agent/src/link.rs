@@ -23,6 +23,12 @@ use crate::server::{Sent, Server, ServerError};
 
 /// The longest wait before a report is posted again.
 const MAX_POST_BACKOFF_MS: u64 = 60 * 1000;
+/// How long HTTP lets MQTT go first, varied by half: a session brings the same with less, above all where a whole fleet
+/// starts at once.
+const HEAD_START: Duration = Duration::from_secs(5);
+/// Within this time a robot whose session takes reports also posts one, for the name and labels that only an answer brings.
+/// A fleet that starts at once spreads over it.
+const FIRST_POST: Duration = Duration::from_secs(15);
 /// The longest wait between polls while the server refuses the token.
 const REFUSED_POLL: Duration = Duration::from_secs(300);
 
@@ -71,6 +77,8 @@ pub struct Shared {
     pub find: Arc<Notify>,
     /// Whether a session is up.
     pub mqtt_up: watch::Sender<bool>,
+    /// Whether the first try to get one is over.
+    pub mqtt_tried: watch::Sender<bool>,
     /// Whether one is up whose acknowledgements come from the server itself: then it takes reports.
     pub mqtt_stores: watch::Sender<bool>,
     /// Says that the server did not accept the token.
@@ -126,6 +134,7 @@ impl Shared {
             endpoint: watch::Sender::new(None),
             find: Arc::default(),
             mqtt_up: watch::Sender::new(false),
+            mqtt_tried: watch::Sender::new(false),
             mqtt_stores: watch::Sender::new(false),
             token_refused: Arc::default(),
             poll: Arc::default(),
@@ -137,20 +146,37 @@ impl Shared {
     }
 }
 
-/// Polls for the desired state, until the agent ends.
+/// The link's half over HTTP, until the agent ends. It begins once MQTT has been tried.
+pub async fn over_http(server: Server, shared: Shared, intervals: Intervals, heard: mpsc::Sender<Heard>) {
+    let mut tried = shared.mqtt_tried.subscribe();
+    tokio::select! {
+        // Cancel-safe: a watch remembers what it holds, a timer is not needed any more, a token can be awaited again.
+        _ = tried.wait_for(|tried| *tried) => {}
+        () = tokio::time::sleep(HEAD_START.mul_f64(spread())) => {}
+        () = shared.shutdown.cancelled() => return,
+    }
+    let polling = poll(server.clone(), shared.clone(), intervals, heard.clone());
+    let asking = async {
+        tokio::time::sleep(FIRST_POST.mul_f64(rand::random())).await;
+        shared.post.notify_one();
+    };
+    tokio::join!(polling, post(server, shared.clone(), heard), asking);
+}
+
+/// Polls for the desired state, until the agent ends: at once, unless a session is up, which is told it without asking.
 pub async fn poll(server: Server, shared: Shared, intervals: Intervals, heard: mpsc::Sender<Heard>) {
-    let mut mqtt_up = shared.mqtt_up.subscribe();
     let mut tag = None;
+    if *shared.mqtt_up.borrow() && !next_poll(&shared, intervals, Duration::ZERO).await {
+        return;
+    }
     loop {
         let known = tag.as_ref().filter(|_| *shared.settled.borrow());
         let begun = Instant::now();
         let outcome = server.desired(known).await;
-        let asked_at = Instant::now();
         // An MQTT session measures more often and without a connection to be made first.
         if outcome.is_ok() && !*shared.mqtt_up.borrow() {
-            shared.meter.round_trip(asked_at - begun);
+            shared.meter.round_trip(begun.elapsed());
         }
-        let spread = spread();
         let least = match &outcome {
             Err(ServerError::TokenRefused(_)) => REFUSED_POLL.min(intervals.slow),
             Err(ServerError::Busy { retry_after: Some(wait), .. }) => (*wait).min(intervals.slow),
@@ -162,27 +188,33 @@ pub async fn poll(server: Server, shared: Shared, intervals: Intervals, heard: m
         if matches!(outcome, Err(ServerError::TokenRefused(_))) {
             shared.token_refused.notify_one();
         }
-        if heard.send(heard_of(outcome)).await.is_err() {
+        if heard.send(heard_of(outcome)).await.is_err() || !next_poll(&shared, intervals, least).await {
             return;
         }
-        loop {
-            let up = *mqtt_up.borrow_and_update();
-            let interval = (if up { intervals.slow } else { intervals.fast }).mul_f64(spread).max(least);
-            tokio::select! {
-                // Cancel-safe: a timer that is made anew for the same time, so that a session that comes and goes does
-                // not put polling off for ever.
-                () = tokio::time::sleep_until(asked_at + interval) => {
-                    // A report over HTTP brings the name and labels the server holds, which MQTT does not.
-                    shared.post.notify_one();
-                    break;
-                }
-                // Cancel-safe: a permit that was not taken stays.
-                () = shared.poll.notified() => break,
-                // Cancel-safe: a watch remembers that it changed. The other interval holds from now on.
-                Ok(()) = mqtt_up.changed() => {}
-                // Cancel-safe: a token can be awaited again.
-                () = shared.shutdown.cancelled() => return,
+    }
+}
+
+/// Waits until it is time to poll, at least for `least`; false if the agent ends.
+async fn next_poll(shared: &Shared, intervals: Intervals, least: Duration) -> bool {
+    let mut mqtt_up = shared.mqtt_up.subscribe();
+    let (asked_at, spread) = (Instant::now(), spread());
+    loop {
+        let up = *mqtt_up.borrow_and_update();
+        let interval = (if up { intervals.slow } else { intervals.fast }).mul_f64(spread).max(least);
+        tokio::select! {
+            // Cancel-safe: a timer that is made anew for the same time, so that a session that comes and goes does
+            // not put polling off for ever.
+            () = tokio::time::sleep_until(asked_at + interval) => {
+                // A report over HTTP brings the name and labels the server holds, which MQTT does not.
+                shared.post.notify_one();
+                return true;
             }
+            // Cancel-safe: a permit that was not taken stays.
+            () = shared.poll.notified() => return true,
+            // Cancel-safe: a watch remembers that it changed. The other interval holds from now on.
+            Ok(()) = mqtt_up.changed() => {}
+            // Cancel-safe: a token can be awaited again.
+            () = shared.shutdown.cancelled() => return false,
         }
     }
 }
@@ -200,10 +232,10 @@ fn heard_of(outcome: Result<Option<Sent>, ServerError>) -> Heard {
     }
 }
 
-/// Delivers reports over HTTP while no MQTT session stores them, and now and then while one does, until the agent ends.
+/// Delivers reports over HTTP while no MQTT session stores them, and when it is asked to while one does, until the agent ends.
 pub async fn post(server: Server, shared: Shared, heard: mpsc::Sender<Heard>) {
     let (mut reports, mut mqtt_stores) = (shared.reports.subscribe(), shared.mqtt_stores.subscribe());
-    let mut asked = true;
+    let mut asked = !*mqtt_stores.borrow();
     let mut failures = 0;
     loop {
         let newest = reports.borrow_and_update().clone();

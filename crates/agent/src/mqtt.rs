@@ -107,6 +107,7 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
         };
         let was_up = shared.mqtt_up.send_replace(false);
         shared.mqtt_stores.send_replace(false);
+        shared.mqtt_tried.send_replace(true);
         if !was_up {
             shared.find.notify_one();
         }
@@ -366,6 +367,7 @@ impl Session<'_> {
         self.up = true;
         self.shared.mqtt_up.send_replace(true);
         self.shared.mqtt_stores.send_replace(!self.is_external);
+        self.shared.mqtt_tried.send_replace(true);
         tracing::info!(host = self.access.host, port = self.access.port, "connected to MQTT");
         for topic in [RobotTopic::Desired, RobotTopic::Request] {
             // The queue is empty at the start of a session, and a lost session is noticed by the pump.

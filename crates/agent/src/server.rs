@@ -20,6 +20,9 @@ const MAX_ANSWER_BYTES: usize = 8 * 1024 * 1024;
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(10);
 /// How long a whole request may take.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(30);
+/// How long a connection is kept for the next request: a pull makes several in a row, then nothing for minutes, and a fleet's
+/// idle connections would cost the server more than its sessions.
+pub const KEPT_CONNECTION: Duration = Duration::from_secs(3);
 
 /// Why there is no answer to use.
 #[derive(Debug, thiserror::Error)]
@@ -76,6 +79,7 @@ pub fn client() -> Result<reqwest::Client, reqwest::Error> {
     reqwest::Client::builder()
         .connect_timeout(CONNECT_TIMEOUT)
         .timeout(REQUEST_TIMEOUT)
+        .pool_idle_timeout(KEPT_CONNECTION)
         .redirect(reqwest::redirect::Policy::none())
         .user_agent(concat!("task-agent/", env!("CARGO_PKG_VERSION")))
         .build()

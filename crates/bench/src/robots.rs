@@ -150,6 +150,7 @@ fn http_client(from: Option<IpAddr>) -> anyhow::Result<reqwest::Client> {
     let client = reqwest::Client::builder()
         .connect_timeout(std::time::Duration::from_secs(10))
         .timeout(std::time::Duration::from_secs(30))
+        .pool_idle_timeout(server::KEPT_CONNECTION)
         .redirect(reqwest::redirect::Policy::none())
         .tls_certs_only([])
         .local_address(from);
@@ -163,8 +164,7 @@ fn start(number: usize, robot: Assembled, crew: &Crew, words: mpsc::Sender<Word>
     let intervals = Intervals { slow: poll, fast: poll.min(std::time::Duration::from_secs(10)) };
     tokio::spawn(witness(number, shared.clone(), words));
     tokio::spawn(driver.run(messages));
-    tokio::spawn(link::poll(server.clone(), shared.clone(), intervals, heard.clone()));
-    tokio::spawn(link::post(server, shared.clone(), heard.clone()));
+    tokio::spawn(link::over_http(server, shared.clone(), intervals, heard.clone()));
     tokio::spawn(async move {
         // Nobody asks these robots anything, and their tasks say nothing.
         let (requests, _asked) = mpsc::channel(1);

@@ -21,6 +21,8 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
 /// What may still run on a blocking thread when everything else has ended.
 const LEFTOVER_PATIENCE: Duration = Duration::from_millis(500);
+/// A quarter of what tokio takes if it is not told.
+const TASKS_PER_LOOK: u32 = 15;
 /// Open files beside connections: the database, blobs that travel, the system's own.
 const OTHER_FILES: usize = 500;
 
@@ -48,7 +50,9 @@ enum Command {
 
 fn main() -> ExitCode {
     let CommandLine { connection, command } = CommandLine::parse();
-    let runtime = match tokio::runtime::Runtime::new() {
+    // Sockets are looked at after so many tasks: those that hand out blobs take long, and would keep everybody waiting.
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().event_interval(TASKS_PER_LOOK).build();
+    let runtime = match runtime {
         Ok(runtime) => runtime,
         Err(error) => return complain(&anyhow::Error::new(error).context("no threads to run on")),
     };

@@ -94,8 +94,7 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
     let (heard, messages) = mpsc::channel(QUEUED_MESSAGES);
     let server = Server::new(client, base.clone(), identity.robot_id.clone(), credential.clone());
     let intervals = Intervals { slow: config.poll_interval, fast: config.poll_interval_without_mqtt };
-    tokio::spawn(link::poll(server.clone(), shared.clone(), intervals, heard.clone()));
-    tokio::spawn(link::post(server.clone(), shared.clone(), heard.clone()));
+    tokio::spawn(link::over_http(server.clone(), shared.clone(), intervals, heard.clone()));
     let rotation = Rotation {
         server: server.clone(),
         credential: credential.clone(),

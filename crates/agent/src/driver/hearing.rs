@@ -7,7 +7,7 @@ use task_proto::envelope::Envelope;
 use task_proto::id::Labels;
 use task_proto::report::Condition;
 
-use super::{Driver, Speaker};
+use super::{Driver, Speaker, requires_labels};
 use crate::admission;
 use crate::effects::{Effects, chain};
 use crate::ledger::Accepted;
@@ -64,7 +64,9 @@ impl<E: Effects> Driver<E> {
                     // The order may be for a label that the robot was given just before it: ask again.
                     // Likewise for what a person has installed since the last one.
                     (self.robot.labels, self.robot.installations) = (None, None);
-                    self.shared.post.notify_one();
+                    if self.views.values().filter_map(|view| view.prepared.as_ref()).any(requires_labels) {
+                        self.shared.post.notify_one();
+                    }
                     self.desired = Some(state);
                     self.dirty = true;
                 }

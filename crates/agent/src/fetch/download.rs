@@ -7,7 +7,7 @@
 use std::time::Duration;
 
 use bytes::Bytes;
-use http::header::{CONTENT_RANGE, CONTENT_TYPE, ETAG, RANGE, RETRY_AFTER};
+use http::header::{CONNECTION, CONTENT_RANGE, CONTENT_TYPE, ETAG, RANGE, RETRY_AFTER};
 use http::{HeaderMap, HeaderName, StatusCode};
 use task_proto::desired::{BlobRef, PackageRef};
 use tokio::sync::mpsc;
@@ -51,6 +51,10 @@ impl Download {
         stall_timeout: Duration,
     ) -> Result<Self, FetchError> {
         let mut request = request.timeout(REQUEST_TIMEOUT);
+        if blob.digest == package.content.digest {
+            // Nothing is asked for after it.
+            request = request.header(CONNECTION, "close");
+        }
         if offset > 0 {
             request = request.header(RANGE, format!("bytes={offset}-"));
         }

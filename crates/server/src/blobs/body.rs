@@ -8,17 +8,19 @@ use std::pin::Pin;
 use std::task::{Context, Poll, ready};
 
 use bytes::Bytes;
+use futures_util::FutureExt as _;
+use futures_util::future::BoxFuture;
 use http_body::{Body, Frame, SizeHint};
-use tokio::task::JoinHandle;
 
-use super::{Blob, BlobError, Source, on_disk};
+use super::{Blob, BlobError};
 
 /// The most bytes handed out at once.
 const SLICE_BYTES: u64 = 256 * 1024;
-/// The most bytes that are looked at ahead for whether they are in memory, in one system call. They may be thrown out again
-/// before they are sent; then a page is read where it should not be, which costs other connections a moment.
+/// The most bytes that are looked at ahead for whether they are in memory, in one system call, and that are read ahead if
+/// they are not. They may be thrown out again before they are sent; then a page is read where it should not be, which costs
+/// other connections a moment.
 const LOOK_AHEAD_BYTES: usize = 1024 * 1024;
-/// Reading one byte in each of these brings a slice into memory; no page is smaller.
+/// No page of memory is smaller.
 const PAGE_BYTES: usize = 4096;
 
 /// Part of a blob, on its way to a client.
@@ -27,14 +29,17 @@ pub struct BlobBody {
     left: Range<u64>,
     /// Up to where it was in memory when that was looked at last.
     in_memory_until: u64,
+    /// Whether others are to have theirs first. A client that is as fast as memory would otherwise keep a thread until it
+    /// has all.
+    is_turn_over: bool,
     /// The next slice, while it is being fetched from the disk.
-    pending: Option<JoinHandle<io::Result<Bytes>>>,
+    pending: Option<BoxFuture<'static, io::Result<Bytes>>>,
 }
 
 impl BlobBody {
     pub(super) fn new(blob: Blob, range: Range<u64>) -> Self {
         debug_assert!(range.end <= blob.size);
-        Self { blob, in_memory_until: range.start, left: range, pending: None }
+        Self { blob, in_memory_until: range.start, left: range, is_turn_over: false, pending: None }
     }
 
     /// The next slice if it is in memory; else starts to fetch it.
@@ -42,25 +47,25 @@ impl BlobBody {
         let start = self.left.start;
         let length = usize::try_from(SLICE_BYTES.min(self.left.end - start)).map_err(io::Error::other)?;
         let blob = self.blob.clone();
-        if let Source::Mapped(_) = self.blob.source {
-            let slice = blob.read_at(start, length)?;
-            if start + length as u64 <= self.in_memory_until {
-                return Ok(Some(slice));
-            }
-            let left = usize::try_from(self.left.end - start).unwrap_or(LOOK_AHEAD_BYTES);
-            let ahead = blob.read_at(start, left.min(LOOK_AHEAD_BYTES))?;
-            let resident = bytes_in_memory(&ahead);
-            self.in_memory_until = start + resident as u64;
-            if resident >= length {
-                return Ok(Some(slice));
-            }
-            self.pending = Some(tokio::task::spawn_blocking(move || {
-                bring_into_memory(&slice);
-                Ok(slice)
-            }));
-        } else {
-            self.pending = Some(tokio::task::spawn_blocking(move || blob.read_at(start, length)));
+        if blob.mapped.is_none() {
+            self.pending = Some(blob.read_in_turn(move |blob| blob.read_at(start, length)).boxed());
+            return Ok(None);
         }
+        let slice = blob.read_at(start, length)?;
+        if start + length as u64 <= self.in_memory_until {
+            return Ok(Some(slice));
+        }
+        let left = usize::try_from(self.left.end - start).unwrap_or(LOOK_AHEAD_BYTES);
+        let ahead = blob.read_at(start, left.min(LOOK_AHEAD_BYTES))?;
+        let resident = bytes_in_memory(&ahead);
+        if resident >= length {
+            self.in_memory_until = start + resident as u64;
+            return Ok(Some(slice));
+        }
+        self.in_memory_until = start + ahead.len() as u64;
+        let length = ahead.len();
+        let fetching = blob.read_in_turn(move |blob| blob.bring_into_memory(start, length).map(|()| slice));
+        self.pending = Some(fetching.boxed());
         Ok(None)
     }
 }
@@ -73,17 +78,22 @@ impl Body for BlobBody {
         if self.left.is_empty() {
             return Poll::Ready(None);
         }
+        if std::mem::take(&mut self.is_turn_over) {
+            context.waker().wake_by_ref();
+            return Poll::Pending;
+        }
         let ready = if self.pending.is_none() { self.next_slice()? } else { None };
         let slice = match (ready, self.pending.as_mut()) {
             (Some(slice), _) => slice,
             (None, Some(pending)) => {
-                let fetched = ready!(Pin::new(pending).poll(context));
+                let fetched = ready!(pending.poll_unpin(context));
                 self.pending = None;
-                fetched.map_err(io::Error::other)??
+                fetched?
             }
             (None, None) => return Poll::Ready(None),
         };
         self.left.start += slice.len() as u64;
+        self.is_turn_over = true;
         Poll::Ready(Some(Ok(Frame::data(slice))))
     }
 
@@ -100,17 +110,30 @@ impl Blob {
     /// The bytes of `range`, which lies inside the blob: mapped ones are not copied, only brought into memory.
     pub async fn slice(&self, range: Range<u64>) -> Result<Bytes, BlobError> {
         debug_assert!(range.end <= self.size);
-        let blob = self.clone();
-        on_disk(move || {
-            let length = usize::try_from(range.end - range.start).unwrap_or(usize::MAX);
-            let slice = blob.read_at(range.start, length);
-            let slice = slice.map_err(BlobError::disk("read", Path::new(&blob.digest.hex())))?;
-            if let Source::Mapped(_) = blob.source {
-                bring_into_memory(&slice);
+        let name = self.digest.hex();
+        let read = self.clone().read_in_turn(move |blob| {
+            let length = usize::try_from(range.end - range.start).map_err(io::Error::other)?;
+            if blob.mapped.is_some() {
+                blob.bring_into_memory(range.start, length)?;
             }
-            Ok(slice)
-        })
-        .await
+            blob.read_at(range.start, length)
+        });
+        read.await.map_err(BlobError::disk("read", Path::new(&name)))
+    }
+
+    /// Reads what may have to come from the disk, when it is this reader's turn.
+    async fn read_in_turn<T, F>(self, read: F) -> io::Result<T>
+    where
+        T: Send + 'static,
+        F: FnOnce(&Self) -> io::Result<T> + Send + 'static,
+    {
+        let turn = self.disk.clone().acquire_owned().await.map_err(io::Error::other)?;
+        let reading = tokio::task::spawn_blocking(move || {
+            let read = read(&self);
+            drop(turn);
+            read
+        });
+        reading.await.map_err(io::Error::other)?
     }
 }
 
@@ -130,11 +153,4 @@ fn bytes_in_memory(slice: &[u8]) -> usize {
     }
     let pages = resident.iter().take_while(|byte| **byte & 1 == 1).count();
     (pages * page).saturating_sub(before).min(slice.len())
-}
-
-fn bring_into_memory(slice: &[u8]) {
-    for page in slice.chunks(PAGE_BYTES) {
-        std::hint::black_box(page[0]);
-    }
-    std::hint::black_box(slice.last());
 }

@@ -16,13 +16,19 @@ use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
 use task_proto::Digest;
-use tokio::sync::{OwnedRwLockReadGuard, OwnedRwLockWriteGuard, RwLock};
+use tokio::sync::{OwnedRwLockReadGuard, OwnedRwLockWriteGuard, RwLock, Semaphore};
 
 pub use body::BlobBody;
 use upload::Uploads;
 pub use upload::{InvalidUploadId, UploadId};
 
 use crate::config::BlobRead;
+
+/// Reads from the disk for answers at the same time. More would not be faster, and would keep the processor from those who
+/// wait for something else.
+const DISK_READS: usize = 4;
+/// What is read at a time to have it in memory.
+const SCRAP_BYTES: usize = 64 * 1024;
 
 /// The blob store's limits and choices.
 #[derive(Debug, Clone, Copy)]
@@ -120,6 +126,7 @@ struct Shared {
     uploads: Uploads,
     /// Blobs opened before, the latest first: opening and mapping costs more than a small blob's bytes.
     open: Mutex<VecDeque<Blob>>,
+    disk: Arc<Semaphore>,
     collection: Arc<RwLock<()>>,
 }
 
@@ -129,13 +136,11 @@ pub struct Blob {
     digest: Digest,
     size: u64,
     quoted_digest: Bytes,
-    source: Source,
-}
-
-#[derive(Clone)]
-enum Source {
-    Mapped(Bytes),
-    File(Arc<File>),
+    file: Arc<File>,
+    /// All of the file, if it is read that way.
+    mapped: Option<Bytes>,
+    /// Whose turn it is to read from the disk.
+    disk: Arc<Semaphore>,
 }
 
 /// While this lives, no blob is collected: whoever found one present can still rely on it.
@@ -155,7 +160,8 @@ impl Blobs {
         fs::create_dir_all(&directory).map_err(BlobError::disk("create", &directory))?;
         let uploads = Uploads::open(data.join("uploads"), settings)?;
         let open = Mutex::new(VecDeque::with_capacity(settings.max_open_blobs));
-        let shared = Shared { directory, settings, uploads, open, collection: Arc::default() };
+        let disk = Arc::new(Semaphore::new(DISK_READS));
+        let shared = Shared { directory, settings, uploads, open, disk, collection: Arc::default() };
         Ok(Self { shared: Arc::new(shared) })
     }
 
@@ -180,8 +186,8 @@ impl Blobs {
             return Ok(Some(blob));
         }
         let path = self.path(digest);
-        let reading = self.shared.settings.reading;
-        let opened = on_disk(move || match Blob::open(digest, &path, reading) {
+        let (reading, disk) = (self.shared.settings.reading, self.shared.disk.clone());
+        let opened = on_disk(move || match Blob::open(digest, &path, reading, disk) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
             opened => opened.map(Some).map_err(BlobError::disk("open", &path)),
         });
@@ -306,21 +312,21 @@ impl Blobs {
 }
 
 impl Blob {
-    fn open(digest: Digest, path: &Path, reading: BlobRead) -> io::Result<Self> {
+    fn open(digest: Digest, path: &Path, reading: BlobRead, disk: Arc<Semaphore>) -> io::Result<Self> {
         let file = File::open(path)?;
         let size = file.metadata()?.len();
-        let source = match reading {
+        let mapped = match reading {
             // An empty file can't be mapped.
             BlobRead::Mmap if size > 0 => {
                 // SAFETY: nothing modifies or truncates a file after it was renamed into the store; deleting it leaves
                 // the mapping intact.
                 let mapping = unsafe { memmap2::Mmap::map(&file) }?;
-                Source::Mapped(Bytes::from_owner(mapping))
+                Some(Bytes::from_owner(mapping))
             }
-            BlobRead::Mmap | BlobRead::Pread => Source::File(Arc::new(file)),
+            BlobRead::Mmap | BlobRead::Pread => None,
         };
         let quoted_digest = format!("\"{digest}\"").into();
-        Ok(Self { digest, size, quoted_digest, source })
+        Ok(Self { digest, size, quoted_digest, file: Arc::new(file), mapped, disk })
     }
 
     /// What it hashes to.
@@ -354,17 +360,25 @@ impl Blob {
     }
 
     fn read_at(&self, offset: u64, length: usize) -> io::Result<Bytes> {
-        match &self.source {
-            Source::Mapped(bytes) => {
-                let start = usize::try_from(offset).map_err(io::Error::other)?;
-                Ok(bytes.slice(start..start + length))
-            }
-            Source::File(file) => {
-                let mut bytes = vec![0; length];
-                file.read_exact_at(&mut bytes, offset)?;
-                Ok(bytes.into())
-            }
+        if let Some(bytes) = &self.mapped {
+            let start = usize::try_from(offset).map_err(io::Error::other)?;
+            return Ok(bytes.slice(start..start + length));
         }
+        let mut bytes = vec![0; length];
+        self.file.read_exact_at(&mut bytes, offset)?;
+        Ok(bytes.into())
+    }
+
+    /// Has the kernel read these bytes, so that their mapping can be read without waiting. Not through the mapping: all
+    /// threads share its lock, and would wait for the disk with this one.
+    fn bring_into_memory(&self, offset: u64, length: usize) -> io::Result<()> {
+        let mut scrap = vec![0; SCRAP_BYTES.min(length)];
+        let end = offset + length as u64;
+        for start in (offset..end).step_by(SCRAP_BYTES) {
+            let length = usize::try_from(end - start).unwrap_or(SCRAP_BYTES).min(SCRAP_BYTES);
+            self.file.read_exact_at(&mut scrap[..length], start)?;
+        }
+        Ok(())
     }
 }
 
@@ -397,10 +411,7 @@ mod tests {
     use super::*;
 
     fn mapping(blob: &Blob) -> *const u8 {
-        match &blob.source {
-            Source::Mapped(bytes) => bytes.as_ptr(),
-            Source::File(_) => panic!("not mapped"),
-        }
+        blob.mapped.as_ref().expect("mapped").as_ptr()
     }
 
     #[tokio::test]

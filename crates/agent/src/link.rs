@@ -23,9 +23,6 @@ use crate::server::{Sent, Server, ServerError};
 
 /// The longest wait before a report is posted again.
 const MAX_POST_BACKOFF_MS: u64 = 60 * 1000;
-/// How long HTTP lets MQTT go first, varied by half: a session brings the same with less, above all where a whole fleet
-/// starts at once.
-const HEAD_START: Duration = Duration::from_secs(5);
 /// Within this time a robot whose session takes reports also posts one, for the name and labels that only an answer brings.
 /// A fleet that starts at once spreads over it.
 const FIRST_POST: Duration = Duration::from_secs(15);
@@ -146,13 +143,13 @@ impl Shared {
     }
 }
 
-/// The link's half over HTTP, until the agent ends. It begins once MQTT has been tried.
+/// The link's half over HTTP, until the agent ends. MQTT goes first, for as long as a try may take: a session brings the same
+/// with less, above all where a whole fleet starts at once.
 pub async fn over_http(server: Server, shared: Shared, intervals: Intervals, heard: mpsc::Sender<Heard>) {
     let mut tried = shared.mqtt_tried.subscribe();
     tokio::select! {
-        // Cancel-safe: a watch remembers what it holds, a timer is not needed any more, a token can be awaited again.
+        // Cancel-safe: a watch remembers what it holds, a token can be awaited again.
         _ = tried.wait_for(|tried| *tried) => {}
-        () = tokio::time::sleep(HEAD_START.mul_f64(spread())) => {}
         () = shared.shutdown.cancelled() => return,
     }
     let polling = poll(server.clone(), shared.clone(), intervals, heard.clone());

@@ -21,8 +21,8 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
 /// What may still run on a blocking thread when everything else has ended.
 const LEFTOVER_PATIENCE: Duration = Duration::from_millis(500);
-/// A quarter of what tokio takes if it is not told.
-const TASKS_PER_LOOK: u32 = 15;
+/// An eighth of what tokio takes if it is not told.
+const TASKS_PER_LOOK: u32 = 7;
 /// Open files beside connections: the database, blobs that travel, the system's own.
 const OTHER_FILES: usize = 500;
 

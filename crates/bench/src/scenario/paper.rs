@@ -23,6 +23,10 @@ const START_LIMIT: Duration = Duration::from_secs(60);
 const ORDER_LIMIT: Duration = Duration::from_secs(20);
 /// The rate that an unlimited machine reaches at least, bytes per second of all robots together.
 const SLOW_MACHINE_BYTES_PER_S: u64 = 20_000_000;
+/// What counts as about as fast: this many times as long,
+const NEARLY: f64 = 1.1;
+/// or so much longer.
+const NEARLY_MS: f64 = 20.0;
 /// How long blobs stay on the server that nobody needs any more.
 const BLOB_GRACE: &str = "40s";
 
@@ -128,6 +132,7 @@ pub async fn run(flags: PaperFlags) -> anyhow::Result<Run> {
     }
     run.notes.extend(decisions(&results));
     run.points = results.iter().map(|(cell, outcomes)| point(cell, outcomes)).collect();
+    run.notes.extend(how_good_adaptive_is(&run.points));
     for (_, stand) in stands {
         stand.fleet.end().await?;
         stand.taskd.end().await?;
@@ -229,6 +234,24 @@ fn decisions(results: &BTreeMap<Cell, Vec<Outcome>>) -> Option<String> {
     (!said.is_empty()).then(|| format!("Adaptive, with the rule that decided: {}.", said.join("; ")))
 }
 
+/// At how many places adaptive is about as fast as the fastest of the others.
+fn how_good_adaptive_is(points: &[Point]) -> Option<String> {
+    let adaptive = Mechanism::Adaptive.to_string();
+    let delay = |point: &Point| point.quantities.get("delay").map(|delay| delay.median);
+    let (mut places, mut good) = (0, 0);
+    for own in points.iter().filter(|point| point.series == adaptive) {
+        let others = points.iter().filter(|other| other.series != adaptive && other.settings == own.settings);
+        let Some(best) = others.filter_map(delay).min_by(f64::total_cmp) else { continue };
+        places += 1;
+        good += usize::from(delay(own).is_some_and(|own| own <= (best * NEARLY).max(best + NEARLY_MS)));
+    }
+    (places > 0).then(|| {
+        format!(
+            "Adaptive is within 10 % or 20 ms of the fastest mechanism at {good} of {places} points, medians compared."
+        )
+    })
+}
+
 fn point(cell: &Cell, outcomes: &[Outcome]) -> Point {
     let settings = [("payload_bytes", cell.payload_bytes as f64), ("robots", cell.robots as f64)];
     let mut point = Point::new(&cell.mechanism.to_string(), settings);
@@ -251,4 +274,34 @@ fn point(cell: &Cell, outcomes: &[Outcome]) -> Point {
     point.measure("load_ratio", Unit::Number, whole.iter().map(|outcome| load(outcome) / needed));
     point.measure("fell_behind", Unit::Number, outcomes.iter().map(|outcome| outcome.fell_behind as f64));
     point
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn adaptive_is_compared_with_the_fastest_at_the_same_place() {
+        let point = |mechanism: Mechanism, robots: f64, delay: f64| {
+            let mut point = Point::new(&mechanism.to_string(), [("robots", robots)]);
+            point.measure("delay", Unit::Milliseconds, [delay]);
+            point
+        };
+        let (adaptive, pull, poll) = (Mechanism::Adaptive, Mechanism::PushPull, Mechanism::Poll);
+        let mut points = vec![
+            point(adaptive, 1.0, 119.0),
+            point(pull, 1.0, 100.0),
+            point(poll, 1.0, 900.0),
+            point(adaptive, 2.0, 1099.0),
+            point(pull, 2.0, 1000.0),
+            point(adaptive, 3.0, 1200.0),
+            point(poll, 3.0, 1000.0),
+            // Nothing to compare it with.
+            point(adaptive, 4.0, 1.0),
+        ];
+        let said = how_good_adaptive_is(&points).expect("said");
+        assert!(said.contains("at 2 of 3 points"), "{said}");
+        points.retain(|point| point.series != adaptive.to_string());
+        assert_eq!(how_good_adaptive_is(&points), None);
+    }
 }

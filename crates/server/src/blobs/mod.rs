@@ -26,7 +26,7 @@ use crate::config::BlobRead;
 
 /// Reads from the disk for answers at the same time. More would not be faster, and would keep the processor from those who
 /// wait for something else.
-const DISK_READS: usize = 4;
+const DISK_READS: usize = 2;
 /// What is read at a time to have it in memory.
 const SCRAP_BYTES: usize = 64 * 1024;
 

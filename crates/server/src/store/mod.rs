@@ -9,6 +9,7 @@ mod assignments;
 mod deliveries;
 mod deployments;
 mod fan_outs;
+mod first_use;
 mod migrate;
 mod orders;
 mod outputs;
@@ -19,6 +20,7 @@ mod rows;
 mod tokens;
 
 use std::path::Path;
+use std::sync::Arc;
 use std::time::Duration;
 
 use sqlx::any::{Any, AnyPoolOptions};
@@ -28,6 +30,7 @@ use access::{Access, Ending};
 pub use assignments::{Released, Revocable, TaskOrder};
 pub use deliveries::{Decided, DeliveryOrder, RobotFacts};
 pub use deployments::NewDeployment;
+use first_use::FirstUses;
 pub use orders::PastOrder;
 pub use packages::{NewManifest, PutManifest, Reference, StoredManifest};
 pub use reports::{OpenAssignment, ReportedRobot};
@@ -45,6 +48,7 @@ pub struct Store {
     reads: AnyPool,
     writes: AnyPool,
     access: Access,
+    first_uses: FirstUses,
 }
 
 /// Why the database did not do as it was told.
@@ -69,6 +73,9 @@ pub enum StoreError {
     /// A statement failed.
     #[error("the database refused a statement")]
     Statement(#[from] sqlx::Error),
+    /// A write that several wait for failed.
+    #[error("a write for several robots failed")]
+    Together(#[source] Arc<StoreError>),
     /// A row holds what this version can't read.
     #[error("column {column} of the database holds what this version of taskd can't read")]
     Unreadable {
@@ -145,7 +152,7 @@ impl Store {
         let writes = pool_options(url, 1).connect(url).await.map_err(open_error)?;
         migrate::run(&writes).await.map_err(|source| StoreError::Migrate { url: without_password(url), source })?;
         let reads = pool_options(url, READERS).connect(url).await.map_err(open_error)?;
-        Ok(Self { reads, writes, access: Access::default() })
+        Ok(Self { reads, writes, access: Access::default(), first_uses: FirstUses::default() })
     }
 
     /// Ends all connections, after the writes that are under way.

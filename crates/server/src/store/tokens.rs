@@ -104,41 +104,6 @@ impl Store {
         Ok(row.map(token_row).transpose()?.filter(|row| row.has_secret_of(token)))
     }
 
-    /// Marks a robot's token as the one it uses; false if it is used or ended already.
-    async fn use_first(&self, token: &Token, now_ms: u64) -> Result<bool, StoreError> {
-        let mut write = self.begin().await?;
-        let row = sqlx::query(
-            "UPDATE tokens SET used_at_ms = $2 WHERE id = $1 AND used_at_ms IS NULL AND revoked_at_ms IS NULL
-             RETURNING robot_id, made_by, number",
-        )
-        .bind(token.id())
-        .bind(stored(now_ms))
-        .fetch_optional(write.connection())
-        .await?;
-        let Some(row) = row else { return Ok(false) };
-        let robot: RobotId = id("tokens.robot_id", row.try_get("robot_id")?)?;
-        let (made_by, number): (Option<String>, i64) = (row.try_get("made_by")?, row.try_get("number")?);
-        sqlx::query(
-            "UPDATE tokens SET revoked_at_ms = $3
-             WHERE robot_id = $1 AND kind = 'robot' AND id <> $2 AND revoked_at_ms IS NULL",
-        )
-        .bind(robot.as_str())
-        .bind(token.id())
-        .bind(stored(now_ms))
-        .execute(write.connection())
-        .await?;
-        sqlx::query("UPDATE robots SET token_number = $2 WHERE id = $1")
-            .bind(robot.as_str())
-            .bind(number)
-            .execute(write.connection())
-            .await?;
-        if made_by.is_some() {
-            write.forget_report(&robot).await?;
-        }
-        write.commit().await?;
-        Ok(true)
-    }
-
     /// Stores an operator's token that does not expire.
     pub async fn create_operator_token(&self, token: &Token, now_ms: u64) -> Result<(), StoreError> {
         let mut write = self.begin().await?;

@@ -4,6 +4,7 @@
 use task_proto::RobotId;
 use task_proto::api::CreateEnrollmentToken;
 use task_proto::token::{Token, TokenKind};
+use taskd::actions::Enrolled;
 use taskd::report_writer::ReportError;
 use taskd::store::{Admitted, Store, TokenHolder};
 
@@ -16,6 +17,7 @@ on_both_databases! {
     tokens_stand_for_their_holder_until_they_end,
     a_new_token_ends_the_old_one_when_it_is_first_used,
     a_first_use_by_two_at_once_is_one,
+    a_fleet_that_comes_at_once_is_let_in_whole,
     a_lost_answer_to_an_enrolment_is_mended_by_asking_again,
 }
 
@@ -154,6 +156,31 @@ async fn a_first_use_by_two_at_once_is_one(database: TestDatabase) {
     }
     let uses = uses.join_all().await;
     assert_eq!(uses.iter().filter(|is_first_use| **is_first_use).count(), 1, "{uses:?}");
+}
+
+async fn a_fleet_that_comes_at_once_is_let_in_whole(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let token = fleet.enrolment_token(CreateEnrollmentToken::default()).await;
+    let mut robots = Vec::new();
+    for number in 0..100 {
+        robots.push(fleet.try_enroll(&token, mac(number), None).await.expect("enrols"));
+    }
+    let admit = |robot: &Enrolled| {
+        let (store, token) = (fleet.database.store.clone(), robot.token.clone());
+        tokio::spawn(async move { store.admit(&token, 1_000_000).await.expect("reads").expect("valid") })
+    };
+    let (impatient, patient): (Vec<_>, Vec<_>) = robots.iter().map(|robot| (admit(robot), admit(robot))).unzip();
+    // Whoever goes away, also in the middle of writing for the others, takes nobody along.
+    impatient.iter().for_each(tokio::task::JoinHandle::abort);
+    for (admitted, robot) in patient.into_iter().zip(&robots) {
+        let TokenHolder::Robot { robot: holder, .. } = admitted.await.expect("let in").holder else {
+            panic!("no robot's token")
+        };
+        assert_eq!(holder, robot.robot_id);
+    }
+    for robot in &robots {
+        assert!(!admit(robot).await.expect("let in").is_first_use);
+    }
 }
 
 async fn a_lost_answer_to_an_enrolment_is_mended_by_asking_again(database: TestDatabase) {

@@ -22,6 +22,7 @@ mod outputs;
 mod packages;
 mod page;
 mod people;
+mod permissions;
 mod registry;
 mod scope;
 mod serve;

@@ -4,12 +4,17 @@
 mod delivery;
 mod logs;
 mod mqtt;
+mod people;
 
 use serde::{Deserialize, Serialize};
 
 pub use self::delivery::{DeliveryChoice, DeliveryDecision, MAX_PRIORITY, MIN_PRIORITY};
 pub use self::logs::{LogEvent, LogsFrom, LogsQuery, LogsView};
 pub use self::mqtt::{BrokerFiles, ExternalBroker, MqttEndpoint};
+pub use self::people::{
+    AccessToken, AddUser, AuditPage, AuditQuery, ChangePassword, CreateToken, EditUser, LogIn, Me, SessionView,
+    SetPassword, SignIn, TokenList, TokenOrigin, TokenView, UserList, UserView,
+};
 use crate::desired::{PackageRef, Wanted};
 use crate::envelope::PublicKey;
 use crate::id::Labels;
@@ -40,7 +45,7 @@ pub struct ApiError {
     pub message: String,
 }
 
-/// `GET /server` (operator).
+/// `GET /server` (read).
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct ServerInfo {
     /// The server's version.
@@ -147,7 +152,7 @@ pub struct RobotToken {
     pub token: String,
 }
 
-/// `POST /enrollment-tokens` (operator).
+/// `POST /enrollment-tokens` (administer).
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct CreateEnrollmentToken {
     /// Only for this robot, by id or name, which may register again with it.
@@ -175,7 +180,7 @@ pub struct EnrollmentToken {
     pub expires_at_ms: u64,
 }
 
-/// `GET /robots` (operator), optionally `?selector=`.
+/// `GET /robots` (read), optionally `?selector=`.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct RobotList {
     /// Sorted by name.
@@ -259,7 +264,7 @@ pub struct RobotTask {
     pub restarts: u32,
 }
 
-/// `PATCH /robots/{robot}` (operator): absent fields stay.
+/// `PATCH /robots/{robot}` (maintain): absent fields stay.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct EditRobot {
     /// A new name.
@@ -281,7 +286,7 @@ pub struct ReportReply {
     pub labels: Labels,
 }
 
-/// `GET /packages` (operator).
+/// `GET /packages` (read).
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct PackageList {
     /// Sorted by name, then newest first.
@@ -299,7 +304,7 @@ pub struct PackageView {
     pub manifest: TaskManifest,
 }
 
-/// `GET /outputs` (operator), optionally `?robot=` (id or name) and `?task=`. The files are read from
+/// `GET /outputs` (read), optionally `?robot=` (id or name) and `?task=`. The files are read from
 /// `/v2/outputs/<robot id>/<task>/blobs/<digest>`.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct OutputList {
@@ -321,7 +326,7 @@ pub struct OutputView {
     pub output: OutputSet,
 }
 
-/// `POST /deployments` (operator), with an `Idempotency-Key` header.
+/// `POST /deployments` (operate), with an `Idempotency-Key` header.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct CreateDeployment {
     /// The package's name: its repository.
@@ -368,7 +373,7 @@ pub struct MatchedRobot {
     pub online: bool,
 }
 
-/// `GET /deployments` (operator): the newest first, without assignments.
+/// `GET /deployments` (read): the newest first, without assignments.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct DeploymentList {
     /// The deployments.
@@ -461,7 +466,7 @@ pub struct AssignmentView {
     pub updated_at_ms: u64,
 }
 
-/// `POST /tasks/{task}/{start|stop|remove}` (operator), with an `Idempotency-Key` header.
+/// `POST /tasks/{task}/{start|stop|remove}` (operate), with an `Idempotency-Key` header.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct OrderTask {
     /// Which robots; those that have no such task are left out.
@@ -471,21 +476,7 @@ pub struct OrderTask {
     pub dry_run: bool,
 }
 
-/// `POST /session` (anyone): exchanges an operator token for a cookie.
-#[derive(Clone, Serialize, Deserialize)]
-pub struct SignIn {
-    /// The operator token.
-    pub token: String,
-}
-
-/// Answer to a sign-in, and `GET /session` (anyone).
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct SessionView {
-    /// When the caller's session ends; absent: not signed in.
-    pub expires_at_ms: Option<u64>,
-}
-
-/// What `GET /events` (operator) streams: each is the `data` of a server-sent event whose `event` is the tag's value.
+/// What `GET /events` (read) streams: each is the `data` of a server-sent event whose `event` is the tag's value.
 /// A view replaces what was known before. After (re)connecting, fetch the lists once.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "type", rename_all = "snake_case")]

@@ -23,7 +23,7 @@ impl Digest {
     }
 
     /// From the 32 bytes a hasher gave.
-    pub fn from_bytes(bytes: [u8; 32]) -> Self {
+    pub const fn from_bytes(bytes: [u8; 32]) -> Self {
         Self(bytes)
     }
 

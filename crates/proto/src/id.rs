@@ -164,6 +164,18 @@ text_id!(
     }
 );
 text_id!(
+    /// A person's name: what they sign in with, and how the audit names them.
+    UserName, "user name", "1 to 64 lower-case letters, digits, '.', '_', '-' and '@', starting with a letter or digit", |t| {
+        t.len() <= 64
+            && t.bytes().next().is_some_and(|b| b.is_ascii_lowercase() || b.is_ascii_digit())
+            && t.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || matches!(b, b'.' | b'_' | b'-' | b'@'))
+    }
+);
+text_id!(
+    /// The public part of a token, by which it is listed and revoked: 12 lower-case hex digits.
+    TokenId, "token id", "12 lower-case hex digits", |t| t.len() == 12 && is_lower_hex(t)
+);
+text_id!(
     /// A label's key.
     LabelKey, "label key", "1 to 63 letters, digits, '.', '_', '/' and '-'", |t| {
         !t.is_empty() && is_label_text(t)

@@ -2,6 +2,7 @@
 //! It never does I/O and never reads a clock; randomness and time are arguments or explicit constructors.
 
 pub mod api;
+pub mod audit;
 pub mod desired;
 pub mod digest;
 pub mod envelope;
@@ -11,6 +12,7 @@ pub mod manifest;
 pub mod oci;
 pub mod output;
 pub mod part;
+pub mod person;
 pub mod report;
 pub mod request;
 pub mod ros;
@@ -21,5 +23,6 @@ pub mod topic;
 
 pub use digest::Digest;
 pub use id::{
-    DeploymentId, Generation, InstanceId, MacAddress, RepositoryName, RobotId, RobotName, Tag, TaskName, Version,
+    DeploymentId, Generation, InstanceId, MacAddress, RepositoryName, RobotId, RobotName, Tag, TaskName, TokenId,
+    UserName, Version,
 };

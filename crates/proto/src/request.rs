@@ -24,7 +24,7 @@ pub struct Request {
     pub ask: Ask,
 }
 
-/// What can be asked of a robot. Also the body of `POST /robots/{robot}/ask` (operator).
+/// What can be asked of a robot. Also the body of `POST /robots/{robot}/ask` (read, or operate if it changes something).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub enum Ask {
@@ -87,6 +87,13 @@ pub enum Ask {
     /// A question of a newer version; it is refused as `unsupported`.
     #[serde(other)]
     Unknown,
+}
+
+impl Ask {
+    /// Whether the robot is not the same afterwards.
+    pub fn changes_something(&self) -> bool {
+        matches!(self, Self::SetParameter { .. } | Self::Lifecycle { .. })
+    }
 }
 
 /// What a robot publishes on its `reply` topic.

@@ -5,9 +5,10 @@ use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use task_proto::{DeploymentId, RobotId, TaskName};
-use tokio::sync::{Notify, broadcast};
+use tokio::sync::{Notify, broadcast, watch};
 
 use crate::part_requests::PartRequests;
+use crate::store::KnownRobot;
 
 /// Notices a slow listener may fall behind before it misses some.
 const NOTICES: usize = 16 * 1024;
@@ -18,7 +19,9 @@ pub enum Change {
     /// A robot is new or has changed.
     Robot(RobotId),
     /// A robot was removed.
-    RobotRemoved(RobotId),
+    RobotRemoved(Box<KnownRobot>),
+    /// A robot may have come into somebody's scope, or have left it.
+    Scopes,
     /// A deployment is new or has changed.
     Deployment(DeploymentId),
     /// A package was pushed or deleted.
@@ -41,6 +44,7 @@ pub struct Consequences {
 pub struct Changes {
     notices: broadcast::Sender<Change>,
     bells: Arc<Bells>,
+    rights: Arc<watch::Sender<()>>,
     part_requests: PartRequests,
 }
 
@@ -63,7 +67,22 @@ pub struct Rings {
 impl Changes {
     /// Nothing announced yet.
     pub fn new() -> Self {
-        Self { notices: broadcast::Sender::new(NOTICES), bells: Arc::default(), part_requests: PartRequests::default() }
+        Self {
+            notices: broadcast::Sender::new(NOTICES),
+            bells: Arc::default(),
+            rights: Arc::new(watch::Sender::new(())),
+            part_requests: PartRequests::default(),
+        }
+    }
+
+    /// Tells whoever serves someone for longer that people or their tokens have changed.
+    pub fn announce_rights(&self) {
+        self.rights.send_replace(());
+    }
+
+    /// Changes each time that people or their tokens have changed, from now on.
+    pub fn rights(&self) -> watch::Receiver<()> {
+        self.rights.subscribe()
     }
 
     /// What robots say they lack.

@@ -4,6 +4,7 @@
 
 use futures_util::FutureExt as _;
 use futures_util::future::BoxFuture;
+use task_proto::person::Permission;
 use task_proto::token::Token;
 
 use crate::broker::{Gatekeeper, Login, Principal, Refusal};
@@ -31,7 +32,11 @@ impl StoreGatekeeper {
                 let is_itself = login.client_id == robot.as_str() && login.user_name.as_deref() == Some(robot.as_str());
                 if is_itself { Ok(Principal::Robot { robot, token_number }) } else { Err(Refusal::NotAuthorised) }
             }
-            Some(TokenHolder::Operator) => Ok(Principal::Operator),
+            // Over MQTT one hears every robot, so it is not for who is limited to some.
+            Some(TokenHolder::Person(person)) if person.may(Permission::Read) && person.scope.is_everything() => {
+                Ok(Principal::Operator(person.name))
+            }
+            Some(TokenHolder::Person(_)) => Err(Refusal::NotAuthorised),
             Some(TokenHolder::Enrolment) => Err(Refusal::NotAuthorised),
             None => Err(Refusal::BadCredentials),
         }

@@ -229,11 +229,13 @@ fn start_tasks(tasks: &TaskTracker, app: &App, config: &Config) {
 async fn expire_assignments(app: App) {
     let mut ticks = ticks(EXPIRY_INTERVAL);
     while next_tick(&mut ticks, &app.stop).await {
-        if let Err(error) = app.actions.expire().await {
-            tracing::error!(
+        match app.actions.expire().await {
+            // They come back with a token that is good, if they have one.
+            Ok(users) => users.iter().for_each(|user| app.broker.disconnect_person(user)),
+            Err(error) => tracing::error!(
                 error = &error as &dyn std::error::Error,
                 "assignments could not be looked through for expired ones"
-            );
+            ),
         }
     }
 }

@@ -21,7 +21,9 @@ async function ask(method, path, body) {
 }
 
 export const session = () => ask('GET', '/session');
-export const signIn = (token) => ask('POST', '/session', { token });
+/** With `{ user, password }` or `{ token }`. */
+export const signIn = (who) => ask('POST', '/session', who);
+export const me = () => ask('GET', '/me');
 export const signOut = () => ask('DELETE', '/session');
 export const server = () => ask('GET', '/server');
 

@@ -20,6 +20,8 @@ const page = {
   /** Heard while the lists are on their way: newer than the lists, or followed by something newer. */
   backlog: null,
   heardAt: null,
+  /** Who is signed in. */
+  me: null,
   clockAheadMs: 0,
   problem: null,
   isSigningIn: false,
@@ -50,7 +52,7 @@ function rearrange(act) {
 
 async function start() {
   const token = tokenOfLink();
-  if (token) return signIn(token);
+  if (token) return signIn({ token });
   try {
     const { expires_at_ms: until } = await api.session();
     if (until) enter();
@@ -68,10 +70,10 @@ function tokenOfLink() {
   return token;
 }
 
-async function signIn(token) {
+async function signIn(who) {
   change(() => Object.assign(page, { isSigningIn: true, problem: null }));
   try {
-    await api.signIn(token.trim());
+    await api.signIn(who);
     enter();
   } catch (error) {
     leave(error.message);
@@ -82,6 +84,13 @@ function enter() {
   live?.stop();
   change(() => Object.assign(page, { view: 'fleet', fleet: new Fleet(), problem: null, isSigningIn: false, stream: { state: 'connecting' } }));
   live = listen(hear);
+}
+
+/** What a form holds, without the spaces that come with pasting; they belong to a password. */
+function signInWith(event) {
+  event.preventDefault();
+  const fields = Object.fromEntries(new FormData(event.currentTarget));
+  signIn(fields.token ? { token: fields.token.trim() } : { user: fields.user.trim(), password: fields.password });
 }
 
 function leave(problem = null) {
@@ -126,8 +135,9 @@ async function refetch() {
   refetchedAt = performance.now();
   const listener = live;
   try {
-    const [server, lists] = await Promise.all([api.server(), api.lists()]);
+    const [server, me, lists] = await Promise.all([api.server(), api.me(), api.lists()]);
     if (live !== listener) return;
+    page.me = me;
     page.clockAheadMs = server.now_ms - Date.now();
     page.heardAt = serverNow();
     page.problem = null;
@@ -198,13 +208,23 @@ function keepInPlace(layout) {
 const signInView = () => html`
   <main class="sign-in">
     <h1>taskd</h1>
-    <form @submit=${(event) => { event.preventDefault(); signIn(new FormData(event.currentTarget).get('token')); }}>
-      <label for="token">Operator token</label>
-      <input id="token" name="token" type="password" required autofocus autocomplete="current-password" spellcheck="false" aria-describedby="hint problem">
+    <form class="by-password" @submit=${signInWith}>
+      <label for="user">Name</label>
+      <input id="user" name="user" required autofocus autocomplete="username" autocapitalize="none" spellcheck="false">
+      <label for="password">Password</label>
+      <input id="password" name="password" type="password" required autocomplete="current-password" aria-describedby="problem">
       <button ?disabled=${page.isSigningIn}>Sign in</button>
       <p id="problem" class="bad" role="alert">${page.problem ?? ''}</p>
     </form>
-    <p id="hint" class="quiet">It starts with <code>tsko_</code> and lies in the server's data directory, in <code>operator.token</code>.</p>
+    <details>
+      <summary>With a token</summary>
+      <form class="by-token" @submit=${signInWith}>
+        <label for="token">Token</label>
+        <input id="token" name="token" type="password" required autocomplete="off" spellcheck="false" aria-describedby="hint problem">
+        <button ?disabled=${page.isSigningIn}>Sign in with it</button>
+      </form>
+      <p id="hint" class="quiet">It starts with <code>tsko_</code>. The first one lies in the server's data directory, in <code>operator.token</code>.</p>
+    </details>
   </main>`;
 
 function fleetView(sight) {
@@ -214,6 +234,7 @@ function fleetView(sight) {
     <header class="top">
       <h1>taskd</h1>
       <p class="stream" role="status">${streamState(now)}</p>
+      <p class="quiet">${page.me ? whoIsIt(page.me) : ''}</p>
       <button class="plain link" @click=${signOut}>Sign out</button>
     </header>
     <main>
@@ -232,6 +253,9 @@ function fleetView(sight) {
     </main>
     ${robotDialog(fleet.robots.get(page.robot), outputs, now, () => actions.show(null))}`;
 }
+
+/** The person, and which robots they are limited to. */
+const whoIsIt = ({ name, scope }) => (scope.length ? `${name}, ${scope.join(' and ')}` : name);
 
 function robotCount({ robots, online, shown, filter, isLoaded }) {
   if (!isLoaded) return '';
@@ -259,7 +283,7 @@ function streamState(now) {
 
 addEventListener('hashchange', () => {
   const token = tokenOfLink();
-  if (token) signIn(token);
+  if (token) signIn({ token });
 });
 addEventListener('scroll', () => change(() => {}), { passive: true });
 addEventListener('resize', () => change(() => {}));

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use crate::TaskName;
 use crate::log::{LogLevel, LogLine};
 
-/// The query of `GET /robots/{robot}/logs` (operator).
+/// The query of `GET /robots/{robot}/logs` (read).
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LogsQuery {

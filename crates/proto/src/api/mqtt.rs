@@ -35,7 +35,7 @@ impl fmt::Debug for ExternalBroker {
     }
 }
 
-/// `GET /broker` (operator): what an external broker must know, as mosquitto reads it.
+/// `GET /broker` (administer): what an external broker must know, as mosquitto reads it.
 #[derive(Clone, Serialize, Deserialize)]
 pub struct BrokerFiles {
     /// The access control list.

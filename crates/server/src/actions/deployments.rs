@@ -4,15 +4,16 @@ use std::collections::BTreeSet;
 
 use task_proto::api::{CreateDeployment, DeliveryChoice, MAX_PRIORITY, MIN_PRIORITY, PackageView};
 use task_proto::report::Phase;
-use task_proto::{DeploymentId, RobotId};
+use task_proto::{DeploymentId, RobotId, UserName};
 
 use super::robots::lifetime_ms;
-use super::{ActionError, Actions, DAY_MS, IdempotencyKey};
+use super::{ActionError, Actions, DAY_MS, IdempotencyKey, check_scope, quoted};
 use crate::advance::advance;
 use crate::changes::Consequences;
 use crate::chooser::{Chooser, travelling_bytes};
 use crate::delivery::shown_bytes;
-use crate::store::{NewDeployment, Revocable, Write};
+use crate::person::Person;
+use crate::store::{Act, Deed, NewDeployment, Revocable, Write};
 
 /// How long an idempotency key is remembered.
 const KEY_LIFETIME_MS: u64 = 30 * DAY_MS;
@@ -22,6 +23,7 @@ impl Actions {
     /// same order gives the same deployment.
     pub async fn create_deployment(
         &self,
+        by: &Person,
         key: &IdempotencyKey,
         order: &CreateDeployment,
         package: &PackageView,
@@ -40,7 +42,7 @@ impl Actions {
             return Err(ActionError::Invalid { key: "priority", reason });
         }
         let mut write = self.store.begin().await?;
-        if let Some(answer) = self.answered_before(&mut write, key, &request).await? {
+        if let Some(answer) = self.answered_before(&mut write, by, key, &request).await? {
             return Ok(answer);
         }
         self.check_fits(order, package)?;
@@ -48,6 +50,7 @@ impl Actions {
         if robots.is_empty() {
             return Err(ActionError::NoRobotsMatch(order.selector.to_string()));
         }
+        check_scope(by, &robots, || quoted(&order.selector))?;
         let robots: Vec<RobotId> = robots.into_iter().map(|robot| robot.id).collect();
         let (id, task) = (DeploymentId::random(), &package.package.name);
         let expires_at_ms = now_ms + lifetime_ms;
@@ -58,7 +61,13 @@ impl Actions {
         touched.insert(id.clone());
         let mut consequences = Consequences { deployments: touched.clone(), ..Consequences::default() };
         advance(&mut write, &self.chooser, touched, now_ms, &mut consequences).await?;
-        self.remember_answer(&mut write, key, &request, &id, now_ms).await?;
+        let deed = Deed::by(by, Act::DeploymentCreate, &id)
+            .with("package", format!("{task} {}", package.package.version))
+            .with("manifest", package.package.manifest.digest)
+            .with("robots", &order.selector)
+            .with("count", robots.len());
+        write.audit(&deed, now_ms).await?;
+        self.remember_answer(&mut write, by, key, &request, &id, now_ms).await?;
         write.commit().await?;
         self.changes.publish(consequences);
         Ok(id)
@@ -79,19 +88,22 @@ impl Actions {
     /// The deployment that `key` with this `order` gave before. A repeated order is answered also when its package is gone.
     pub async fn deployment_ordered_before(
         &self,
+        by: &Person,
         key: &IdempotencyKey,
         order: &CreateDeployment,
     ) -> Result<Option<DeploymentId>, ActionError> {
         let mut write = self.store.begin().await?;
-        self.answered_before(&mut write, key, &creation(order)).await
+        self.answered_before(&mut write, by, key, &creation(order)).await
     }
 
     /// Interrupts a deployment: where it has not settled, what it replaced is desired again; a service that runs goes on.
     /// Doing it twice is harmless.
-    pub async fn cancel_deployment(&self, id: &DeploymentId) -> Result<(), ActionError> {
+    pub async fn cancel_deployment(&self, by: &Person, id: &DeploymentId) -> Result<(), ActionError> {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
-        if is_cancelled(&mut write, id).await? {
+        let is_cancelled = is_cancelled(&mut write, id).await?;
+        check_deployment(&mut write, by, id).await?;
+        if is_cancelled {
             return Ok(());
         }
         let robots: Vec<RobotId> = write.revocable(id).await?.into_iter().map(|row| row.robot).collect();
@@ -101,22 +113,26 @@ impl Actions {
         let mut consequences = take_back(&mut write, &self.chooser, &taken, Phase::Cancelled, now_ms).await?;
         write.skip_as_previous(id).await?;
         consequences.deployments.insert(id.clone());
+        write.audit(&Deed::by(by, Act::DeploymentCancel, id), now_ms).await?;
         write.commit().await?;
         self.changes.publish(consequences);
         Ok(())
     }
 
     /// Lets a paused deployment go on; the failures so far are forgiven.
-    pub async fn resume_deployment(&self, id: &DeploymentId) -> Result<(), ActionError> {
+    pub async fn resume_deployment(&self, by: &Person, id: &DeploymentId) -> Result<(), ActionError> {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
-        if is_cancelled(&mut write, id).await? {
+        let is_cancelled = is_cancelled(&mut write, id).await?;
+        check_deployment(&mut write, by, id).await?;
+        if is_cancelled {
             return Err(ActionError::DeploymentCancelled(id.clone()));
         }
         let Some((rollout, tally)) = write.rollout(id).await?.filter(|(rollout, _)| rollout.paused) else {
             return Ok(());
         };
         write.resume(id, rollout.forgiven.max(tally.failed)).await?;
+        write.audit(&Deed::by(by, Act::DeploymentResume, id), now_ms).await?;
         let touched = BTreeSet::from([id.clone()]);
         let mut consequences = Consequences { deployments: touched.clone(), ..Consequences::default() };
         advance(&mut write, &self.chooser, touched, now_ms, &mut consequences).await?;
@@ -126,17 +142,17 @@ impl Actions {
     }
 
     /// Ends what was not done in time, and forgets old idempotency keys and tokens that have ended. To be called about once
-    /// a minute.
-    pub async fn expire(&self) -> Result<(), ActionError> {
+    /// a minute. Gives the users whose tokens those were.
+    pub async fn expire(&self) -> Result<BTreeSet<UserName>, ActionError> {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
         write.forget_orders(now_ms.saturating_sub(KEY_LIFETIME_MS)).await?;
-        write.forget_ended_tokens(now_ms).await?;
+        let users = write.forget_ended_tokens(now_ms).await?;
         let overdue = write.overdue(now_ms).await?;
         let consequences = take_back(&mut write, &self.chooser, &overdue, Phase::Expired, now_ms).await?;
         write.commit().await?;
         self.changes.publish(consequences);
-        Ok(())
+        Ok(users)
     }
 }
 
@@ -147,6 +163,15 @@ fn creation(order: &CreateDeployment) -> String {
 
 async fn is_cancelled(write: &mut Write, id: &DeploymentId) -> Result<bool, ActionError> {
     write.is_cancelled(id).await?.ok_or_else(|| ActionError::DeploymentNotFound(id.clone()))
+}
+
+/// Whether all robots of a deployment are the person's.
+async fn check_deployment(write: &mut Write, by: &Person, id: &DeploymentId) -> Result<(), ActionError> {
+    if by.scope.is_everything() {
+        return Ok(());
+    }
+    let robots = write.robots_of_deployment(id).await?;
+    check_scope(by, &robots, || format!("deployment {id}"))
 }
 
 /// Ends `taken` in `phase`, puts back what it had replaced, and moves on the rollouts this touches.

@@ -4,6 +4,7 @@
 mod deployments;
 mod desired;
 mod fallen_behind;
+pub mod people;
 mod robots;
 mod tasks;
 
@@ -14,12 +15,16 @@ use std::sync::Arc;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use task_proto::envelope::SigningKey;
-use task_proto::{DeploymentId, Digest, MacAddress, RobotId, RobotName};
+use task_proto::selector::Selector;
+use task_proto::{DeploymentId, Digest, MacAddress, RobotId, RobotName, TokenId, UserName};
 
 use crate::changes::Changes;
 use crate::chooser::Chooser;
 use crate::clock::Clock;
-use crate::store::{PastOrder, Store, StoreError, Write};
+use crate::passwords::Passwords;
+use crate::person::Person;
+use crate::sign_ins::SignIns;
+use crate::store::{KnownRobot, PastOrder, Store, StoreError, Write};
 
 pub use crate::store::TaskOrder;
 pub use desired::Desired;
@@ -35,6 +40,8 @@ pub struct Actions {
     settings: ActionSettings,
     chooser: Chooser,
     envelopes: Arc<desired::Envelopes>,
+    passwords: Passwords,
+    sign_ins: Arc<SignIns>,
 }
 
 /// Lifetimes the operator may set.
@@ -73,18 +80,21 @@ impl Actions {
         settings: ActionSettings,
         chooser: Chooser,
     ) -> Self {
-        Self { store, clock, changes, key: Arc::new(key), settings, chooser, envelopes: Arc::default() }
+        let (key, envelopes) = (Arc::new(key), Arc::default());
+        let (passwords, sign_ins) = (Passwords::default(), Arc::default());
+        Self { store, clock, changes, key, settings, chooser, envelopes, passwords, sign_ins }
     }
 
-    /// What was answered when `key` came with this `request` before; an error if it came with another.
+    /// What was answered when `key` came with this `request` before; an error if it came with another, or from someone else.
     async fn answered_before<T: DeserializeOwned>(
         &self,
         write: &mut Write,
+        by: &Person,
         key: &IdempotencyKey,
         request: &str,
     ) -> Result<Option<T>, ActionError> {
         let Some(past) = write.past_order(&key.0).await? else { return Ok(None) };
-        if past.request != Digest::of(request.as_bytes()).to_string() {
+        if past.request != remembered(by, request) {
             return Err(ActionError::IdempotencyKeyReused(key.to_string()));
         }
         let answer = serde_json::from_str(&past.answer);
@@ -95,15 +105,46 @@ impl Actions {
     async fn remember_answer<T: Serialize>(
         &self,
         write: &mut Write,
+        by: &Person,
         key: &IdempotencyKey,
         request: &str,
         answer: &T,
         now_ms: u64,
     ) -> Result<(), ActionError> {
         let answer = serde_json::to_string(answer).expect("an answer always has a JSON form");
-        let order = PastOrder { request: Digest::of(request.as_bytes()).to_string(), answer };
+        let order = PastOrder { request: remembered(by, request), answer };
         Ok(write.remember_order(&key.0, &order, now_ms).await?)
     }
+}
+
+/// A request as it is remembered with its answer. That of the first token is remembered as it was before there were users.
+fn remembered(by: &Person, request: &str) -> String {
+    let text = if by.is_first() { request.to_owned() } else { format!("{} {request}", by.name) };
+    Digest::of(text.as_bytes()).to_string()
+}
+
+/// Refuses an order as a whole if one of the robots it means is not the person's: a part of it would be a surprise.
+/// `what` says what means them.
+fn check_scope(by: &Person, robots: &[KnownRobot], what: impl FnOnce() -> String) -> Result<(), ActionError> {
+    let outside = robots.iter().filter(|robot| !by.scope.covers(&robot.id, &robot.name, &robot.labels)).count();
+    if outside == 0 {
+        return Ok(());
+    }
+    let (meant, what, person, scope) = (robots.len(), what(), by.name.clone(), by.scope.to_string());
+    Err(ActionError::OutOfScope { outside, meant, what, person, scope })
+}
+
+fn out_of_scope(outside: usize, meant: usize, what: &str, person: &UserName, scope: &str) -> String {
+    if meant == 1 {
+        return format!("{what} is outside of {person}'s scope {scope:?}; nothing was done");
+    }
+    format!("{outside} of the {meant} robots of {what} are outside of {person}'s scope {scope:?}; nothing was done")
+}
+
+/// A selector in an error.
+fn quoted(selector: &Selector) -> String {
+    let text: String = selector.to_string().chars().take(80).collect();
+    format!("{text:?}")
 }
 
 /// Why an order was not carried out. Nothing of it was.
@@ -118,6 +159,50 @@ pub enum ActionError {
     /// Text that is no idempotency key.
     #[error("an idempotency key has 1 to 128 visible ASCII characters")]
     InvalidIdempotencyKey,
+    /// Some of the robots meant are not the person's.
+    #[error("{}", out_of_scope(*outside, *meant, what, person, scope))]
+    OutOfScope {
+        /// How many are not.
+        outside: usize,
+        /// How many are meant.
+        meant: usize,
+        /// By what.
+        what: String,
+        /// Whose scope.
+        person: UserName,
+        /// The scope.
+        scope: String,
+    },
+    /// It takes something else than the person has.
+    #[error("{0}")]
+    NotPermitted(String),
+    /// Name and password don't belong together, or there is no such user.
+    #[error("the user name or the password is wrong")]
+    SignInRefused,
+    /// Too many were wrong.
+    #[error("too many wrong passwords; try again in {seconds} s")]
+    SignInBlocked {
+        /// When the next one is looked at.
+        seconds: u64,
+    },
+    /// More at once than can be checked.
+    #[error("too many sign-ins at once; try again")]
+    TooManySignIns,
+    /// It could not be hashed.
+    #[error("the password could not be hashed")]
+    PasswordFailed,
+    /// The name is taken.
+    #[error("there is a user {0} already, or the name stands for something else")]
+    UserExists(UserName),
+    /// No such user.
+    #[error("there is no user {0}")]
+    UserNotFound(UserName),
+    /// No such token, or somebody else's.
+    #[error("there is no token {0} of yours")]
+    TokenNotFound(TokenId),
+    /// Without them nobody could administer the server any more.
+    #[error("{0} is the last administrator with a way in; give another one a password first")]
+    LastAdministrator(UserName),
     /// A request that makes no sense.
     #[error("{key}: {reason}")]
     Invalid {
@@ -183,18 +268,25 @@ impl ActionError {
     pub fn code(&self) -> &'static str {
         match self {
             Self::NoRobotsMatch(_) => "no_robots_match",
+            Self::OutOfScope { .. } => "out_of_scope",
+            Self::NotPermitted(_) => "forbidden",
+            Self::SignInBlocked { .. } | Self::TooManySignIns => "too_many_requests",
+            Self::UserExists(_) => "user_exists",
+            Self::LastAdministrator(_) => "last_administrator",
             Self::IdempotencyKeyReused(_) => "idempotency_key_reused",
             Self::InvalidIdempotencyKey | Self::Invalid { .. } => "invalid_request",
             Self::TooLargeForInline { .. } => "package_too_large",
             Self::MacKnown { .. } => "mac_known",
             Self::TokenForOther { .. } => "token_for_other_robot",
             Self::NameTaken(_) => "name_taken",
-            Self::TokenRefused => "unauthorized",
+            Self::TokenRefused | Self::SignInRefused => "unauthorized",
             Self::EnrolledAnew(_) => "enrolled_anew",
-            Self::RobotNotFound(_) | Self::DeploymentNotFound(_) => "not_found",
+            Self::RobotNotFound(_) | Self::DeploymentNotFound(_) | Self::UserNotFound(_) | Self::TokenNotFound(_) => {
+                "not_found"
+            }
             Self::DeploymentCancelled(_) => "deployment_cancelled",
             Self::Diverged(_) => "diverged",
-            Self::Store(_) => "internal",
+            Self::Store(_) | Self::PasswordFailed => "internal",
         }
     }
 }

@@ -1,15 +1,19 @@
 //! Robots come, are edited and go; and the tokens they come with.
 
+use std::net::IpAddr;
+
 use task_proto::api::{CreateEnrollmentToken, EditRobot, EnrollRequest, EnrollmentToken, MatchedRobot};
 use task_proto::id::Labels;
+use task_proto::request::Ask;
 use task_proto::selector::Selector;
 use task_proto::token::{Token, TokenKind};
 use task_proto::{MacAddress, RobotId, RobotName};
 
-use super::{ActionError, Actions, MAX_LIFETIME_MS};
+use super::{ActionError, Actions, MAX_LIFETIME_MS, check_scope, quoted};
 use crate::advance::advance;
 use crate::changes::{Change, Consequences};
-use crate::store::{EnrolmentTerms, KnownRobot, StoreError, Write};
+use crate::person::Person;
+use crate::store::{Act, Deed, EnrolmentTerms, KnownRobot, StoreError, Write};
 
 /// The most labels a robot may have.
 const MAX_LABELS: usize = 64;
@@ -28,8 +32,14 @@ pub struct Enrolled {
 impl Actions {
     /// Registers a robot that holds the enrolment token `token`. A robot that is known by its MAC may register again with
     /// a token made for it, and by the same token as before while the answer to that may have been lost: nobody has used
-    /// what was in it. It keeps its id, name and labels; its old token ends when the new one is first used.
-    pub async fn enroll(&self, token: &Token, request: &EnrollRequest) -> Result<Enrolled, ActionError> {
+    /// what was in it. It keeps its id, name and labels; its old token ends when the new one is first used. `address` is
+    /// where it asks from.
+    pub async fn enroll(
+        &self,
+        token: &Token,
+        request: &EnrollRequest,
+        address: Option<IpAddr>,
+    ) -> Result<Enrolled, ActionError> {
         check_labels(&request.labels)?;
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
@@ -56,6 +66,8 @@ impl Actions {
         }
         let robot_token = Token::random(TokenKind::Robot);
         write.offer_robot_token(&robot_token, &robot.id, Some(token), now_ms).await?;
+        let deed = Deed::new("enrolment".to_owned(), token.id().parse().ok(), address, Act::RobotEnroll, &robot.id);
+        write.audit(&deed.with("name", &robot.name).with("mac", robot.mac), now_ms).await?;
         write.commit().await?;
         self.changes.announce(Change::Robot(robot.id.clone()));
         Ok(Enrolled { robot_id: robot.id, name: robot.name, token: robot_token })
@@ -75,7 +87,11 @@ impl Actions {
     }
 
     /// Makes an enrolment token.
-    pub async fn create_enrollment_token(&self, order: &CreateEnrollmentToken) -> Result<EnrollmentToken, ActionError> {
+    pub async fn create_enrollment_token(
+        &self,
+        by: &Person,
+        order: &CreateEnrollmentToken,
+    ) -> Result<EnrollmentToken, ActionError> {
         check_labels(&order.labels)?;
         if order.uses == Some(0) {
             return Err(ActionError::Invalid { key: "uses", reason: "a token needs at least one use".to_owned() });
@@ -94,14 +110,22 @@ impl Actions {
         let terms = EnrolmentTerms { robot, labels: order.labels.clone(), uses_left: order.uses, expires_at_ms };
         let token = Token::random_enrolment(self.key.public_key());
         write.create_enrolment_token(&token, &terms, now_ms).await?;
+        let deed = Deed::by(by, Act::EnrolmentCreate, token.id())
+            .with_some("robot", terms.robot.as_ref())
+            .with_some("uses", terms.uses_left)
+            .with("labels", shown_labels(&terms.labels))
+            .with("expires_at_ms", expires_at_ms);
+        write.audit(&deed, now_ms).await?;
         write.commit().await?;
         Ok(EnrollmentToken { id: token.id(), token: token.reveal(), expires_at_ms })
     }
 
-    /// Changes a robot's name or labels.
-    pub async fn edit_robot(&self, robot: &RobotId, edit: &EditRobot) -> Result<(), ActionError> {
+    /// Changes a robot's name or labels. Before and after it has to be one of the person's.
+    pub async fn edit_robot(&self, by: &Person, robot: &RobotId, edit: &EditRobot) -> Result<(), ActionError> {
         let mut write = self.store.begin().await?;
         let mut known = known_robot(&mut write, robot.as_str()).await?;
+        check_scope(by, std::slice::from_ref(&known), || known.name.to_string())?;
+        let deed = Deed::by(by, Act::RobotEdit, &known.id).with("name", &known.name);
         if let Some(labels) = &edit.labels {
             check_labels(labels)?;
             known.labels = labels.clone();
@@ -110,35 +134,55 @@ impl Actions {
             check_name(&mut write, name).await?;
             known.name = name.clone();
         }
+        check_scope(by, std::slice::from_ref(&known), || format!("{} with the new name and labels", known.name))?;
         write.update_robot(&known).await?;
+        let renamed = edit.name.as_ref().map(|_| &known.name);
+        let labels = edit.labels.as_ref().map(shown_labels);
+        let deed = deed.with_some("new_name", renamed).with_some("labels", labels);
+        write.audit(&deed, self.clock.now_ms()).await?;
         write.commit().await?;
         self.changes.announce(Change::Robot(known.id));
+        self.changes.announce(Change::Scopes);
+        self.changes.announce_rights();
         Ok(())
     }
 
     /// Removes a robot: its tokens end now, its MAC and name are free, its id is never used again.
-    pub async fn remove_robot(&self, robot: &RobotId) -> Result<(), ActionError> {
+    pub async fn remove_robot(&self, by: &Person, robot: &RobotId) -> Result<(), ActionError> {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
-        known_robot(&mut write, robot.as_str()).await?;
+        let known = known_robot(&mut write, robot.as_str()).await?;
+        check_scope(by, std::slice::from_ref(&known), || known.name.to_string())?;
         let touched = write.end_all_of_robot(robot, now_ms).await?;
         write.revoke_tokens(robot, now_ms).await?;
         write.remove_robot(robot, now_ms).await?;
+        let deed = Deed::by(by, Act::RobotRemove, robot).with("name", &known.name).with("mac", known.mac);
+        write.audit(&deed, now_ms).await?;
         let mut consequences = Consequences { deployments: touched.clone(), ..Consequences::default() };
         advance(&mut write, &self.chooser, touched, now_ms, &mut consequences).await?;
         write.commit().await?;
         self.envelopes.forget(robot);
-        self.changes.announce(Change::RobotRemoved(robot.clone()));
+        self.changes.announce(Change::RobotRemoved(Box::new(known)));
         self.changes.publish(consequences);
         Ok(())
     }
 
-    /// The robots a selector means now, sorted by name; an error if nobody. `online` is left false.
-    pub async fn matching_robots(&self, selector: &Selector) -> Result<Vec<MatchedRobot>, ActionError> {
+    /// Writes down that the robot is about to be asked to change something, which it then may or may not do.
+    pub async fn note_ask(&self, by: &Person, robot: &RobotId, ask: &Ask) -> Result<(), ActionError> {
+        let mut write = self.store.begin_reports().await?;
+        let ask = serde_json::to_string(ask).expect("a question always has a JSON form");
+        write.audit(&Deed::by(by, Act::RobotAsk, robot).with("ask", ask), self.clock.now_ms()).await?;
+        Ok(write.commit().await?)
+    }
+
+    /// The robots an order with this selector would mean now, sorted by name; an error if nobody, or if one of them is not
+    /// the person's. `online` is left false.
+    pub async fn matching_robots(&self, by: &Person, selector: &Selector) -> Result<Vec<MatchedRobot>, ActionError> {
         let robots = self.store.matching_robots(selector).await?;
         if robots.is_empty() {
             return Err(ActionError::NoRobotsMatch(selector.to_string()));
         }
+        check_scope(by, &robots, || quoted(selector))?;
         Ok(robots.into_iter().map(matched).collect())
     }
 }
@@ -146,6 +190,12 @@ impl Actions {
 /// A robot as the answer to an order lists it.
 pub(super) fn matched(robot: KnownRobot) -> MatchedRobot {
     MatchedRobot { id: robot.id, name: robot.name, online: false }
+}
+
+/// Labels as the audit shows them.
+fn shown_labels(labels: &Labels) -> String {
+    let pairs: Vec<String> = labels.iter().map(|(key, value)| format!("{key}={value}")).collect();
+    pairs.join(",")
 }
 
 /// A lifetime that a request gives in seconds under `key`.

@@ -7,16 +7,18 @@ use task_proto::selector::Selector;
 use task_proto::{RobotId, TaskName};
 
 use super::robots::matched;
-use super::{ActionError, Actions, IdempotencyKey, TaskOrder};
+use super::{ActionError, Actions, IdempotencyKey, TaskOrder, check_scope, quoted};
 use crate::advance::advance;
 use crate::changes::Consequences;
-use crate::store::KnownRobot;
+use crate::person::Person;
+use crate::store::{Act, Deed, KnownRobot};
 
 impl Actions {
     /// Orders `task` started, stopped or removed on the robots that match and have it. The same key gives the same
     /// answer, and orders nothing twice. `online` is left false.
     pub async fn order_task(
         &self,
+        by: &Person,
         key: &IdempotencyKey,
         order: TaskOrder,
         task: &TaskName,
@@ -25,13 +27,14 @@ impl Actions {
         let request = format!("{order:?} {task} {selector}");
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
-        if let Some(answer) = self.answered_before(&mut write, key, &request).await? {
+        if let Some(answer) = self.answered_before(&mut write, by, key, &request).await? {
             return Ok(answer);
         }
         let mut robots = write.matching_robots(selector).await?;
         let ids: Vec<RobotId> = robots.iter().map(|robot| robot.id.clone()).collect();
         write.adopt_diverged(&ids, now_ms).await?;
         keep_those_with_task(&mut robots, write.robots_with_task(task).await?, selector)?;
+        check_scope(by, &robots, || quoted(selector))?;
         let ids: Vec<RobotId> = robots.iter().map(|robot| robot.id.clone()).collect();
         let expires_at_ms = now_ms + self.settings.assignment_lifetime_ms;
         let changed = write.order_on_task(order, task, &ids, expires_at_ms, now_ms).await?;
@@ -46,8 +49,10 @@ impl Actions {
         }
         consequences.deployments.extend(touched.iter().cloned());
         advance(&mut write, &self.chooser, touched, now_ms, &mut consequences).await?;
+        let deed = Deed::by(by, act(order), task).with("robots", selector).with("count", ids.len());
+        write.audit(&deed, now_ms).await?;
         let answer: Vec<MatchedRobot> = robots.into_iter().map(matched).collect();
-        self.remember_answer(&mut write, key, &request, &answer, now_ms).await?;
+        self.remember_answer(&mut write, by, key, &request, &answer, now_ms).await?;
         write.commit().await?;
         self.changes.publish(consequences);
         Ok(answer)
@@ -56,12 +61,22 @@ impl Actions {
     /// Whom [`Actions::order_task`] would mean; an error if nobody.
     pub async fn robots_with_task(
         &self,
+        by: &Person,
         task: &TaskName,
         selector: &Selector,
     ) -> Result<Vec<MatchedRobot>, ActionError> {
         let mut robots = self.store.matching_robots(selector).await?;
         keep_those_with_task(&mut robots, self.store.robots_with_task(task).await?, selector)?;
+        check_scope(by, &robots, || quoted(selector))?;
         Ok(robots.into_iter().map(matched).collect())
+    }
+}
+
+fn act(order: TaskOrder) -> Act {
+    match order {
+        TaskOrder::Start => Act::TaskStart,
+        TaskOrder::Stop => Act::TaskStop,
+        TaskOrder::Remove => Act::TaskRemove,
     }
 }
 

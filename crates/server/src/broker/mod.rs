@@ -18,7 +18,7 @@ use bytes::Bytes;
 use futures_util::future::BoxFuture;
 use task_proto::api::{MqttTraffic, Traffic};
 use task_proto::topic::{RobotTopic, TopicPrefix};
-use task_proto::{Digest, RobotId};
+use task_proto::{Digest, RobotId, UserName};
 use tokio::sync::watch;
 
 pub use external::{CANARY_LEVEL, ExternalConfig};
@@ -50,8 +50,8 @@ pub enum Principal {
         /// Which of its tokens it showed; comes back with its messages.
         token_number: u64,
     },
-    /// A person or program with an operator's token: may listen below the prefix.
-    Operator,
+    /// A person, or a program with a person's token: may listen below the prefix.
+    Operator(UserName),
 }
 
 /// Why a client is not let in.
@@ -322,6 +322,15 @@ impl Broker {
         match &self.kind {
             Kind::Embedded(front) => front.disconnect(robot),
             Kind::External(external) => external.disconnect(robot),
+        }
+    }
+
+    /// Ends the person's sessions: what they may has changed, or one of their tokens has ended.
+    pub fn disconnect_person(&self, user: &UserName) {
+        match &self.kind {
+            Kind::Embedded(front) => front.disconnect_person(user),
+            // There they are not ours to know.
+            Kind::External(_) => {}
         }
     }
 

@@ -13,6 +13,7 @@ use task_proto::api::{BASE, ErrorBody, IDEMPOTENCY_KEY};
 use task_proto::request::{Answer, Ask};
 use task_proto::token::{InvalidToken, Token};
 
+use super::login::kept_token;
 use super::output::printable;
 use super::{CommandError, Connection, Outcome};
 
@@ -56,7 +57,8 @@ pub enum ClientError {
     },
     /// No token was given.
     #[error(
-        "no operator token: give --token or --token-file, set TASKD_TOKEN, or point --data at the server's data directory"
+        "no token: sign in with taskd login NAME, give --token or --token-file, set TASKD_TOKEN, or point --data at the \
+         server's data directory"
     )]
     NoToken,
     /// The token file can't be read.
@@ -103,17 +105,27 @@ impl ClientError {
 pub(crate) struct Client {
     http: reqwest::Client,
     base: String,
-    token: Token,
+    token: Option<Token>,
 }
 
 impl Client {
     /// Finds server and token; nothing is sent yet.
     pub(crate) fn connect(connection: &Connection) -> Result<Self, CommandError> {
-        let data = connection
-            .data
-            .as_ref()
-            .map(PathBuf::from)
-            .or_else(|| crate::config::default_data_directory(|name| std::env::var_os(name)));
+        let client = Self::anonymous(connection)?;
+        let token = find_token(connection, data_directory(connection).as_deref(), &client.base)?;
+        Ok(Self { token: Some(token), ..client })
+    }
+
+    /// The same with this token.
+    pub(crate) fn with_token(connection: &Connection, token: &str) -> Result<Self, CommandError> {
+        let token =
+            token.parse().map_err(|source| ClientError::Token { origin: "the kept token".to_owned(), source })?;
+        Ok(Self { token: Some(token), ..Self::anonymous(connection)? })
+    }
+
+    /// The same without a token, to ask for one.
+    pub(crate) fn anonymous(connection: &Connection) -> Result<Self, CommandError> {
+        let data = data_directory(connection);
         let base = match &connection.server {
             Some(url) => url.trim_end_matches('/').to_owned(),
             None => local_server(data.as_deref()).unwrap_or_else(|| "http://127.0.0.1:8080".to_owned()),
@@ -123,7 +135,6 @@ impl Client {
         if !is_http {
             return Err(ClientError::Url { url: base }.into());
         }
-        let token = find_token(connection, data.as_deref())?;
         // A second install is refused because the first is in place, which is all that matters.
         let _ = rustls::crypto::ring::default_provider().install_default();
         let http = reqwest::Client::builder()
@@ -132,7 +143,12 @@ impl Client {
             .user_agent(concat!("taskd/", env!("CARGO_PKG_VERSION")))
             .build()
             .map_err(|source| ClientError::Unreachable { url: base.clone(), source })?;
-        Ok(Self { http, base, token })
+        Ok(Self { http, base, token: None })
+    }
+
+    /// The server's URL.
+    pub(crate) fn base(&self) -> &str {
+        &self.base
     }
 
     /// Reads from the API.
@@ -170,6 +186,31 @@ impl Client {
         self.send(|| self.request(Method::DELETE, &path)).await.map(drop)
     }
 
+    /// Replaces something; the answer's body does not matter.
+    pub(crate) async fn put<B: Serialize>(&self, path: &str, body: &B) -> Result<(), ClientError> {
+        let path = format!("{BASE}{path}");
+        self.send(|| self.request(Method::PUT, &path).json(body)).await.map(drop)
+    }
+
+    /// Changes something to what the body says, which may be tried twice.
+    pub(crate) async fn change<B: Serialize, T: DeserializeOwned>(
+        &self,
+        path: &str,
+        body: &B,
+    ) -> Result<T, ClientError> {
+        self.answer(|| self.request(Method::PATCH, &format!("{BASE}{path}")).json(body)).await
+    }
+
+    /// Asks for something that would be made twice if it were tried twice.
+    pub(crate) async fn once<B: Serialize, T: DeserializeOwned>(&self, path: &str, body: &B) -> Result<T, ClientError> {
+        let request = self.request(Method::POST, &format!("{BASE}{path}")).json(body);
+        let response = request.send().await.map_err(|source| self.unreachable(source))?;
+        match response.status().is_success() {
+            true => self.body(response).await,
+            false => Err(self.refusal(response).await),
+        }
+    }
+
     /// Orders something. However often it is tried, it is done once: `key` says that it is the same order.
     pub(crate) async fn order<B: Serialize, T: DeserializeOwned>(
         &self,
@@ -183,18 +224,17 @@ impl Client {
 
     /// Asks a robot something. Tried once only: the robot may have done what was asked though no answer came.
     pub(crate) async fn ask(&self, robot: &RobotName, ask: &Ask) -> Result<Answer, ClientError> {
-        let request = self.request(Method::POST, &format!("{BASE}/robots/{robot}/ask")).json(ask);
-        let response = request.send().await.map_err(|source| self.unreachable(source))?;
-        match response.status().is_success() {
-            true => self.body(response).await,
-            false => Err(self.refusal(response).await),
-        }
+        self.once(&format!("/robots/{robot}/ask"), ask).await
     }
 
     /// A request with the token, to a path below the server's URL or to a whole URL of the same server.
     pub(crate) fn request(&self, method: Method, path: &str) -> RequestBuilder {
         let url = if path.starts_with('/') { format!("{}{path}", self.base) } else { path.to_owned() };
-        self.http.request(method, url).bearer_auth(self.token.reveal()).timeout(ANSWER_TIMEOUT)
+        let request = self.http.request(method, url).timeout(ANSWER_TIMEOUT);
+        match &self.token {
+            Some(token) => request.bearer_auth(token.reveal()),
+            None => request,
+        }
     }
 
     async fn answer<T: DeserializeOwned>(&self, request: impl Fn() -> RequestBuilder) -> Result<T, ClientError> {
@@ -317,7 +357,17 @@ fn local_server(data: Option<&Path>) -> Option<String> {
     Some(if http.contains("://") { http.trim_end_matches('/').to_owned() } else { format!("http://{http}") })
 }
 
-fn find_token(connection: &Connection, data: Option<&Path>) -> Result<Token, ClientError> {
+fn data_directory(connection: &Connection) -> Option<PathBuf> {
+    let named = connection.data.as_ref().map(PathBuf::from);
+    named.or_else(|| crate::config::default_data_directory(|name| std::env::var_os(name)))
+}
+
+/// What was said wins, then what was signed in to, then what lies where a server on this machine would put it.
+fn find_token(connection: &Connection, data: Option<&Path>, base: &str) -> Result<Token, ClientError> {
+    let is_said = connection.token.is_some() || connection.token_file.is_some() || connection.data.is_some();
+    if !is_said && let Some(token) = kept_token(base) {
+        return Ok(token);
+    }
     let (text, origin) = match (&connection.token_file, &connection.token, data) {
         (Some(path), _, _) => (read_token(path)?, path.display().to_string()),
         (None, Some(token), _) => (token.clone(), "--token or TASKD_TOKEN".to_owned()),

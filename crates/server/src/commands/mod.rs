@@ -1,6 +1,6 @@
 //! The operator's commands: what they are called, what they take, and which exit code they end with. Each command talks
 //! to the server over its public API only; none of them opens the server's database or files (the published address and
-//! the operator's token excepted).
+//! the first token excepted).
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -11,14 +11,17 @@ use crate::package::PackageError;
 use client::{Client, ClientError};
 use output::{Format, Output};
 
+mod audit;
 mod broker;
 mod client;
 mod confirm;
 mod deploy;
 mod enroll_token;
+mod login;
 mod logs;
 mod output;
 mod outputs;
+mod password;
 mod progress;
 mod push;
 mod robot;
@@ -27,7 +30,9 @@ mod server;
 mod shown;
 mod sse;
 mod task;
+mod token;
 mod upload;
+mod user;
 mod view;
 mod wait;
 
@@ -40,6 +45,26 @@ pub enum Command {
         #[command(subcommand)]
         action: robot::Action,
     },
+    /// Sign in with a name and a password
+    Login(login::LoginOrder),
+    /// Sign out where taskd login signed in
+    Logout,
+    /// Show whom the token stands for, and what it allows
+    Whoami,
+    /// Say who may use the server, and what for
+    User {
+        /// What to do.
+        #[command(subcommand)]
+        action: user::Action,
+    },
+    /// Make, list or revoke access tokens
+    Token {
+        /// What to do.
+        #[command(subcommand)]
+        action: token::Action,
+    },
+    /// Show who did what, export or verify it
+    Audit(audit::AuditOrder),
     /// Look at the server
     Server {
         /// What to do.
@@ -111,10 +136,10 @@ pub struct Connection {
     /// The server's URL [default: the server of --data, else http://127.0.0.1:8080]
     #[arg(long, env = "TASKD_SERVER", value_name = "URL", global = true)]
     pub server: Option<String>,
-    /// The operator's token [default: operator.token in --data]
+    /// A person's token [default: that of taskd login, else operator.token in --data]
     #[arg(long, env = "TASKD_TOKEN", value_name = "TOKEN", hide_env_values = true, global = true)]
     pub token: Option<String>,
-    /// A file that holds the operator's token
+    /// A file that holds the token
     #[arg(long, value_name = "FILE", global = true)]
     pub token_file: Option<PathBuf>,
     /// The data directory of a server on this machine
@@ -168,6 +193,9 @@ pub enum CommandError {
     /// The command line asks for something that makes no sense.
     #[error("{0}")]
     Usage(String),
+    /// The audit's chain does not hold.
+    #[error("the audit does not hold: {0}")]
+    Broken(String),
     /// A local file or stream.
     #[error("{what}")]
     Io {
@@ -182,7 +210,7 @@ impl CommandError {
     fn outcome(&self) -> Outcome {
         match self {
             Self::Client(error) => error.outcome(),
-            Self::Package(PackageError::Io { .. }) | Self::Io { .. } => Outcome::Failed,
+            Self::Package(PackageError::Io { .. }) | Self::Io { .. } | Self::Broken(_) => Outcome::Failed,
             Self::Package(_) | Self::Usage(_) => Outcome::Usage,
         }
     }
@@ -203,6 +231,12 @@ pub async fn run(connection: &Connection, command: Command) -> ExitCode {
 async fn dispatch(connection: &Connection, command: Command) -> Result<Outcome, CommandError> {
     match command {
         Command::Pack(pack) => push::pack(&Output::new(connection.output), pack).await,
+        Command::Login(order) => login::log_in(connection, order).await,
+        Command::Logout => login::log_out(connection).await,
+        Command::Whoami => user::who_am_i(&connection.open()?).await,
+        Command::User { action } => user::run(&connection.open()?, action).await,
+        Command::Token { action } => token::run(&connection.open()?, action).await,
+        Command::Audit(order) => audit::run(connection, order).await,
         Command::Robot { action } => robot::run(&connection.open()?, action).await,
         Command::Server { action } => server::run(&connection.open()?, action).await,
         Command::Broker { action } => broker::run(&connection.open()?, action).await,

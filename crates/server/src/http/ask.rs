@@ -1,4 +1,4 @@
-//! Questions of operators to one robot: passed on, answered by the robot itself.
+//! Questions to one robot: passed on, answered by the robot itself. What changes something takes more than looking.
 
 use std::time::Duration;
 
@@ -6,12 +6,15 @@ use axum::Json;
 use axum::extract::State;
 use http::StatusCode;
 use task_proto::RobotName;
+use task_proto::person::Permission;
 use task_proto::request::{Answer, Ask, Refusal};
 
 use super::App;
+use super::auth::not_permitted;
 use super::error::ApiError;
 use super::extract::{JsonBody, PathParam};
 use super::robots::find;
+use crate::person::Person;
 use crate::requests::RequestError;
 
 /// How long a robot may take. A lifecycle transition on a slow robot is what takes longest.
@@ -20,13 +23,20 @@ const PATIENCE: Duration = Duration::from_secs(20);
 /// `POST /robots/{robot}/ask`: asks the robot and gives its answer.
 pub(super) async fn ask(
     State(app): State<App>,
+    by: Person,
     PathParam(robot): PathParam<RobotName>,
     JsonBody(ask): JsonBody<Ask>,
 ) -> Result<Json<Answer>, ApiError> {
     if ask == Ask::Unknown {
         return Err(ApiError::invalid("type: there is no such question"));
     }
-    let id = find(&app, &robot).await?;
+    let id = find(&app, &by, &robot).await?;
+    if ask.changes_something() {
+        if !by.may(Permission::Operate) {
+            return Err(not_permitted(&by, Permission::Operate));
+        }
+        app.actions.note_ask(&by, &id, &ask).await?;
+    }
     Ok(Json(app.requests.ask(&app.broker, &id, ask, PATIENCE).await?))
 }
 

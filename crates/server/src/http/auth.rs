@@ -11,12 +11,14 @@ use axum::response::{IntoResponse, Response};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use http::request::Parts;
-use http::{HeaderMap, Method, StatusCode, header};
+use http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use task_proto::RobotId;
+use task_proto::person::Permission;
 use task_proto::token::Token;
 
 use super::App;
 use super::error::ApiError;
+use crate::person::Person;
 use crate::store::{Admitted, TokenHolder};
 
 /// Who may call a route.
@@ -24,14 +26,14 @@ use crate::store::{Admitted, TokenHolder};
 pub enum Access {
     /// Everybody, known or not.
     Anyone,
-    /// A person with an operator token or a signed-in page.
-    Operator,
+    /// A person, by a token or a signed-in page, who has the permission. Which robots it holds for is the handler's to look at.
+    Person(Permission),
     /// The robot that the path's `{robot}` names, and no other.
     OwnRobot,
     /// A machine with an enrolment token that is still good.
     Enrolment,
-    /// An operator, or any robot; the handler narrows what a robot gets.
-    OperatorOrRobot,
+    /// A person or any robot; the handler narrows what each of them gets.
+    PersonOrRobot,
 }
 
 /// Which of its tokens a robot called with, by number. Handlers for robots may take it as an extension.
@@ -43,8 +45,8 @@ pub struct TokenNumber(pub u64);
 pub enum Caller {
     /// Nobody known: only on routes for anyone.
     Anyone,
-    /// An operator.
-    Operator,
+    /// A person.
+    Person(Person),
     /// A robot.
     Robot(RobotId),
     /// The holder of an enrolment token.
@@ -60,13 +62,21 @@ impl Caller {
         }
     }
 
+    /// The person that calls; `None` for everybody else.
+    pub fn person(&self) -> Option<&Person> {
+        match self {
+            Self::Person(person) => Some(person),
+            _ => None,
+        }
+    }
+
     fn may(&self, access: Access, own: Option<&str>) -> bool {
         match access {
             Access::Anyone => true,
-            Access::Operator => *self == Self::Operator,
+            Access::Person(permission) => matches!(self, Self::Person(person) if person.may(permission)),
             Access::OwnRobot => self.robot().is_some_and(|robot| own == Some(robot.as_str())),
             Access::Enrolment => matches!(self, Self::Enrolment(_)),
-            Access::OperatorOrRobot => matches!(self, Self::Operator | Self::Robot(_)),
+            Access::PersonOrRobot => matches!(self, Self::Person(_) | Self::Robot(_)),
         }
     }
 }
@@ -77,6 +87,17 @@ impl<S: Sync> FromRequestParts<S> for Caller {
     async fn from_request_parts(parts: &mut Parts, _state: &S) -> Result<Self, ApiError> {
         // Absent only if a handler was mounted without the guard: then nobody is let in.
         parts.extensions.get::<Self>().cloned().ok_or_else(|| ApiError::unauthorized("this route has no guard"))
+    }
+}
+
+impl<S: Sync> FromRequestParts<S> for Person {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, ApiError> {
+        match Caller::from_request_parts(parts, state).await? {
+            Caller::Person(person) => Ok(person),
+            _ => Err(ApiError::forbidden("only people may do that")),
+        }
     }
 }
 
@@ -100,7 +121,10 @@ pub(super) async fn guard(
     // A path that is no text names nobody; the handler says that there is no such thing.
     let own = params.iter().flatten().find(|(name, _)| *name == "robot").map(|(_, value)| value);
     match admit(&gate, peer, own, request.method(), request.headers()).await {
-        Ok((caller, token_number)) => {
+        Ok((mut caller, token_number)) => {
+            if let Caller::Person(person) = &mut caller {
+                person.address = Some(peer.ip().to_canonical());
+            }
             request.extensions_mut().insert(caller);
             request.extensions_mut().insert(token_number);
         }
@@ -127,6 +151,9 @@ async fn admit(
     match identify(&gate.app, method, headers).await {
         Ok((caller, token_number)) if caller.may(gate.access, own) => Ok((caller, token_number)),
         Ok((Caller::Anyone, _)) => Err(ApiError::unauthorized("a token is needed: Authorization: Bearer …")),
+        Ok((Caller::Person(person), _)) if let Access::Person(permission) = gate.access => {
+            Err(not_permitted(&person, permission))
+        }
         Ok(_) => Err(ApiError::forbidden("this token may not do that")),
         Err(error) if error.status == StatusCode::UNAUTHORIZED => {
             let is_too_many = gate.app.attempts.record(peer.ip(), gate.app.clock.now_ms());
@@ -136,13 +163,21 @@ async fn admit(
     }
 }
 
+/// Says what is missing, so that people know whom to ask for what.
+pub(super) fn not_permitted(person: &Person, permission: Permission) -> ApiError {
+    let (name, roles) = (&person.name, &person.roles);
+    ApiError::forbidden(if person.roles.allow(permission) {
+        format!("{name} is limited to the robots {:?}, and this concerns all of them", person.scope.to_string())
+    } else {
+        format!("{name} has no permission to {permission} (roles: {roles})")
+    })
+}
+
 /// Who sent these headers. `Anyone` if they don't say; an error if they say it wrongly.
 async fn identify(app: &App, method: &Method, headers: &HeaderMap) -> Result<(Caller, TokenNumber), ApiError> {
     let now_ms = app.clock.now_ms();
     let token = if let Some(value) = headers.get(header::AUTHORIZATION) {
-        let text = value.to_str().ok().and_then(presented_token);
-        let text = text.ok_or_else(|| ApiError::unauthorized("Authorization: expected Bearer or Basic and a token"))?;
-        text.parse().map_err(|error| ApiError::unauthorized(format!("Authorization: {error}")))?
+        token_of(value)?
     } else if let Some(session) = app.sessions.find(headers, now_ms) {
         if !matches!(*method, Method::GET | Method::HEAD) {
             require_same_origin(headers)?;
@@ -155,7 +190,7 @@ async fn identify(app: &App, method: &Method, headers: &HeaderMap) -> Result<(Ca
         return Err(ApiError::unauthorized("the token is unknown, expired or revoked"));
     };
     Ok(match holder {
-        TokenHolder::Operator => (Caller::Operator, TokenNumber(0)),
+        TokenHolder::Person(person) => (Caller::Person(person), TokenNumber(0)),
         TokenHolder::Enrolment => (Caller::Enrolment(Box::new(token)), TokenNumber(0)),
         TokenHolder::Robot { robot, token_number } => {
             if is_first_use {
@@ -165,6 +200,18 @@ async fn identify(app: &App, method: &Method, headers: &HeaderMap) -> Result<(Ca
             (Caller::Robot(robot), TokenNumber(token_number))
         }
     })
+}
+
+/// The token that these headers show.
+pub(super) fn shown_token(headers: &HeaderMap) -> Result<Token, ApiError> {
+    let value = headers.get(header::AUTHORIZATION);
+    token_of(value.ok_or_else(|| ApiError::unauthorized("Authorization: it is missing"))?)
+}
+
+fn token_of(value: &HeaderValue) -> Result<Token, ApiError> {
+    let text = value.to_str().ok().and_then(presented_token);
+    let text = text.ok_or_else(|| ApiError::unauthorized("Authorization: expected Bearer or Basic and a token"))?;
+    text.parse().map_err(|error| ApiError::unauthorized(format!("Authorization: {error}")))
 }
 
 /// The token of `Bearer TOKEN` or `Basic base64(anything:TOKEN)`.

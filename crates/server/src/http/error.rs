@@ -8,6 +8,7 @@ use serde_json::json;
 use task_proto::api;
 
 use crate::actions::ActionError;
+use crate::person::Person;
 use crate::report_writer::ReportError;
 use crate::store::StoreError;
 
@@ -41,6 +42,12 @@ impl ApiError {
     /// 403: whoever asks may not.
     pub fn forbidden(message: impl Into<String>) -> Self {
         Self::new(StatusCode::FORBIDDEN, "forbidden", message)
+    }
+
+    /// 403: it is not one of the person's robots, or concerns none of them.
+    pub fn out_of_scope(what: impl std::fmt::Display, by: &Person) -> Self {
+        let message = format!("{what} is outside of {}'s scope {:?}", by.name, by.scope.to_string());
+        Self::new(StatusCode::FORBIDDEN, "out_of_scope", message)
     }
 
     /// 404: there is no such thing.
@@ -112,11 +119,17 @@ impl From<StoreError> for ApiError {
 impl From<ActionError> for ApiError {
     fn from(error: ActionError) -> Self {
         let status = match error {
-            ActionError::Store(_) => return Self::internal(&error),
+            ActionError::Store(_) | ActionError::PasswordFailed => return Self::internal(&error),
             ActionError::Invalid { .. } | ActionError::InvalidIdempotencyKey => StatusCode::BAD_REQUEST,
-            ActionError::TokenRefused => StatusCode::UNAUTHORIZED,
-            ActionError::TokenForOther { .. } => StatusCode::FORBIDDEN,
-            ActionError::RobotNotFound(_) | ActionError::DeploymentNotFound(_) => StatusCode::NOT_FOUND,
+            ActionError::TokenRefused | ActionError::SignInRefused => StatusCode::UNAUTHORIZED,
+            ActionError::TokenForOther { .. } | ActionError::OutOfScope { .. } | ActionError::NotPermitted(_) => {
+                StatusCode::FORBIDDEN
+            }
+            ActionError::SignInBlocked { .. } | ActionError::TooManySignIns => StatusCode::TOO_MANY_REQUESTS,
+            ActionError::RobotNotFound(_)
+            | ActionError::DeploymentNotFound(_)
+            | ActionError::UserNotFound(_)
+            | ActionError::TokenNotFound(_) => StatusCode::NOT_FOUND,
             ActionError::TooLargeForInline { .. } => StatusCode::UNPROCESSABLE_ENTITY,
             ActionError::NoRobotsMatch(_)
             | ActionError::IdempotencyKeyReused(_)
@@ -124,6 +137,8 @@ impl From<ActionError> for ApiError {
             | ActionError::NameTaken(_)
             | ActionError::EnrolledAnew(_)
             | ActionError::DeploymentCancelled(_)
+            | ActionError::UserExists(_)
+            | ActionError::LastAdministrator(_)
             | ActionError::Diverged(_) => StatusCode::CONFLICT,
         };
         Self::new(status, error.code(), error.to_string())

@@ -1,28 +1,31 @@
-//! The event stream: notices of change, gathered for a moment, read once from the store and sent to every listener.
-//! It never replays: whoever missed something is told so and fetches the lists again.
+//! The event stream: notices of change, gathered for a moment, read once from the store and sent to every listener whose
+//! robots they concern. It never replays: whoever missed something is told so and fetches the lists again.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, HashSet};
 use std::convert::Infallible;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use axum::extract::State;
 use axum::response::sse::{Event as SentEvent, KeepAlive, Sse};
 use futures_util::{Stream, StreamExt as _};
 use http::{HeaderMap, header};
-use task_proto::RobotId;
-use task_proto::api::Event;
+use task_proto::api::{DeploymentView, Event, RobotView};
+use task_proto::token::Token;
+use task_proto::{DeploymentId, RobotId};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, broadcast};
 use tokio_stream::wrappers::BroadcastStream;
 use tokio_util::sync::CancellationToken;
 
 use super::App;
+use super::auth::shown_token;
 use super::error::ApiError;
-use super::views::complete_robot;
+use super::views::{complete_robot, narrowed};
 use crate::changes::{Change, Changes};
 use crate::clock::Clock;
+use crate::person::{Person, Scope};
 use crate::presence::Presence;
-use crate::store::{Store, StoreError};
+use crate::store::{KnownRobot, Store, StoreError, TokenHolder};
 
 /// For how long notices are gathered: a robot that reports ten times in it is sent once.
 const GATHER: Duration = Duration::from_millis(200);
@@ -30,13 +33,61 @@ const GATHER: Duration = Duration::from_millis(200);
 const BACKLOG: usize = 16 * 1024;
 /// The most listeners at once.
 const MOST_LISTENERS: usize = 512;
+/// How often a stream looks whether its listener may still listen, when nobody has said anything.
+const RIGHTS_INTERVAL: Duration = Duration::from_secs(30);
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
 
-/// An event as it goes to every listener: written once.
+/// An event as it goes to the listeners: written once.
 #[derive(Debug, Clone)]
 struct Line {
     name: &'static str,
     data: Arc<str>,
+    audience: Audience,
+}
+
+/// Whom an event is for.
+#[derive(Debug, Clone)]
+enum Audience {
+    Everybody,
+    /// Those who may see this robot.
+    Robot(Arc<KnownRobot>),
+    /// Those with exactly this scope: what they see of a deployment is their part of it.
+    Scope(Scope),
+    /// Those who are limited to some robots.
+    Limited,
+}
+
+impl Audience {
+    fn includes(&self, scope: &Scope) -> bool {
+        match self {
+            Self::Everybody => true,
+            Self::Robot(robot) => scope.covers(&robot.id, &robot.name, &robot.labels),
+            Self::Scope(only) => only == scope,
+            Self::Limited => !scope.is_everything(),
+        }
+    }
+}
+
+/// The limited scopes of those who listen, each with how many they are.
+type Scopes = Arc<Mutex<Vec<(Scope, usize)>>>;
+
+/// A listener's place; dropping it makes room.
+pub(super) struct Place {
+    scopes: Scopes,
+    scope: Scope,
+    _permit: OwnedSemaphorePermit,
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        let mut scopes = self.scopes.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(at) = scopes.iter().position(|(scope, _)| *scope == self.scope) {
+            scopes[at].1 -= 1;
+            if scopes[at].1 == 0 {
+                scopes.swap_remove(at);
+            }
+        }
+    }
 }
 
 /// Where listeners come to.
@@ -44,6 +95,7 @@ struct Line {
 pub struct EventFeed {
     lines: broadcast::Sender<Line>,
     places: Arc<Semaphore>,
+    scopes: Scopes,
 }
 
 /// What the feed reads from.
@@ -59,13 +111,22 @@ pub struct EventSource {
 impl EventFeed {
     /// A feed without listeners; [`EventFeed::run`] fills it.
     pub fn new() -> Self {
-        Self { lines: broadcast::Sender::new(BACKLOG), places: Arc::new(Semaphore::new(MOST_LISTENERS)) }
+        let (lines, places) = (broadcast::Sender::new(BACKLOG), Arc::new(Semaphore::new(MOST_LISTENERS)));
+        Self { lines, places, scopes: Scopes::default() }
     }
 
-    /// A place among the listeners, for as long as it is held.
-    pub(super) fn place(&self) -> Result<OwnedSemaphorePermit, ApiError> {
-        let place = self.places.clone().try_acquire_owned();
-        place.map_err(|_| ApiError::unavailable("too many pages listen to events already"))
+    /// A place among the listeners for someone with this scope, for as long as it is held.
+    pub(super) fn place(&self, scope: &Scope) -> Result<Place, ApiError> {
+        let permit = self.places.clone().try_acquire_owned();
+        let permit = permit.map_err(|_| ApiError::unavailable("too many pages listen to events already"))?;
+        if !scope.is_everything() {
+            let mut scopes = self.scopes.lock().unwrap_or_else(PoisonError::into_inner);
+            match scopes.iter_mut().find(|(known, _)| known == scope) {
+                Some((_, count)) => *count += 1,
+                None => scopes.push((scope.clone(), 1)),
+            }
+        }
+        Ok(Place { scopes: self.scopes.clone(), scope: scope.clone(), _permit: permit })
     }
 
     /// Turns notices into events until `stop`.
@@ -101,38 +162,73 @@ impl EventFeed {
                 has_missed = true;
             }
             if has_missed {
-                self.send(&Event::Missed);
+                self.send(&Event::Missed, Audience::Everybody);
             }
         }
     }
 
     async fn send_all(&self, source: &EventSource, gathered: BTreeSet<Change>) -> Result<(), StoreError> {
-        let mut robots = BTreeSet::new();
+        let (mut robots, mut deployments) = (BTreeSet::new(), BTreeSet::new());
         for change in gathered {
             match change {
                 Change::Robot(id) => drop(robots.insert(id)),
-                Change::RobotRemoved(id) => self.send(&Event::RobotRemoved { id }),
-                Change::Package(name) => self.send(&Event::Package { name }),
-                Change::Deployment(id) => {
-                    if let Some(deployment) = source.store.deployment_summary(&id).await? {
-                        self.send(&Event::Deployment { deployment: Box::new(deployment) });
-                    }
+                Change::RobotRemoved(robot) => {
+                    self.send(&Event::RobotRemoved { id: robot.id.clone() }, Audience::Robot(Arc::new(*robot)));
                 }
+                Change::Scopes => self.send(&Event::Missed, Audience::Limited),
+                Change::Package(name) => self.send(&Event::Package { name }, Audience::Everybody),
+                Change::Deployment(id) => drop(deployments.insert(id)),
             }
         }
+        self.send_deployments(source, deployments).await?;
         let now_ms = source.clock.now_ms();
         let robots: Vec<RobotId> = robots.into_iter().collect();
         for mut robot in source.store.robots_among(&robots).await? {
             complete_robot(&mut robot, &source.presence, now_ms);
-            self.send(&Event::Robot { robot: Box::new(robot) });
+            let RobotView { id, name, mac, labels, .. } = &robot;
+            let known = KnownRobot { id: id.clone(), name: name.clone(), mac: *mac, labels: labels.clone() };
+            self.send(&Event::Robot { robot: Box::new(robot) }, Audience::Robot(Arc::new(known)));
         }
         Ok(())
     }
 
-    fn send(&self, event: &Event) {
+    /// Whoever has a limited scope gets their part of a deployment; it is read and written once for all with that scope.
+    async fn send_deployments(
+        &self,
+        source: &EventSource,
+        deployments: BTreeSet<DeploymentId>,
+    ) -> Result<(), StoreError> {
+        if deployments.is_empty() {
+            return Ok(());
+        }
+        let limited = self.scopes.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        let mut scopes = Vec::with_capacity(limited.len());
+        for (scope, _) in limited {
+            let robots: HashSet<RobotId> = source.store.robots_in(&scope).await?.into_iter().collect();
+            scopes.push((scope, robots));
+        }
+        for id in deployments {
+            let whole = source.store.deployment_summary(&id).await?;
+            let Some(deployment) = whole.map(Box::new) else { continue };
+            self.send(&Event::Deployment { deployment }, Audience::Scope(Scope::everything()));
+            if scopes.is_empty() {
+                continue;
+            }
+            let Some(whole) = source.store.deployment(&id).await? else { continue };
+            for (scope, robots) in &scopes {
+                if let Some(part) = narrowed(whole.clone(), robots) {
+                    let deployment = Box::new(DeploymentView { assignments: None, ..part });
+                    self.send(&Event::Deployment { deployment }, Audience::Scope(scope.clone()));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn send(&self, event: &Event, audience: Audience) {
         match serde_json::to_string(event) {
             // Nobody listening is fine.
-            Ok(data) => drop(self.lines.send(Line { name: name_of(event), data: data.into() })),
+            Ok(data) => drop(self.lines.send(Line { name: name_of(event), data: data.into(), audience })),
             Err(error) => tracing::error!(%error, "an event could not be written"),
         }
     }
@@ -157,41 +253,71 @@ fn name_of(event: &Event) -> &'static str {
 /// `GET /events`: what changes from now on, until the server stops or the listener's session ends.
 pub(super) async fn stream(
     State(app): State<App>,
+    by: Person,
     headers: HeaderMap,
 ) -> Result<Sse<impl Stream<Item = Result<SentEvent, Infallible>>>, ApiError> {
-    let place = app.events.place()?;
+    // The place is free again when the stream is dropped.
+    let place = app.events.place(&by.scope)?;
     let lines = BroadcastStream::new(app.events.lines.subscribe());
-    let events = lines.map(move |line| {
-        // The place is free again when the stream is dropped.
-        let _held = &place;
-        Ok(match line {
-            Ok(line) => SentEvent::default().event(line.name).data(line.data),
-            Err(_) => SentEvent::default().event("missed").data(r#"{"type":"missed"}"#),
-        })
+    let events = lines.filter_map(move |line| {
+        let event = match line {
+            Ok(line) if !line.audience.includes(&place.scope) => None,
+            Ok(line) => Some(SentEvent::default().event(line.name).data(line.data)),
+            Err(_) => Some(SentEvent::default().event("missed").data(r#"{"type":"missed"}"#)),
+        };
+        std::future::ready(event.map(Ok))
     });
     // A first line, so that proxies pass the headers on and the page knows that it is connected.
     let greeting =
         futures_util::stream::iter([Ok(SentEvent::default().retry(Duration::from_secs(2)).comment("hello"))]);
-    let events = greeting.chain(events).take_until(end_of_stream(&app, &headers)?);
+    let events = greeting.chain(events).take_until(end_of_stream(&app, by, None, &headers)?);
     Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)))
 }
 
-/// Resolves when whoever sent these headers may listen no longer. A session may have ended since the guard looked.
-pub(super) fn end_of_stream(app: &App, headers: &HeaderMap) -> Result<impl Future<Output = ()> + use<>, ApiError> {
+/// Whether the token still stands for the same person with the same rights, and the robot, if it is about one, is theirs.
+async fn still_may(app: &App, by: &Person, token: &Token, robot: Option<&RobotId>) -> Result<bool, StoreError> {
+    match app.store.token_holder(token, app.clock.now_ms()).await? {
+        Some(TokenHolder::Person(person)) if person.has_the_rights_of(by) => {}
+        _ => return Ok(false),
+    }
+    let Some(robot) = robot.filter(|_| !by.scope.is_everything()) else { return Ok(true) };
+    let robot = app.store.find_robot(robot.as_str()).await?;
+    Ok(robot.is_some_and(|robot| by.scope.covers(&robot.id, &robot.name, &robot.labels)))
+}
+
+/// Resolves when whoever sent these headers may listen no longer: their session ended (perhaps since the guard looked), or
+/// what they may has changed, or `robot` is none of theirs any more. Whoever may something else then comes again and gets that.
+pub(super) fn end_of_stream(
+    app: &App,
+    by: Person,
+    robot: Option<RobotId>,
+    headers: &HeaderMap,
+) -> Result<impl Future<Output = ()> + use<>, ApiError> {
     let now_ms = app.clock.now_ms();
-    let (ended, left) = if headers.contains_key(header::AUTHORIZATION) {
-        (CancellationToken::new(), Duration::MAX)
+    let (token, ended, left) = if headers.contains_key(header::AUTHORIZATION) {
+        (shown_token(headers)?, CancellationToken::new(), Duration::MAX)
     } else {
         let session = app.sessions.find(headers, now_ms);
         let session = session.ok_or_else(|| ApiError::unauthorized("the session has ended"))?;
-        (session.ended, Duration::from_millis(session.expires_at_ms.saturating_sub(now_ms)))
+        (session.token, session.ended, Duration::from_millis(session.expires_at_ms.saturating_sub(now_ms)))
     };
-    let stop = app.stop.clone();
+    let (stop, app, mut rights) = (app.stop.clone(), app.clone(), app.changes.rights());
+    let may_no_longer = async move {
+        // While the database does not answer nobody can change anything either.
+        while still_may(&app, &by, &token, robot.as_ref()).await.unwrap_or(true) {
+            // A token also ends by itself.
+            tokio::select! {
+                _ = rights.changed() => {}
+                () = tokio::time::sleep(RIGHTS_INTERVAL) => {}
+            }
+        }
+    };
     Ok(async move {
         tokio::select! {
             () = stop.cancelled() => {}
             () = ended.cancelled() => {}
             () = tokio::time::sleep(left) => {}
+            () = may_no_longer => {}
         }
     })
 }

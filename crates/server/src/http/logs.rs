@@ -21,6 +21,7 @@ use super::error::ApiError;
 use super::events::end_of_stream;
 use super::extract::{PathParam, QueryParams};
 use super::robots::find;
+use crate::person::{Person, Scope};
 use crate::requests::RequestError;
 use crate::robot_logs::{Joined, Told};
 
@@ -38,14 +39,15 @@ const DEFAULT_LINES: u64 = 500;
 /// `GET /robots/{robot}/logs`: the newest lines, or with `follow` those that come.
 pub(super) async fn show(
     State(app): State<App>,
+    by: Person,
     PathParam(robot): PathParam<RobotName>,
     QueryParams(query): QueryParams<LogsQuery>,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
-    let id = find(&app, &robot).await?;
+    let id = find(&app, &by, &robot).await?;
     let filter = Filter { task: query.task, level: query.level.unwrap_or(LogLevel::Debug) };
     if query.follow {
-        return Ok(stream(&app, id, filter, &headers)?.into_response());
+        return Ok(stream(&app, by, id, filter, &headers)?.into_response());
     }
     let max_lines = query.max_lines.unwrap_or(DEFAULT_LINES).min(MAX_KEPT_LINES as u64);
     Ok(Json(newest(&app, &id, filter, query.since_s, max_lines).await?).into_response())
@@ -114,12 +116,13 @@ fn remembered(
 
 fn stream(
     app: &App,
+    by: Person,
     robot: RobotId,
     filter: Filter,
     headers: &HeaderMap,
 ) -> Result<Sse<impl Stream<Item = Result<SentEvent, Infallible>> + use<>>, ApiError> {
-    let end = end_of_stream(app, headers)?;
-    let place = app.events.place()?;
+    let end = end_of_stream(app, by, Some(robot.clone()), headers)?;
+    let place = app.events.place(&Scope::everything())?;
     let Joined { follower, told, is_first } = app.logs.follow(&robot, filter.level);
     if is_first {
         tokio::spawn(keep_following(app.clone(), robot));

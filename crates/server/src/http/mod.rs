@@ -17,6 +17,7 @@ mod logs;
 pub mod oci;
 mod outputs;
 mod packages;
+mod people;
 mod robots;
 pub mod session;
 mod tasks;
@@ -36,6 +37,7 @@ use axum::response::{IntoResponse, Response};
 use axum::routing::{MethodFilter, MethodRouter, any, on};
 use http::{HeaderValue, Method, StatusCode, header};
 use task_proto::envelope::PublicKey;
+use task_proto::person::Permission;
 use tokio_util::sync::CancellationToken;
 
 use crate::actions::Actions;
@@ -182,45 +184,62 @@ impl Route {
 
 /// Every route there is, with who may call it. Nothing is served that is not here.
 pub fn routes() -> Vec<Route> {
-    use Access::{Anyone, Enrolment, Operator, OperatorOrRobot, OwnRobot};
-    let (get, post, patch, delete) = (Method::GET, Method::POST, Method::PATCH, Method::DELETE);
+    use Access::{Anyone, Enrolment, OwnRobot, Person, PersonOrRobot};
+    use Permission::{Administer, Maintain, Operate, Read};
+    let (get, post, put) = (Method::GET, Method::POST, Method::PUT);
+    let (patch, delete) = (Method::PATCH, Method::DELETE);
     vec![
         Route::new(get.clone(), "/healthz", Anyone, health::healthz),
         Route::new(get.clone(), "/readyz", Anyone, health::readyz),
-        Route::new(get.clone(), "/api/v1/server", Operator, health::server),
-        Route::new(get.clone(), "/api/v1/broker", Operator, broker::files),
+        Route::new(get.clone(), "/api/v1/server", Person(Read), health::server),
+        Route::new(get.clone(), "/api/v1/broker", Person(Administer), broker::files),
         Route::new(get.clone(), "/api/v1/session", Anyone, session::show),
         Route::new(post.clone(), "/api/v1/session", Anyone, session::sign_in),
-        Route::new(delete.clone(), "/api/v1/session", Operator, session::sign_out),
+        Route::new(delete.clone(), "/api/v1/session", Person(Read), session::sign_out),
+        Route::new(post.clone(), "/api/v1/login", Anyone, people::log_in),
+        Route::new(get.clone(), "/api/v1/me", Person(Read), people::me),
+        Route::new(put.clone(), "/api/v1/password", Person(Read), people::change_password),
+        Route::new(get.clone(), "/api/v1/users", Person(Administer), people::users),
+        Route::new(post.clone(), "/api/v1/users", Person(Administer), people::add_user),
+        Route::new(patch.clone(), "/api/v1/users/{user}", Person(Administer), people::edit_user),
+        Route::new(delete.clone(), "/api/v1/users/{user}", Person(Administer), people::remove_user),
+        Route::new(put, "/api/v1/users/{user}/password", Person(Administer), people::set_password),
+        Route::new(get.clone(), "/api/v1/tokens", Person(Read), people::tokens),
+        Route::new(post.clone(), "/api/v1/tokens", Person(Read), people::create_token),
+        Route::new(delete.clone(), "/api/v1/tokens/{token}", Person(Read), people::revoke_token),
+        Route::new(get.clone(), "/api/v1/audit", Person(Administer), people::audit),
         Route::new(post.clone(), "/api/v1/enroll", Enrolment, enroll::enroll),
-        Route::new(post.clone(), "/api/v1/enrollment-tokens", Operator, enroll::create_token),
-        Route::new(get.clone(), "/api/v1/robots", Operator, robots::list),
-        Route::new(get.clone(), "/api/v1/robots/{robot}", Operator, robots::show),
-        Route::new(patch, "/api/v1/robots/{robot}", Operator, robots::edit),
-        Route::new(delete, "/api/v1/robots/{robot}", Operator, robots::remove),
+        Route::new(post.clone(), "/api/v1/enrollment-tokens", Person(Administer), enroll::create_token),
+        Route::new(get.clone(), "/api/v1/robots", Person(Read), robots::list),
+        Route::new(get.clone(), "/api/v1/robots/{robot}", Person(Read), robots::show),
+        Route::new(patch, "/api/v1/robots/{robot}", Person(Maintain), robots::edit),
+        Route::new(delete, "/api/v1/robots/{robot}", Person(Maintain), robots::remove),
         Route::new(get.clone(), "/api/v1/robots/{robot}/desired", OwnRobot, robots::desired),
         Route::new(get.clone(), "/api/v1/robots/{robot}/mqtt", OwnRobot, broker::endpoint),
         Route::new(post.clone(), "/api/v1/robots/{robot}/token", OwnRobot, robots::next_token),
         Route::new(post.clone(), "/api/v1/robots/{robot}/report", OwnRobot, robots::report)
             .body_bytes(REPORT_BODY_BYTES),
-        Route::new(post.clone(), "/api/v1/robots/{robot}/ask", Operator, ask::ask),
-        Route::new(get.clone(), "/api/v1/robots/{robot}/logs", Operator, logs::show).streaming(),
-        Route::new(get.clone(), "/api/v1/packages", Operator, packages::list),
-        Route::new(get.clone(), "/api/v1/outputs", Operator, outputs::list),
-        Route::new(get.clone(), "/api/v1/deployments", Operator, deployments::list),
-        Route::new(post.clone(), "/api/v1/deployments", Operator, deployments::create).body_bytes(ORDER_BODY_BYTES),
-        Route::new(get.clone(), "/api/v1/deployments/{deployment}", Operator, deployments::show),
-        Route::new(post.clone(), "/api/v1/deployments/{deployment}/cancel", Operator, deployments::cancel),
-        Route::new(post.clone(), "/api/v1/deployments/{deployment}/resume", Operator, deployments::resume),
-        Route::new(post.clone(), "/api/v1/tasks/{task}/start", Operator, tasks::start).body_bytes(ORDER_BODY_BYTES),
-        Route::new(post.clone(), "/api/v1/tasks/{task}/stop", Operator, tasks::stop).body_bytes(ORDER_BODY_BYTES),
-        Route::new(post, "/api/v1/tasks/{task}/remove", Operator, tasks::remove).body_bytes(ORDER_BODY_BYTES),
-        Route::new(get.clone(), "/api/v1/events", Operator, events::stream).streaming(),
+        Route::new(post.clone(), "/api/v1/robots/{robot}/ask", Person(Read), ask::ask),
+        Route::new(get.clone(), "/api/v1/robots/{robot}/logs", Person(Read), logs::show).streaming(),
+        Route::new(get.clone(), "/api/v1/packages", Person(Read), packages::list),
+        Route::new(get.clone(), "/api/v1/outputs", Person(Read), outputs::list),
+        Route::new(get.clone(), "/api/v1/deployments", Person(Read), deployments::list),
+        Route::new(post.clone(), "/api/v1/deployments", Person(Operate), deployments::create)
+            .body_bytes(ORDER_BODY_BYTES),
+        Route::new(get.clone(), "/api/v1/deployments/{deployment}", Person(Read), deployments::show),
+        Route::new(post.clone(), "/api/v1/deployments/{deployment}/cancel", Person(Operate), deployments::cancel),
+        Route::new(post.clone(), "/api/v1/deployments/{deployment}/resume", Person(Operate), deployments::resume),
+        Route::new(post.clone(), "/api/v1/tasks/{task}/start", Person(Operate), tasks::start)
+            .body_bytes(ORDER_BODY_BYTES),
+        Route::new(post.clone(), "/api/v1/tasks/{task}/stop", Person(Operate), tasks::stop)
+            .body_bytes(ORDER_BODY_BYTES),
+        Route::new(post, "/api/v1/tasks/{task}/remove", Person(Operate), tasks::remove).body_bytes(ORDER_BODY_BYTES),
+        Route::new(get.clone(), "/api/v1/events", Person(Read), events::stream).streaming(),
         Route::new(get.clone(), "/", Anyone, web::index),
         Route::new(get, "/ui/{*file}", Anyone, web::file),
-        Route::any("/v2", OperatorOrRobot, oci::version),
-        Route::any("/v2/", OperatorOrRobot, oci::version),
-        Route::any("/v2/{*path}", OperatorOrRobot, oci::dispatch),
+        Route::any("/v2", PersonOrRobot, oci::version),
+        Route::any("/v2/", PersonOrRobot, oci::version),
+        Route::any("/v2/{*path}", PersonOrRobot, oci::dispatch),
     ]
 }
 

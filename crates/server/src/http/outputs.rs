@@ -10,6 +10,7 @@ use super::App;
 use super::error::ApiError;
 use super::extract::QueryParams;
 use super::robots::find;
+use crate::person::{Person, Scope};
 
 /// The query of `GET /outputs`.
 #[derive(Deserialize)]
@@ -22,11 +23,13 @@ pub(super) struct ListQuery {
 /// `GET /outputs`: what came back, of one robot or of all.
 pub(super) async fn list(
     State(app): State<App>,
+    by: Person,
     QueryParams(query): QueryParams<ListQuery>,
 ) -> Result<Json<OutputList>, ApiError> {
     let robot = match &query.robot {
-        Some(robot) => Some(find(&app, robot).await?),
+        Some(robot) => Some(find(&app, &by, robot).await?),
         None => None,
     };
-    Ok(Json(OutputList { outputs: app.store.outputs(robot.as_ref(), query.task.as_ref()).await? }))
+    let scope = if robot.is_some() { &Scope::everything() } else { &by.scope };
+    Ok(Json(OutputList { outputs: app.store.outputs(robot.as_ref(), query.task.as_ref(), scope).await? }))
 }

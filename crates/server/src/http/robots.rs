@@ -17,6 +17,7 @@ use super::auth::TokenNumber;
 use super::error::ApiError;
 use super::extract::{JsonBody, PathParam, QueryParams, TolerantJson};
 use super::views::complete_robot;
+use crate::person::Person;
 use crate::uplink;
 
 /// The query of `GET /robots`.
@@ -26,12 +27,14 @@ pub(super) struct ListQuery {
     selector: Option<Selector>,
 }
 
-/// `GET /robots`: all robots, or those a selector means.
+/// `GET /robots`: all robots of the person's, or those of them a selector means.
 pub(super) async fn list(
     State(app): State<App>,
+    by: Person,
     QueryParams(query): QueryParams<ListQuery>,
 ) -> Result<Json<RobotList>, ApiError> {
     let mut robots = app.store.robots().await?;
+    robots.retain(|robot| by.scope.covers(&robot.id, &robot.name, &robot.labels));
     if let Some(selector) = query.selector {
         robots.retain(|robot| selector.matches(&robot.id, &robot.name, &robot.labels));
     }
@@ -43,9 +46,10 @@ pub(super) async fn list(
 /// `GET /robots/{robot}`: one robot, by id or name.
 pub(super) async fn show(
     State(app): State<App>,
+    by: Person,
     PathParam(robot): PathParam<RobotName>,
 ) -> Result<Json<RobotView>, ApiError> {
-    let id = find(&app, &robot).await?;
+    let id = find(&app, &by, &robot).await?;
     let mut view = view(&app, &id).await?;
     let since_ms = app.presence.get(&id, app.clock.now_ms()).and_then(|sighting| sighting.connected_since_ms);
     view.mqtt =
@@ -56,21 +60,23 @@ pub(super) async fn show(
 /// `PATCH /robots/{robot}`: changes name or labels.
 pub(super) async fn edit(
     State(app): State<App>,
+    by: Person,
     PathParam(robot): PathParam<RobotName>,
     JsonBody(edit): JsonBody<EditRobot>,
 ) -> Result<Json<RobotView>, ApiError> {
-    let id = find(&app, &robot).await?;
-    app.actions.edit_robot(&id, &edit).await?;
+    let id = find(&app, &by, &robot).await?;
+    app.actions.edit_robot(&by, &id, &edit).await?;
     view(&app, &id).await.map(Json)
 }
 
 /// `DELETE /robots/{robot}`: removes it; whoever is connected with its token has to go.
 pub(super) async fn remove(
     State(app): State<App>,
+    by: Person,
     PathParam(robot): PathParam<RobotName>,
 ) -> Result<StatusCode, ApiError> {
-    let id = find(&app, &robot).await?;
-    app.actions.remove_robot(&id).await?;
+    let id = find(&app, &by, &robot).await?;
+    app.actions.remove_robot(&by, &id).await?;
     app.logs.forget(&id);
     app.broker.disconnect(&id);
     app.presence.forget(&id);
@@ -128,10 +134,14 @@ pub(super) async fn next_token(
     Ok((StatusCode::CREATED, Json(RobotToken { token: token.reveal() })))
 }
 
-/// The robot that an operator names.
-pub(super) async fn find(app: &App, id_or_name: &RobotName) -> Result<RobotId, ApiError> {
+/// The robot that a person names, which must be one of theirs.
+pub(super) async fn find(app: &App, by: &Person, id_or_name: &RobotName) -> Result<RobotId, ApiError> {
     let found = app.store.find_robot(id_or_name.as_str()).await?;
-    found.ok_or_else(|| ApiError::not_found(format!("there is no robot {id_or_name}")))
+    let found = found.ok_or_else(|| ApiError::not_found(format!("there is no robot {id_or_name}")))?;
+    if by.scope.covers(&found.id, &found.name, &found.labels) {
+        return Ok(found.id);
+    }
+    Err(ApiError::out_of_scope(format!("robot {id_or_name}"), by))
 }
 
 async fn view(app: &App, id: &RobotId) -> Result<RobotView, ApiError> {

@@ -1,28 +1,31 @@
-//! Signing in at the page: an operator's token is exchanged for a cookie that scripts can't read. Sessions are kept in
+//! Signing in at the page: a name and a password, or a person's token, is exchanged for a cookie that scripts can't read. Sessions are kept in
 //! memory only, so a restart of the server signs everybody out.
 
 use std::collections::HashMap;
+use std::net::SocketAddr;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use axum::Json;
-use axum::extract::State;
+use axum::extract::{ConnectInfo, State};
 use axum::response::{IntoResponse, Response};
 use http::{HeaderMap, StatusCode, header};
 use task_proto::Digest;
-use task_proto::api::{SessionView, SignIn};
-use task_proto::token::{Token, TokenKind};
+use task_proto::api::{LogIn, SessionView, SignIn, TokenOrigin};
+use task_proto::token::Token;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
 use super::App;
 use super::auth::require_same_origin;
 use super::error::ApiError;
 use super::extract::JsonBody;
+use crate::actions::people::PAGE_LIFETIME_MS;
+use crate::person::Person;
 use crate::store::TokenHolder;
 
 /// The cookie's name.
 const COOKIE: &str = "taskd_session";
 /// How long a session lasts.
-const LIFETIME_MS: u64 = 12 * 60 * 60 * 1000;
+const LIFETIME_MS: u64 = PAGE_LIFETIME_MS;
 /// Sessions at a time; one more ends the oldest.
 const MOST_SESSIONS: usize = 1_024;
 
@@ -95,6 +98,7 @@ fn set_cookie(value: &str, max_age_s: u64) -> [(header::HeaderName, String); 1] 
 /// `POST /session`: signs in.
 pub(super) async fn sign_in(
     State(app): State<App>,
+    ConnectInfo(peer): ConnectInfo<SocketAddr>,
     headers: HeaderMap,
     JsonBody(request): JsonBody<SignIn>,
 ) -> Result<Response, ApiError> {
@@ -102,33 +106,50 @@ pub(super) async fn sign_in(
     if headers.contains_key(header::ORIGIN) {
         require_same_origin(&headers)?;
     }
-    let refused = || ApiError::unauthorized("token: it is unknown, expired or revoked, or not an operator's");
-    let token: Token = request.token.parse().map_err(|error| ApiError::unauthorized(format!("token: {error}")))?;
     let now_ms = app.clock.now_ms();
-    if token.kind() != TokenKind::Operator
-        || app.store.token_holder(&token, now_ms).await? != Some(TokenHolder::Operator)
-    {
-        return Err(refused());
-    }
+    let token = match request {
+        SignIn { token: Some(token), user: None, password: None } => known_token(&app, &token, now_ms).await?,
+        SignIn { token: None, user: Some(user), password: Some(password) } => {
+            let order = LogIn { user, password, ttl_s: None };
+            app.actions.sign_in(&order, TokenOrigin::Page, peer.ip().to_canonical()).await?.token
+        }
+        _ => return Err(ApiError::invalid("user: expected a user and a password, or else a token")),
+    };
     let id = app.sessions.begin(token, now_ms);
     let view = SessionView { expires_at_ms: Some(now_ms + LIFETIME_MS) };
     Ok((set_cookie(&id, LIFETIME_MS / 1000), Json(view)).into_response())
 }
 
-/// `GET /session`: tells until when the caller is signed in.
-pub(super) async fn show(State(app): State<App>, headers: HeaderMap) -> Json<SessionView> {
-    let session = app.sessions.find(&headers, app.clock.now_ms());
-    Json(SessionView { expires_at_ms: session.map(|session| session.expires_at_ms) })
+async fn known_token(app: &App, text: &str, now_ms: u64) -> Result<Token, ApiError> {
+    let token: Token = text.parse().map_err(|error| ApiError::unauthorized(format!("token: {error}")))?;
+    match app.store.token_holder(&token, now_ms).await? {
+        Some(TokenHolder::Person(_)) => Ok(token),
+        _ => Err(ApiError::unauthorized("token: it is unknown, expired or revoked, or not a person's")),
+    }
 }
 
-/// `DELETE /session`: signs out.
-pub(super) async fn sign_out(State(app): State<App>, headers: HeaderMap) -> Response {
+/// `GET /session`: tells until when the caller is signed in.
+pub(super) async fn show(State(app): State<App>, headers: HeaderMap) -> Result<Json<SessionView>, ApiError> {
+    let now_ms = app.clock.now_ms();
+    let Some(session) = app.sessions.find(&headers, now_ms) else {
+        return Ok(Json(SessionView { expires_at_ms: None }));
+    };
+    let is_good = app.store.token_holder(&session.token, now_ms).await?.is_some();
+    Ok(Json(SessionView { expires_at_ms: is_good.then_some(session.expires_at_ms) }))
+}
+
+/// `DELETE /session`: signs out, the page or whoever signed in at the command line.
+pub(super) async fn sign_out(State(app): State<App>, by: Person, headers: HeaderMap) -> Result<Response, ApiError> {
     app.sessions.end(&headers);
-    (StatusCode::NO_CONTENT, set_cookie("", 0)).into_response()
+    app.actions.sign_out(&by).await?;
+    app.broker.disconnect_person(&by.name);
+    Ok((StatusCode::NO_CONTENT, set_cookie("", 0)).into_response())
 }
 
 #[cfg(test)]
 mod tests {
+    use task_proto::token::TokenKind;
+
     use super::*;
 
     fn with_cookie(text: String) -> HeaderMap {

@@ -1,8 +1,12 @@
 //! Views as the operator sees them: the store's rows, completed with what only presence knows.
 
-use task_proto::api::{DeploymentView, MatchedRobot, RobotView};
-use task_proto::report::Condition;
+use std::collections::HashSet;
 
+use task_proto::RobotId;
+use task_proto::api::{DeploymentState, DeploymentView, MatchedRobot, PhaseCount, RobotView};
+use task_proto::report::{Condition, Phase};
+
+use crate::deployment;
 use crate::presence::Presence;
 
 /// Adds where a robot is and what is wrong with its identity.
@@ -23,6 +27,21 @@ pub fn complete_deployment(view: &mut DeploymentView, presence: &Presence, now_m
     for assignment in view.assignments.iter_mut().flatten() {
         assignment.online = presence.is_online(&assignment.robot, now_ms);
     }
+}
+
+/// What of a deployment, which has its assignments, concerns these robots; `None` if nothing does.
+pub fn narrowed(mut view: DeploymentView, robots: &HashSet<RobotId>) -> Option<DeploymentView> {
+    let assignments = view.assignments.as_mut()?;
+    assignments.retain(|assignment| robots.contains(&assignment.robot));
+    if assignments.is_empty() {
+        return None;
+    }
+    let count = |phase: &Phase| assignments.iter().filter(|assignment| assignment.phase == *phase).count() as u64;
+    let counts = Phase::ALL.iter().map(|phase| PhaseCount { phase: *phase, count: count(phase) });
+    view.counts = counts.filter(|counted| counted.count > 0).collect();
+    let (is_cancelled, is_paused) = (view.state == DeploymentState::Cancelled, view.state == DeploymentState::Paused);
+    view.state = deployment::state(view.kind, is_cancelled, is_paused, &view.counts);
+    Some(view)
 }
 
 /// Says which of the robots are there.

@@ -3,14 +3,14 @@
 use std::collections::HashMap;
 
 use sqlx::{AssertSqlSafe, Row as _};
-use task_proto::DeploymentId;
 use task_proto::api::{AssignmentView, CreateDeployment, DeploymentView, PhaseCount};
 use task_proto::desired::PackageRef;
 use task_proto::manifest::TaskKind;
 use task_proto::report::Phase;
+use task_proto::{DeploymentId, RobotId};
 
 use super::deliveries;
-use super::rows::{from_json, from_optional_json, from_word, id, json, number, priority, stored, word};
+use super::rows::{from_json, from_optional_json, from_word, groups, id, json, number, priority, stored, values, word};
 use super::{Store, StoreError, Write};
 use crate::deployment;
 use crate::rollout::{Rollout, Tally};
@@ -36,12 +36,31 @@ const LISTED: &str = "(SELECT id FROM deployments WHERE id = $1 OR $1 = '' ORDER
 impl Store {
     /// The newest deployments, newest first, without assignments.
     pub async fn deployments(&self) -> Result<Vec<DeploymentView>, StoreError> {
-        self.deployment_views("").await
+        self.deployment_views("", self.counted("", None).await?).await
+    }
+
+    /// Of the newest deployments those that concern one of these robots, as far as they do.
+    pub async fn deployments_of(&self, robots: &[RobotId]) -> Result<Vec<DeploymentView>, StoreError> {
+        let mut counts: HashMap<String, Vec<PhaseCount>> = HashMap::new();
+        for group in groups(robots) {
+            for (deployment, counted) in self.counted("", Some(group)).await? {
+                let sum = counts.entry(deployment).or_default();
+                for PhaseCount { phase, count } in counted {
+                    match sum.iter_mut().find(|known| known.phase == phase) {
+                        Some(known) => known.count += count,
+                        None => sum.push(PhaseCount { phase, count }),
+                    }
+                }
+            }
+        }
+        let mut views = self.deployment_views("", counts).await?;
+        views.retain(|view| !view.counts.is_empty());
+        Ok(views)
     }
 
     /// One deployment without its assignments.
     pub async fn deployment_summary(&self, id: &DeploymentId) -> Result<Option<DeploymentView>, StoreError> {
-        Ok(self.deployment_views(id.as_str()).await?.pop())
+        Ok(self.deployment_views(id.as_str(), self.counted(id.as_str(), None).await?).await?.pop())
     }
 
     /// One deployment with its assignments, sorted by robot name; their `online` is left false.
@@ -73,19 +92,43 @@ impl Store {
         rows.iter().map(|row| from_json("deployments.package", row)).collect()
     }
 
-    /// The views of one deployment, or with an empty `id` of the newest.
-    async fn deployment_views(&self, id: &str) -> Result<Vec<DeploymentView>, StoreError> {
+    /// How many assignments of each deployment stand in which phase: of one, or with an empty `id` of the newest; of all
+    /// robots or of a group of them.
+    async fn counted(
+        &self,
+        id: &str,
+        robots: Option<&[RobotId]>,
+    ) -> Result<HashMap<String, Vec<PhaseCount>>, StoreError> {
+        let among = match robots {
+            Some(group) => format!("AND robot_id IN ({})", values(2, group.len(), &["TEXT"])),
+            None => String::new(),
+        };
+        let sql = format!(
+            "SELECT deployment_id, phase, COUNT(*) FROM assignments WHERE deployment_id IN {LISTED} {among}
+             GROUP BY deployment_id, phase"
+        );
+        let mut query = sqlx::query_as::<_, (String, String, i64)>(AssertSqlSafe(sql)).bind(id);
+        for robot in robots.unwrap_or_default() {
+            query = query.bind(robot.as_str());
+        }
+        let mut counts: HashMap<String, Vec<PhaseCount>> = HashMap::new();
+        for (deployment, phase, count) in query.fetch_all(&self.reads).await? {
+            let count = PhaseCount { phase: Phase::from_text(&phase), count: number(count) };
+            counts.entry(deployment).or_default().push(count);
+        }
+        Ok(counts)
+    }
+
+    /// The views of one deployment, or with an empty `id` of the newest, with these counts.
+    async fn deployment_views(
+        &self,
+        id: &str,
+        mut counts: HashMap<String, Vec<PhaseCount>>,
+    ) -> Result<Vec<DeploymentView>, StoreError> {
         let rows = sqlx::query(AssertSqlSafe(format!(
             "SELECT id, package, kind, selector, delivery, priority, batch, max_failures, paused, created_at_ms, expires_at_ms,
                  cancelled_at_ms
              FROM deployments WHERE id IN {LISTED} ORDER BY number DESC"
-        )))
-        .bind(id)
-        .fetch_all(&self.reads)
-        .await?;
-        let counted: Vec<(String, String, i64)> = sqlx::query_as(AssertSqlSafe(format!(
-            "SELECT deployment_id, phase, COUNT(*) FROM assignments WHERE deployment_id IN {LISTED}
-             GROUP BY deployment_id, phase"
         )))
         .bind(id)
         .fetch_all(&self.reads)
@@ -97,11 +140,6 @@ impl Store {
         .bind(id)
         .fetch_all(&self.reads)
         .await?;
-        let mut counts: HashMap<String, Vec<PhaseCount>> = HashMap::new();
-        for (deployment, phase, count) in counted {
-            let count = PhaseCount { phase: Phase::from_text(&phase), count: number(count) };
-            counts.entry(deployment).or_default().push(count);
-        }
         let mut supersedes: HashMap<String, Vec<DeploymentId>> = HashMap::new();
         for (newer, older) in superseded {
             supersedes.entry(newer).or_default().push(super::rows::id("assignments.deployment_id", &older)?);

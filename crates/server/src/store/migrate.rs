@@ -14,6 +14,7 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[
     (4, "outputs", include_str!("../migrations/0004_outputs.sql")),
     (5, "broker_credentials", include_str!("../migrations/0005_broker_credentials.sql")),
     (6, "delivery", include_str!("../migrations/0006_delivery.sql")),
+    (7, "people", include_str!("../migrations/0007_people.sql")),
 ];
 
 /// Applies what has not been applied yet.

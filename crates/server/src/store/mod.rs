@@ -6,6 +6,7 @@
 mod access;
 mod adoption;
 mod assignments;
+mod audit;
 mod deliveries;
 mod deployments;
 mod fan_outs;
@@ -18,6 +19,7 @@ mod reports;
 mod robots;
 mod rows;
 mod tokens;
+mod users;
 
 use std::path::Path;
 use std::sync::Arc;
@@ -28,6 +30,7 @@ use sqlx::{AnyConnection, AnyPool, Transaction};
 
 use access::{Access, Ending};
 pub use assignments::{Released, Revocable, TaskOrder};
+pub use audit::{Act, Deed};
 pub use deliveries::{Decided, DeliveryOrder, RobotFacts};
 pub use deployments::NewDeployment;
 use first_use::FirstUses;
@@ -36,6 +39,7 @@ pub use packages::{NewManifest, PutManifest, Reference, StoredManifest};
 pub use reports::{OpenAssignment, ReportedRobot};
 pub use robots::{BrokerCredential, DesiredTasks, FetchedBy, KnownRobot};
 pub use tokens::{Admitted, EnrolmentTerms, TokenHolder};
+pub use users::{NewToken, User};
 
 /// Connections that read at the same time.
 const READERS: u32 = 4;

@@ -7,41 +7,52 @@ use task_proto::output::OutputSet;
 use task_proto::{Digest, RepositoryName, RobotId, TaskName};
 
 use super::{Store, StoreError, Write, rows};
+use crate::person::Scope;
 
 /// The newest runs kept of one task on one robot.
 const KEPT: usize = 10;
 /// The newest runs kept of one robot: the names of tasks are in its own hands.
 const KEPT_OF_ROBOT: usize = 200;
 /// The most outputs listed.
-const MAX_LISTED: i64 = 1000;
+const MAX_LISTED: usize = 1000;
 /// The most bytes of JSON listed: an output of many files with long names takes a lot of room.
 const MAX_LISTED_BYTES: usize = 16 * 1024 * 1024;
 
 impl Store {
-    /// The newest outputs first, of one robot or of all, of one task or of all; at most 1,000, and fewer if they are large.
+    /// The newest outputs first, of one robot or of all in a scope, of one task or of all; at most 1,000, and fewer if they
+    /// are large.
     pub async fn outputs(
         &self,
         robot: Option<&RobotId>,
         task: Option<&TaskName>,
+        scope: &Scope,
     ) -> Result<Vec<OutputView>, StoreError> {
         let mut found = sqlx::query(
-            "SELECT o.manifest, o.output, o.pushed_at_ms, r.name FROM outputs o JOIN robots r ON r.id = o.robot_id
+            "SELECT o.manifest, o.output, o.pushed_at_ms, r.name, o.robot_id, r.labels FROM outputs o JOIN robots r ON r.id = o.robot_id
              WHERE ($1 = '' OR o.robot_id = $1) AND ($2 = '' OR o.task = $2)
              ORDER BY o.pushed_at_ms DESC, o.manifest LIMIT $3",
         )
         .bind(robot.map_or("", RobotId::as_str))
         .bind(task.map_or("", TaskName::as_str))
-        .bind(MAX_LISTED)
+        // How many of a scope's are among the newest is not known before they are looked at.
+        .bind(if scope.is_everything() { MAX_LISTED as i64 } else { i64::MAX })
         .fetch(&self.reads);
         let (mut views, mut bytes) = (Vec::new(), 0);
         while let Some(row) = found.try_next().await? {
+            let robot_name = rows::id("robots.name", row.try_get("name")?)?;
+            if !scope.is_everything() {
+                let labels = rows::from_json("robots.labels", row.try_get("labels")?)?;
+                if !scope.covers(&rows::id("outputs.robot_id", row.try_get("robot_id")?)?, &robot_name, &labels) {
+                    continue;
+                }
+            }
             let output: &str = row.try_get("output")?;
             bytes += output.len();
-            if bytes > MAX_LISTED_BYTES {
+            if bytes > MAX_LISTED_BYTES || views.len() == MAX_LISTED {
                 break;
             }
             views.push(OutputView {
-                robot_name: rows::id("robots.name", row.try_get("name")?)?,
+                robot_name,
                 manifest: rows::id("outputs.manifest", row.try_get("manifest")?)?,
                 pushed_at_ms: rows::number(row.try_get("pushed_at_ms")?),
                 output: rows::from_json("outputs.output", output)?,

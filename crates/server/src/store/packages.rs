@@ -12,7 +12,7 @@ use task_proto::oci::Descriptor;
 use task_proto::output::OutputSet;
 use task_proto::{Digest, RepositoryName, Tag, TaskName};
 
-use super::{Store, StoreError, Write, rows};
+use super::{Deed, Store, StoreError, Write, rows};
 
 /// A manifest's name inside its repository.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -65,11 +65,13 @@ pub enum PutManifest {
 }
 
 impl Store {
-    /// Stores a manifest and points its tags to it, if all its parts are in the repository.
+    /// Stores a manifest and points its tags to it, if all its parts are in the repository. With a `deed` that is written
+    /// down, as below.
     pub async fn put_manifest(
         &self,
         repository: &RepositoryName,
         new: &NewManifest,
+        deed: Option<&Deed>,
         now_ms: u64,
     ) -> Result<PutManifest, StoreError> {
         let mut write = self.begin().await?;
@@ -94,7 +96,7 @@ impl Store {
                 write.delete_manifest(&repository, &surplus).await?;
             }
         }
-        write.commit().await?;
+        write.commit_with(deed, now_ms).await?;
         Ok(PutManifest::Stored)
     }
 
@@ -134,23 +136,32 @@ impl Store {
         &self,
         repository: &RepositoryName,
         digest: &Digest,
+        deed: Option<&Deed>,
+        now_ms: u64,
     ) -> Result<Option<Vec<Digest>>, StoreError> {
         let mut write = self.begin().await?;
         let parts = write.delete_manifest(repository, digest).await?;
-        write.commit().await?;
+        write.commit_with(deed.filter(|_| parts.is_some()), now_ms).await?;
         Ok(parts)
     }
 
     /// Removes a tag; false if it was not there.
-    pub async fn delete_tag(&self, repository: &RepositoryName, tag: &Tag) -> Result<bool, StoreError> {
+    pub async fn delete_tag(
+        &self,
+        repository: &RepositoryName,
+        tag: &Tag,
+        deed: Option<&Deed>,
+        now_ms: u64,
+    ) -> Result<bool, StoreError> {
         let mut write = self.begin().await?;
         let deleted = sqlx::query("DELETE FROM tags WHERE repository = $1 AND tag = $2")
             .bind(repository.as_str())
             .bind(tag.as_str())
             .execute(write.connection())
             .await?;
-        write.commit().await?;
-        Ok(deleted.rows_affected() > 0)
+        let is_deleted = deleted.rows_affected() > 0;
+        write.commit_with(deed.filter(|_| is_deleted), now_ms).await?;
+        Ok(is_deleted)
     }
 
     /// A repository's tags in the order of their bytes; `None` if there is no such repository.
@@ -200,15 +211,22 @@ impl Store {
     }
 
     /// Takes a blob out of a repository; false if it was not in it.
-    pub async fn unlink_blob(&self, repository: &RepositoryName, digest: &Digest) -> Result<bool, StoreError> {
+    pub async fn unlink_blob(
+        &self,
+        repository: &RepositoryName,
+        digest: &Digest,
+        deed: Option<&Deed>,
+        now_ms: u64,
+    ) -> Result<bool, StoreError> {
         let mut write = self.begin().await?;
         let deleted = sqlx::query("DELETE FROM repository_blobs WHERE repository = $1 AND digest = $2")
             .bind(repository.as_str())
             .bind(digest.to_string())
             .execute(write.connection())
             .await?;
-        write.commit().await?;
-        Ok(deleted.rows_affected() > 0)
+        let is_deleted = deleted.rows_affected() > 0;
+        write.commit_with(deed.filter(|_| is_deleted), now_ms).await?;
+        Ok(is_deleted)
     }
 
     /// Whether a blob is in `repository`, or in any if that is `None`.

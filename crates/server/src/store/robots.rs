@@ -9,14 +9,15 @@ use task_proto::desired::{BlobRef, Delivery, DesiredTask, PackageRef};
 use task_proto::id::Labels;
 use task_proto::report::{Condition, Phase, Report};
 use task_proto::selector::Selector;
-use task_proto::{Digest, Generation, MacAddress, RobotId, RobotName, TaskName};
+use task_proto::{DeploymentId, Digest, Generation, MacAddress, RobotId, RobotName, TaskName};
 
 use super::deliveries;
 use super::rows::{from_json, from_optional_json, from_word, groups, id, json, number, priority, stored, values};
 use super::{Store, StoreError, Write};
+use crate::person::Scope;
 
 /// Who a robot is.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct KnownRobot {
     /// Its identity.
     pub id: RobotId,
@@ -65,6 +66,9 @@ pub struct FetchedBy {
 
 const KNOWN: &str = "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL";
 
+const KNOWN_BY_ID_OR_NAME: &str =
+    "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL AND (id = $1 OR name = $1)";
+
 impl Store {
     /// All robots, sorted by name. `online` and `address` are left empty: only presence knows them.
     pub async fn robots(&self) -> Result<Vec<RobotView>, StoreError> {
@@ -96,18 +100,22 @@ impl Store {
     }
 
     /// The robot with this id or name.
-    pub async fn find_robot(&self, id_or_name: &str) -> Result<Option<RobotId>, StoreError> {
-        let found: Option<String> =
-            sqlx::query_scalar("SELECT id FROM robots WHERE removed_at_ms IS NULL AND (id = $1 OR name = $1)")
-                .bind(id_or_name)
-                .fetch_optional(&self.reads)
-                .await?;
-        found.map(|found| id("robots.id", &found)).transpose()
+    pub async fn find_robot(&self, id_or_name: &str) -> Result<Option<KnownRobot>, StoreError> {
+        let row = sqlx::query(KNOWN_BY_ID_OR_NAME).bind(id_or_name).fetch_optional(&self.reads).await?;
+        row.map(|row| known_robot(&row)).transpose()
     }
 
     /// The robots that `selector` means now, sorted by name.
     pub async fn matching_robots(&self, selector: &Selector) -> Result<Vec<KnownRobot>, StoreError> {
         matching(sqlx::query(KNOWN).fetch_all(&self.reads).await?, selector)
+    }
+
+    /// The robots in a scope.
+    pub async fn robots_in(&self, scope: &Scope) -> Result<Vec<RobotId>, StoreError> {
+        let rows = sqlx::query(KNOWN).fetch_all(&self.reads).await?;
+        let mut robots = rows.iter().map(known_robot).collect::<Result<Vec<_>, _>>()?;
+        robots.retain(|robot| scope.covers(&robot.id, &robot.name, &robot.labels));
+        Ok(robots.into_iter().map(|robot| robot.id).collect())
     }
 
     /// Every robot.
@@ -226,13 +234,18 @@ impl Write {
 
     /// The robot with this id or name.
     pub async fn known_robot(&mut self, id_or_name: &str) -> Result<Option<KnownRobot>, StoreError> {
-        let row = sqlx::query(
-            "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL AND (id = $1 OR name = $1)",
-        )
-        .bind(id_or_name)
-        .fetch_optional(self.connection())
-        .await?;
+        let row = sqlx::query(KNOWN_BY_ID_OR_NAME).bind(id_or_name).fetch_optional(self.connection()).await?;
         row.map(|row| known_robot(&row)).transpose()
+    }
+
+    /// The robots that a deployment is for.
+    pub async fn robots_of_deployment(&mut self, deployment: &DeploymentId) -> Result<Vec<KnownRobot>, StoreError> {
+        let of_deployment = "id IN (SELECT robot_id FROM assignments WHERE deployment_id = $1)";
+        let rows = sqlx::query(AssertSqlSafe(format!("{KNOWN} AND {of_deployment}")))
+            .bind(deployment.as_str())
+            .fetch_all(self.connection())
+            .await?;
+        rows.iter().map(known_robot).collect()
     }
 
     /// Registers a robot.

@@ -60,6 +60,11 @@ pub(super) fn id<T: FromStr>(column: &'static str, text: &str) -> Result<T, Stor
     text.parse().map_err(|_| StoreError::Unreadable { column })
 }
 
+/// The same for a column that may be empty.
+pub(super) fn optional<T: FromStr>(column: &'static str, text: Option<String>) -> Result<Option<T>, StoreError> {
+    text.map(|text| id(column, &text)).transpose()
+}
+
 /// Cuts rows into groups of 64, 8 and 1.
 pub(super) fn groups<T>(mut rows: &[T]) -> impl Iterator<Item = &[T]> {
     std::iter::from_fn(move || {

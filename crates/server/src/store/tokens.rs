@@ -1,20 +1,26 @@
 //! Tokens: stored as digests of their secrets, with what each may do. A robot has at most two that are valid: the one it
 //! uses, and one that was made for it and ends the other when it is first used.
 
+use std::collections::BTreeSet;
+
 use sqlx::Row as _;
 use subtle::ConstantTimeEq as _;
-use task_proto::RobotId;
+use task_proto::api::TokenOrigin;
 use task_proto::id::Labels;
+use task_proto::person::Roles;
+use task_proto::selector::Selector;
 use task_proto::token::{Token, TokenKind};
+use task_proto::{RobotId, UserName};
 
-use super::rows::{from_optional_json, id, json, number, stored};
+use super::rows::{from_optional_json, from_word, id, json, number, optional, stored};
 use super::{Store, StoreError, Write};
+use crate::person::{Person, Scope};
 
 /// Whom a valid token stands for.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum TokenHolder {
-    /// An operator.
-    Operator,
+    /// A person.
+    Person(Person),
     /// Someone who may enrol.
     Enrolment,
     /// A robot.
@@ -56,20 +62,33 @@ struct TokenRow {
     expires_at_ms: Option<u64>,
     is_used: bool,
     number: u64,
+    user: Option<UserPart>,
+}
+
+/// Of a user's token: the user as they are now, and what the token is limited to.
+struct UserPart {
+    name: UserName,
+    /// Roles and scope; `None` if the user was removed.
+    user: Option<(Roles, Option<Selector>)>,
+    roles: Option<Roles>,
+    scope: Option<Selector>,
+    origin: TokenOrigin,
 }
 
 /// An enrolment token without a use left is still good while a token that it made was never used: the answer with that
 /// one may have been lost.
-const VALID_TOKEN: &str = "SELECT digest, robot_id, labels, uses_left, expires_at_ms, used_at_ms, number FROM tokens
-     WHERE id = $1 AND kind = $2 AND revoked_at_ms IS NULL AND (expires_at_ms IS NULL OR expires_at_ms > $3)
-       AND (uses_left IS NULL OR uses_left > 0 OR EXISTS (SELECT 1 FROM tokens made
-            WHERE made.made_by = tokens.id AND made.used_at_ms IS NULL AND made.revoked_at_ms IS NULL))";
+const VALID_TOKEN: &str = "SELECT t.digest, t.robot_id, t.labels, t.uses_left, t.expires_at_ms, t.used_at_ms, t.number,
+         t.user_name, t.roles, t.scope, t.origin, u.roles AS user_roles, u.scope AS user_scope
+     FROM tokens t LEFT JOIN users u ON u.name = t.user_name
+     WHERE t.id = $1 AND t.kind = $2 AND t.revoked_at_ms IS NULL AND (t.expires_at_ms IS NULL OR t.expires_at_ms > $3)
+       AND (t.uses_left IS NULL OR t.uses_left > 0 OR EXISTS (SELECT 1 FROM tokens made
+            WHERE made.made_by = t.id AND made.used_at_ms IS NULL AND made.revoked_at_ms IS NULL))";
 
 impl Store {
     /// Whom `token` stands for at `now_ms`; `None` if it is unknown, wrong, used up, expired or revoked. Changes nothing.
     pub async fn token_holder(&self, token: &Token, now_ms: u64) -> Result<Option<TokenHolder>, StoreError> {
         let row = self.valid_token(token, now_ms).await?;
-        Ok(row.and_then(|row| row.holder(token.kind())))
+        Ok(row.and_then(|row| row.holder(token)))
     }
 
     /// The same for whoever shows the token to come in. A robot's first use of a token ends its other ones.
@@ -81,7 +100,7 @@ impl Store {
         let Some(row) = self.valid_token(token, now_ms).await? else { return Ok(None) };
         let is_unused = token.kind() == TokenKind::Robot && !row.is_used;
         let expires_at_ms = row.expires_at_ms;
-        let Some(holder) = row.holder(token.kind()) else { return Ok(None) };
+        let Some(holder) = row.holder(token) else { return Ok(None) };
         if is_unused && !self.use_first(token, now_ms).await? {
             // Somebody was faster: either with this token or with a later one.
             let holder = self.token_holder(token, now_ms).await?;
@@ -104,7 +123,7 @@ impl Store {
         Ok(row.map(token_row).transpose()?.filter(|row| row.has_secret_of(token)))
     }
 
-    /// Stores an operator's token that does not expire.
+    /// Stores the first token, which does not expire.
     pub async fn create_operator_token(&self, token: &Token, now_ms: u64) -> Result<(), StoreError> {
         let mut write = self.begin().await?;
         write.insert_token(token, None, None, now_ms).await?;
@@ -199,22 +218,23 @@ impl Write {
         Ok(())
     }
 
-    /// Forgets enrolment and robot tokens that are good for nothing any more. A revoked operator token stays: the one in the
-    /// data directory must not come back to life at the next start.
-    pub async fn forget_ended_tokens(&mut self, now_ms: u64) -> Result<(), StoreError> {
-        sqlx::query(
+    /// Forgets tokens that are good for nothing any more, and says whose they were if they were users'. The first token stays when it was revoked: it is in the data
+    /// directory, and must not come back to life at the next start.
+    pub async fn forget_ended_tokens(&mut self, now_ms: u64) -> Result<BTreeSet<UserName>, StoreError> {
+        let users: Vec<Option<String>> = sqlx::query_scalar(
             "DELETE FROM tokens
-             WHERE kind <> 'operator' AND (revoked_at_ms IS NOT NULL OR expires_at_ms <= $1
+             WHERE (kind <> 'operator' OR user_name IS NOT NULL) AND (revoked_at_ms IS NOT NULL OR expires_at_ms <= $1
                  OR uses_left = 0 AND NOT EXISTS (SELECT 1 FROM tokens made
-                     WHERE made.made_by = tokens.id AND made.used_at_ms IS NULL AND made.revoked_at_ms IS NULL))",
+                     WHERE made.made_by = tokens.id AND made.used_at_ms IS NULL AND made.revoked_at_ms IS NULL))
+             RETURNING user_name",
         )
         .bind(stored(now_ms))
-        .execute(self.connection())
+        .fetch_all(self.connection())
         .await?;
-        Ok(())
+        users.iter().flatten().map(|user| id("tokens.user_name", user)).collect()
     }
 
-    async fn insert_token(
+    pub(super) async fn insert_token(
         &mut self,
         token: &Token,
         robot: Option<&RobotId>,
@@ -240,12 +260,24 @@ impl Write {
 }
 
 impl TokenRow {
-    fn holder(self, kind: TokenKind) -> Option<TokenHolder> {
-        match kind {
-            TokenKind::Operator => Some(TokenHolder::Operator),
+    fn holder(self, token: &Token) -> Option<TokenHolder> {
+        match token.kind() {
+            TokenKind::Operator => self.person(token).map(TokenHolder::Person),
             TokenKind::Enrolment => Some(TokenHolder::Enrolment),
             TokenKind::Robot => self.robot.map(|robot| TokenHolder::Robot { robot, token_number: self.number }),
         }
+    }
+
+    /// What the token allows is what both it and its user are allowed now; `None` if that is nothing.
+    fn person(self, token: &Token) -> Option<Person> {
+        let Some(UserPart { name, user, roles, scope, origin }) = self.user else { return Some(Person::first(token)) };
+        let (user_roles, user_scope) = user?;
+        let roles = match roles {
+            Some(roles) => roles.within(&user_roles)?,
+            None => user_roles,
+        };
+        let (scope, token) = (Scope::of(user_scope.into_iter().chain(scope)), token.id().parse().ok()?);
+        Some(Person { name, roles, scope, token, origin, address: None })
     }
 
     fn has_secret_of(&self, token: &Token) -> bool {
@@ -263,7 +295,21 @@ fn token_row(row: sqlx::any::AnyRow) -> Result<TokenRow, StoreError> {
         expires_at_ms: row.try_get::<Option<i64>, _>("expires_at_ms")?.map(number),
         is_used: row.try_get::<Option<i64>, _>("used_at_ms")?.is_some(),
         number: number(row.try_get("number")?),
+        user: user_part(&row)?,
     })
+}
+
+fn user_part(row: &sqlx::any::AnyRow) -> Result<Option<UserPart>, StoreError> {
+    let Some(name) = row.try_get::<Option<String>, _>("user_name")? else { return Ok(None) };
+    let user_roles: Option<Roles> = optional("users.roles", row.try_get("user_roles")?)?;
+    let user_scope = optional("users.scope", row.try_get("user_scope")?)?;
+    Ok(Some(UserPart {
+        name: id("tokens.user_name", &name)?,
+        user: user_roles.map(|roles| (roles, user_scope)),
+        roles: optional("tokens.roles", row.try_get("roles")?)?,
+        scope: optional("tokens.scope", row.try_get("scope")?)?,
+        origin: from_word("tokens.origin", row.try_get("origin")?)?,
+    }))
 }
 
 fn kind_text(kind: TokenKind) -> &'static str {

@@ -46,10 +46,10 @@ impl Comer {
         use Comer::{OtherRobot, RemovedRobot, Robot, Stranger};
         let is_let_in = match access {
             Access::Anyone => true,
-            Access::Operator => matches!(self, Operator | OperatorByPassword),
+            Access::Person(_) => matches!(self, Operator | OperatorByPassword),
             Access::OwnRobot => self == Robot,
             Access::Enrolment => self == Enrolment,
-            Access::OperatorOrRobot => matches!(self, Operator | OperatorByPassword | Robot | OtherRobot),
+            Access::PersonOrRobot => matches!(self, Operator | OperatorByPassword | Robot | OtherRobot),
         };
         match self {
             _ if is_let_in => None,

@@ -14,26 +14,26 @@ use taskd::serve::Server;
 use tempfile::TempDir;
 
 /// A server and the directory its operator works in.
-struct Bench {
-    server: Option<Server>,
-    dir: TempDir,
+pub struct Bench {
+    pub server: Option<Server>,
+    pub dir: TempDir,
     http: reqwest::Client,
 }
 
 /// What a command left behind.
-struct Ran {
-    code: i32,
-    stdout: String,
-    stderr: String,
+pub struct Ran {
+    pub code: i32,
+    pub stdout: String,
+    pub stderr: String,
 }
 
 impl Ran {
-    fn json(&self) -> Value {
+    pub fn json(&self) -> Value {
         serde_json::from_str(&self.stdout).unwrap_or_else(|_| panic!("{}\n{}", self.stdout, self.stderr))
     }
 
     #[track_caller]
-    fn expect(self, code: i32, stderr: &str) -> Self {
+    pub fn expect(self, code: i32, stderr: &str) -> Self {
         assert_eq!(self.code, code, "{}\n{}", self.stdout, self.stderr);
         assert!(self.stderr.contains(stderr), "expected {stderr:?} in {}", self.stderr);
         self
@@ -51,21 +51,23 @@ impl From<Output> for Ran {
 }
 
 #[expect(clippy::disallowed_methods, reason = "the test starts the program it tests")]
-fn command(arguments: &[&str]) -> std::process::Command {
+pub fn command(arguments: &[&str]) -> std::process::Command {
     let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_taskd"));
     command.args(arguments).stdin(Stdio::null());
     for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("TASKD_")) {
         command.env_remove(name);
     }
+    // Nobody is signed in.
+    command.env("XDG_CONFIG_HOME", "/nonexistent");
     command
 }
 
-async fn run(mut command: std::process::Command) -> Ran {
+pub async fn run(mut command: std::process::Command) -> Ran {
     tokio::task::spawn_blocking(move || command.output()).await.unwrap().unwrap().into()
 }
 
 impl Bench {
-    async fn start() -> Self {
+    pub async fn start() -> Self {
         let _ = rustls::crypto::ring::default_provider().install_default();
         let dir = tempfile::tempdir().unwrap();
         let mut config = Config::with_data(dir.path().join("server"));
@@ -84,23 +86,23 @@ impl Bench {
         self.server = Some(Server::start(config, Clock::system()).await.unwrap());
     }
 
-    fn server(&self) -> &Server {
+    pub fn server(&self) -> &Server {
         self.server.as_ref().unwrap()
     }
 
-    fn data(&self) -> PathBuf {
+    pub fn data(&self) -> PathBuf {
         self.dir.path().join("server")
     }
 
     /// Runs `taskd` as the operator of this server.
-    async fn taskd(&self, arguments: &[&str]) -> Ran {
+    pub async fn taskd(&self, arguments: &[&str]) -> Ran {
         let mut command = command(arguments);
         command.env("TASKD_DATA", self.data());
         run(command).await
     }
 
     /// A package of one script; `extra` is more of its task.toml.
-    fn package(&self, version: &str, extra: &str) -> String {
+    pub fn package(&self, version: &str, extra: &str) -> String {
         let dir = self.dir.path().join(format!("hello-{version}"));
         std::fs::create_dir_all(&dir).unwrap();
         let task = format!("name = \"hello\"\nversion = \"{version}\"\n[run]\nexec = [\"true\"]\n{extra}");
@@ -183,7 +185,7 @@ async fn who_may_not_ask_is_told_apart_from_what_does_not_work() {
     bench.taskd(&["robot", "list", "--nonsense"]).await.expect(2, "--nonsense");
     let mut without = command(&list);
     without.env("HOME", "/nonexistent").env("XDG_DATA_HOME", "/nonexistent");
-    run(without).await.expect(2, "no operator token");
+    run(without).await.expect(2, "no token");
     let nobody = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
     let nobody = format!("http://{nobody}");
     bench.taskd(&["robot", "list", "--server", &nobody]).await.expect(1, "can't reach the server");

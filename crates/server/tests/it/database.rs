@@ -48,6 +48,21 @@ impl TestDatabase {
         query.fetch_one(&mut connection).await.expect("decided")
     }
 
+    /// Changes an entry of the audit behind its back.
+    pub async fn forge_audit(&self, number: i64, from: &str, to: &str) {
+        let mut connection = sqlx::AnyConnection::connect(&self.url).await.expect("connects");
+        let forge = sqlx::query("UPDATE audit SET entry = REPLACE(entry, $2, $3) WHERE number = $1");
+        let forged = forge.bind(number).bind(from).bind(to).execute(&mut connection).await.expect("forges");
+        assert_eq!(forged.rows_affected(), 1);
+    }
+
+    /// Takes an entry of the audit away.
+    pub async fn drop_audit(&self, number: i64) {
+        let mut connection = sqlx::AnyConnection::connect(&self.url).await.expect("connects");
+        let query = sqlx::query("DELETE FROM audit WHERE number = $1").bind(number);
+        assert_eq!(query.execute(&mut connection).await.expect("drops").rows_affected(), 1);
+    }
+
     /// Makes all assignments such as they were before decisions were kept.
     pub async fn forget_decisions(&self) {
         let mut connection = sqlx::AnyConnection::connect(&self.url).await.expect("connects");

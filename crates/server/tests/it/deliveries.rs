@@ -40,7 +40,11 @@ fn settings(own_rules: Vec<Rule>) -> DeliverySettings {
 
 async fn label(fleet: &Fleet, robot: &Robot, key: &str, value: &str) {
     let labels = [(key.parse().expect("a key"), value.parse().expect("a value"))].into();
-    fleet.actions.edit_robot(&robot.id, &EditRobot { name: None, labels: Some(labels) }).await.expect("edited");
+    fleet
+        .actions
+        .edit_robot(&fleet.operator, &robot.id, &EditRobot { name: None, labels: Some(labels) })
+        .await
+        .expect("edited");
 }
 
 /// The decisions of a deployment by robot, shortly.
@@ -172,7 +176,10 @@ async fn what_was_ordered_is_kept_and_orders_have_priorities(database: TestDatab
     for priority in [-101, 101, i32::MAX] {
         let mut order = order_of(&package("4", TaskKind::Service));
         order.priority = priority;
-        let refused = fleet.actions.create_deployment(&random_key(), &order, &package("4", TaskKind::Service)).await;
+        let refused = fleet
+            .actions
+            .create_deployment(&fleet.operator, &random_key(), &order, &package("4", TaskKind::Service))
+            .await;
         let error = refused.expect_err("refused");
         assert_eq!(error.to_string(), format!("priority: expected -100 to 100, not {priority}"));
     }
@@ -185,17 +192,17 @@ async fn more_than_an_announcement_carries_is_refused(database: TestDatabase) {
     large.package.content.size = 10_171_187;
     let mut order = order_of(&large);
     order.delivery = DeliveryChoice::Inline;
-    let refused = fleet.actions.create_deployment(&random_key(), &order, &large).await;
+    let refused = fleet.actions.create_deployment(&fleet.operator, &random_key(), &order, &large).await;
     let error = refused.expect_err("refused");
     assert_eq!(error.to_string(), "delivery: talker 1 has 9.7 MB, inline carries at most 32 KB");
     assert_eq!(error.code(), "package_too_large");
     // One byte too many, which the config brings.
     large.package.content.size = 32 << 10;
-    let refused = fleet.actions.create_deployment(&random_key(), &order, &large).await;
+    let refused = fleet.actions.create_deployment(&fleet.operator, &random_key(), &order, &large).await;
     let message = refused.expect_err("refused").to_string();
     assert_eq!(message, "delivery: talker 1 has 32769 B, inline carries at most 32768 B");
     order.delivery = DeliveryChoice::Adaptive;
-    let id = fleet.actions.create_deployment(&random_key(), &order, &large).await.expect("ordered");
+    let id = fleet.actions.create_deployment(&fleet.operator, &random_key(), &order, &large).await.expect("ordered");
     let because = "size 32769 B > 32768 B, batch 1 < 8";
     assert_eq!(decisions(&fleet, &id).await, [decision(Delivery::PushPull, "otherwise", because)]);
 }

@@ -10,12 +10,14 @@ use task_proto::desired::{BlobRef, DesiredState, DesiredTask, PackageRef};
 use task_proto::envelope::{DESIRED_STATE_TYPE, SigningKey};
 use task_proto::manifest::{TaskKind, TaskManifest};
 use task_proto::report::{HostFacts, LinkFacts, Phase, Report, TaskReport};
+use task_proto::token::{Token, TokenKind};
 use task_proto::{DeploymentId, Digest, Generation, InstanceId, MacAddress, RobotId};
 use taskd::actions::{ActionError, ActionSettings, Actions, Enrolled, IdempotencyKey};
 use taskd::changes::Changes;
 use taskd::chooser::{Chooser, ServerLoad};
 use taskd::clock::Clock;
 use taskd::config::DeliverySettings;
+use taskd::person::Person;
 use taskd::presence::Presence;
 use taskd::report_writer::ReportWriter;
 
@@ -27,6 +29,7 @@ const SEED: [u8; 32] = [7; 32];
 pub struct Fleet {
     pub database: TestDatabase,
     pub actions: Actions,
+    pub operator: Person,
     pub writer: ReportWriter,
     pub clock: Clock,
     pub changes: Changes,
@@ -66,11 +69,12 @@ impl Fleet {
             ActionSettings::default(),
             chooser.clone(),
         );
-        Self { database, actions, writer, clock, changes, presence, load, chooser }
+        let operator = Person::first(&Token::random(TokenKind::Operator));
+        Self { database, actions, operator, writer, clock, changes, presence, load, chooser }
     }
 
     pub async fn enrolment_token(&self, order: CreateEnrollmentToken) -> task_proto::token::Token {
-        let made = self.actions.create_enrollment_token(&order).await.expect("a token");
+        let made = self.actions.create_enrollment_token(&self.operator, &order).await.expect("a token");
         made.token.parse().expect("a token")
     }
 
@@ -81,7 +85,7 @@ impl Fleet {
         name: Option<&str>,
     ) -> Result<Enrolled, ActionError> {
         let name = name.map(|name| name.parse().expect("a name"));
-        self.actions.enroll(token, &EnrollRequest { mac, name, labels: BTreeMap::new() }).await
+        self.actions.enroll(token, &EnrollRequest { mac, name, labels: BTreeMap::new() }, None).await
     }
 
     /// Registers `count` robots named `r0`, `r1`, …
@@ -99,7 +103,7 @@ impl Fleet {
         let package = package(version, TaskKind::Service);
         let mut request = order_of(&package);
         order(&mut request);
-        self.actions.create_deployment(&random_key(), &request, &package).await.expect("ordered")
+        self.actions.create_deployment(&self.operator, &random_key(), &request, &package).await.expect("ordered")
     }
 
     pub async fn deployment(&self, id: &DeploymentId) -> DeploymentView {

@@ -28,7 +28,7 @@ impl Gatekeeper for Door {
         Box::pin(async move {
             let user = login.user_name.unwrap_or_default();
             match login.password.as_deref().ok_or(Refusal::NotAuthorised)? {
-                "operator" => Ok(Principal::Operator),
+                "operator" => Ok(Principal::Operator("alice".parse().expect("a name"))),
                 "revoked" => Err(Refusal::NotAuthorised),
                 "outage" => Err(Refusal::Unavailable),
                 "slow" => std::future::pending().await,

@@ -72,7 +72,11 @@ async fn a_package_in_use_outlives_its_manifest(database: TestDatabase) {
     let fleet = Fleet::new(database);
     let robots = fleet.enroll(1).await;
     let ordered = registry.registry.store.packages().await.expect("packages").remove(0);
-    fleet.actions.create_deployment(&random_key(), &order_of(&ordered), &ordered).await.expect("ordered");
+    fleet
+        .actions
+        .create_deployment(&fleet.operator, &random_key(), &order_of(&ordered), &ordered)
+        .await
+        .expect("ordered");
     let robot = serve(registry.registry.clone(), Some(Caller::Robot(robots[0].id.clone()))).await;
     let stranger = serve(registry.registry.clone(), Some(Caller::Robot(RobotId::random()))).await;
 

@@ -79,7 +79,7 @@ async fn an_operator_watches_a_robot_through_its_life() {
     browser
         .run("[...document.querySelectorAll('button')].find((button) => button.innerText === 'Sign out').click()")
         .await;
-    browser.wait("document.querySelector('label')?.innerText === 'Operator token'").await;
+    browser.wait("document.querySelector('label')?.innerText === 'Name'").await;
     let status = "return fetch('/api/v1/robots').then((response) => response.status)";
     assert_eq!(browser.run(status).await, json!(401));
     server.stop().await;
@@ -92,7 +92,7 @@ async fn a_wrong_token_is_refused_in_words_and_a_restarted_server_is_found_again
 
     browser.open(&server.url("/#token=tsko_wrong")).await;
     browser.wait("document.querySelector('[role=alert]')?.innerText.startsWith('token: ')").await;
-    let form = "document.querySelector('form')";
+    let form = "document.querySelector('form.by-token')";
     let sign_in = format!("{form}.elements.token.value = '{}'; {form}.requestSubmit()", server.operator.reveal());
     browser.run(&sign_in).await;
     browser.wait("document.querySelector('.stream')?.innerText.includes('Live')").await;
@@ -102,9 +102,37 @@ async fn a_wrong_token_is_refused_in_words_and_a_restarted_server_is_found_again
     browser.wait("document.querySelector('.stream')?.innerText.includes('Not live')").await;
     let server = TestServer::start_in(directory, |config| config.http.set_port(port)).await;
     // Sessions end with the server; the page finds it and asks to sign in again.
-    browser.wait("document.querySelector('label')?.innerText === 'Operator token'").await;
+    browser.wait("document.querySelector('label')?.innerText === 'Name'").await;
     browser.run(&sign_in).await;
     browser.wait("document.querySelector('.stream')?.innerText.includes('Live')").await;
+    server.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_user_signs_in_with_a_password_and_sees_their_robots() {
+    let server = TestServer::start().await;
+    server.enroll("atlas").await;
+    server.enroll("boreas").await;
+    let user = json!({ "name": "alice", "roles": ["viewer"], "scope": "atlas", "password": "correct horse battery" });
+    let added: Value = server.post("/api/v1/users", &user).await;
+    assert_eq!(added["scope"], "atlas");
+    let browser = Browser::start().await;
+    browser.open(&server.url("/")).await;
+    let sign_in = |password: &str| {
+        let form = "document.querySelector('form.by-password')";
+        format!(
+            "const form = {form}; form.elements.user.value = 'alice'; form.elements.password.value = '{password}';
+             form.requestSubmit()"
+        )
+    };
+    browser.wait("document.querySelector('form.by-password') !== null").await;
+    browser.run(&sign_in("wrong")).await;
+    browser.wait("document.querySelector('[role=alert]')?.innerText.includes('or the password is wrong')").await;
+    browser.run(&sign_in("correct horse battery")).await;
+    browser.wait("document.querySelector('.stream')?.innerText.includes('Live')").await;
+    browser.wait("document.querySelector('header.top').innerText.includes('alice')").await;
+    let names = "return [...document.querySelectorAll('[data-robot] .name')].map((name) => name.innerText)";
+    assert_eq!(browser.run(names).await, json!(["atlas"]));
     server.stop().await;
 }
 

@@ -11,6 +11,7 @@ use serde_json::{Value, json};
 use task_proto::Digest;
 use task_proto::desired::BlobRef;
 use task_proto::oci::MANIFEST_TYPE;
+use task_proto::token::{Token, TokenKind};
 use taskd::blobs::{BlobSettings, Blobs};
 use taskd::clock::Clock;
 use taskd::collector::{self, Collected};
@@ -18,6 +19,7 @@ use taskd::config::TransferLimits;
 use taskd::http::auth::Caller;
 use taskd::http::drain::drain_unread;
 use taskd::http::oci::{self, Registry};
+use taskd::person::Person;
 use taskd::store::{Store, sqlite_url};
 use taskd::transfers::Transfers;
 use tempfile::TempDir;
@@ -132,7 +134,7 @@ pub async fn let_in(
 }
 
 pub fn operator() -> Caller {
-    Caller::Operator
+    Caller::Person(Person::first(&Token::random(TokenKind::Operator)))
 }
 
 pub fn image(config: BlobRef, layer: BlobRef) -> Value {

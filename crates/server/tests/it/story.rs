@@ -42,9 +42,9 @@ async fn a_removed_robot_leaves_its_mac_and_name(database: TestDatabase) {
     let old = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("enrols");
     let mut robot = Robot::new(old.robot_id.clone());
     let deployment = fleet.deploy("1", |_| ()).await;
-    fleet.actions.remove_robot(&old.robot_id).await.expect("removed");
+    fleet.actions.remove_robot(&fleet.operator, &old.robot_id).await.expect("removed");
     assert_eq!(fleet.phases(&deployment).await, [Phase::Cancelled]);
-    assert_eq!(code(fleet.actions.remove_robot(&old.robot_id).await), "not_found");
+    assert_eq!(code(fleet.actions.remove_robot(&fleet.operator, &old.robot_id).await), "not_found");
     assert_eq!(code(fleet.actions.desired(&old.robot_id).await), "not_found");
     let report = fleet.writer.submit(robot.next_report(), 0).await;
     assert!(matches!(report, Err(ReportError::RobotNotFound(_))));
@@ -54,7 +54,7 @@ async fn a_removed_robot_leaves_its_mac_and_name(database: TestDatabase) {
     assert_ne!(new.robot_id, old.robot_id);
     // A name that a selector could take for another robot's id is refused.
     let edit = EditRobot { name: Some(old.robot_id.as_str().parse().expect("a name")), labels: None };
-    assert_eq!(code(fleet.actions.edit_robot(&new.robot_id, &edit).await), "invalid_request");
+    assert_eq!(code(fleet.actions.edit_robot(&fleet.operator, &new.robot_id, &edit).await), "invalid_request");
 }
 
 async fn an_order_reaches_all_that_match_and_settles(database: TestDatabase) {
@@ -62,7 +62,10 @@ async fn an_order_reaches_all_that_match_and_settles(database: TestDatabase) {
     let mut robots = fleet.enroll(3).await;
     let nobody = order_of(&package("1", TaskKind::Service));
     let nobody = task_proto::api::CreateDeployment { selector: "site=mars".parse().expect("valid"), ..nobody };
-    let refused = fleet.actions.create_deployment(&random_key(), &nobody, &package("1", TaskKind::Service)).await;
+    let refused = fleet
+        .actions
+        .create_deployment(&fleet.operator, &random_key(), &nobody, &package("1", TaskKind::Service))
+        .await;
     assert_eq!(code(refused), "no_robots_match");
     let id = fleet.deploy("1", |order| order.selector = "r0,r2".parse().expect("valid")).await;
     let rung: BTreeSet<_> = [robots[0].id.clone(), robots[2].id.clone()].into();
@@ -93,18 +96,23 @@ async fn an_idempotency_key_orders_once(database: TestDatabase) {
     fleet.enroll(1).await;
     let (key, package) = (random_key(), package("1", TaskKind::Service));
     let order = order_of(&package);
-    let first = fleet.actions.create_deployment(&key, &order, &package).await.expect("ordered");
-    let again = fleet.actions.create_deployment(&key, &order, &package).await.expect("the same");
+    let first = fleet.actions.create_deployment(&fleet.operator, &key, &order, &package).await.expect("ordered");
+    let again = fleet.actions.create_deployment(&fleet.operator, &key, &order, &package).await.expect("the same");
     assert_eq!(first, again);
     let other = task_proto::api::CreateDeployment { batch: Some(1), ..order };
-    let refused = fleet.actions.create_deployment(&key, &other, &package).await;
+    let refused = fleet.actions.create_deployment(&fleet.operator, &key, &other, &package).await;
     assert_eq!(code(refused), "idempotency_key_reused");
-    let before = fleet.actions.deployment_ordered_before(&key, &order_of(&package)).await.expect("reads");
+    let before =
+        fleet.actions.deployment_ordered_before(&fleet.operator, &key, &order_of(&package)).await.expect("reads");
     assert_eq!(before, Some(first));
-    let never = fleet.actions.deployment_ordered_before(&random_key(), &order_of(&package)).await.expect("reads");
+    let never = fleet
+        .actions
+        .deployment_ordered_before(&fleet.operator, &random_key(), &order_of(&package))
+        .await
+        .expect("reads");
     assert_eq!(never, None);
     let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
-    let refused = fleet.actions.order_task(&key, TaskOrder::Stop, &task, &everyone).await;
+    let refused = fleet.actions.order_task(&fleet.operator, &key, TaskOrder::Stop, &task, &everyone).await;
     assert_eq!(code(refused), "idempotency_key_reused");
     assert_eq!(fleet.database.store.deployments().await.expect("reads").len(), 1);
 }
@@ -124,8 +132,12 @@ async fn racing_operators_leave_one_winner(database: TestDatabase) {
             for (key, version) in keys.iter().zip(&versions) {
                 let actions = if retry == 0 { fleet.actions.clone() } else { rival.clone() };
                 let (key, package) = (key.clone(), package(version, TaskKind::Service));
+                let operator = fleet.operator.clone();
                 orders.spawn(async move {
-                    let id = actions.create_deployment(&key, &order_of(&package), &package).await.expect("ordered");
+                    let id = actions
+                        .create_deployment(&operator, &key, &order_of(&package), &package)
+                        .await
+                        .expect("ordered");
                     (key.to_string(), id)
                 });
             }
@@ -160,8 +172,8 @@ async fn a_newer_deployment_supersedes_and_a_cancel_puts_back(database: TestData
     assert_eq!(superseded_by, Some(new.clone()));
     fleet.follow(&mut robots[0], Phase::Fetching).await;
     fleet.changes.take_rings().await;
-    fleet.actions.cancel_deployment(&new).await.expect("cancelled");
-    fleet.actions.cancel_deployment(&new).await.expect("again is harmless");
+    fleet.actions.cancel_deployment(&fleet.operator, &new).await.expect("cancelled");
+    fleet.actions.cancel_deployment(&fleet.operator, &new).await.expect("again is harmless");
     assert_eq!(fleet.changes.take_rings().await.robots, [robots[0].id.clone()].into());
     assert_eq!(fleet.deployment(&new).await.state, DeploymentState::Cancelled);
     assert_eq!(fleet.phases(&new).await, [Phase::Cancelled]);
@@ -174,16 +186,16 @@ async fn a_newer_deployment_supersedes_and_a_cancel_puts_back(database: TestData
     assert_eq!(fleet.phases(&old).await, [Phase::Running, Phase::Running]);
     assert!(fleet.deployment(&new).await.supersedes.is_empty());
     // A service that runs has settled: there is nothing to interrupt.
-    fleet.actions.cancel_deployment(&old).await.expect("cancelled");
+    fleet.actions.cancel_deployment(&fleet.operator, &old).await.expect("cancelled");
     assert_eq!(fleet.phases(&old).await, [Phase::Running, Phase::Running]);
     assert_eq!(fleet.desired(&robots[1]).await.expect("state").tasks[0].deployment, old);
     // What runs under a cancelled deployment is put back like any other.
     let third = fleet.deploy("3", |_| ()).await;
-    fleet.actions.cancel_deployment(&third).await.expect("cancelled");
+    fleet.actions.cancel_deployment(&fleet.operator, &third).await.expect("cancelled");
     assert_eq!(fleet.desired(&robots[1]).await.expect("state").tasks[0].deployment, old);
     let unknown = task_proto::DeploymentId::random();
-    assert_eq!(code(fleet.actions.cancel_deployment(&unknown).await), "not_found");
-    assert_eq!(code(fleet.actions.resume_deployment(&old).await), "deployment_cancelled");
+    assert_eq!(code(fleet.actions.cancel_deployment(&fleet.operator, &unknown).await), "not_found");
+    assert_eq!(code(fleet.actions.resume_deployment(&fleet.operator, &old).await), "deployment_cancelled");
 }
 
 async fn a_cancel_skips_what_was_cancelled_before(database: TestDatabase) {
@@ -192,12 +204,12 @@ async fn a_cancel_skips_what_was_cancelled_before(database: TestDatabase) {
     let one = fleet.deploy("1", |_| ()).await;
     let two = fleet.deploy("2", |_| ()).await;
     let three = fleet.deploy("3", |_| ()).await;
-    fleet.actions.cancel_deployment(&two).await.expect("cancelled");
+    fleet.actions.cancel_deployment(&fleet.operator, &two).await.expect("cancelled");
     assert_eq!(fleet.desired(&robots[0]).await.expect("state").tasks[0].deployment, three);
-    fleet.actions.cancel_deployment(&three).await.expect("cancelled");
+    fleet.actions.cancel_deployment(&fleet.operator, &three).await.expect("cancelled");
     assert_eq!(fleet.desired(&robots[0]).await.expect("state").tasks[0].deployment, one);
     // Without anything to put back, the task goes.
-    fleet.actions.cancel_deployment(&one).await.expect("cancelled");
+    fleet.actions.cancel_deployment(&fleet.operator, &one).await.expect("cancelled");
     assert!(fleet.desired(&robots[0]).await.expect("state").tasks.is_empty());
 }
 
@@ -238,11 +250,11 @@ async fn batches_follow_each_other_and_failures_pause(database: TestDatabase) {
     assert_eq!(fleet.deployment(&id).await.state, DeploymentState::Paused);
     fleet.follow(&mut robots[3], Phase::Running).await;
     assert_eq!(released().await, 4);
-    fleet.actions.resume_deployment(&id).await.expect("resumed");
+    fleet.actions.resume_deployment(&fleet.operator, &id).await.expect("resumed");
     assert_eq!(released().await, 6);
     fleet.follow(&mut robots[4], Phase::Running).await;
     // A removed robot is not waited for.
-    fleet.actions.remove_robot(&robots[5].id).await.expect("removed");
+    fleet.actions.remove_robot(&fleet.operator, &robots[5].id).await.expect("removed");
     assert_eq!(fleet.deployment(&id).await.state, DeploymentState::Settled);
 
     // A newer order also takes the place of what still waits for its batch.
@@ -281,7 +293,9 @@ async fn tasks_are_stopped_started_and_removed(database: TestDatabase) {
     let mut robots = fleet.enroll(2).await;
     let id = fleet.deploy("1", |order| order.selector = "r0".parse().expect("valid")).await;
     let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
-    let order = async |order| fleet.actions.order_task(&random_key(), order, &task, &everyone).await.expect("ordered");
+    let order = async |order| {
+        fleet.actions.order_task(&fleet.operator, &random_key(), order, &task, &everyone).await.expect("ordered")
+    };
     fleet.follow(&mut robots[0], Phase::Running).await;
 
     // A start of what runs changes nothing; who has no such task is left out.
@@ -313,7 +327,7 @@ async fn tasks_are_stopped_started_and_removed(database: TestDatabase) {
     fleet.follow(&mut robots[0], Phase::Running).await;
     assert_eq!(fleet.phases(&id).await, [Phase::Stopped]);
     assert!(fleet.view(&robots[0]).await.tasks.is_empty());
-    let refused = fleet.actions.order_task(&random_key(), TaskOrder::Stop, &task, &everyone).await;
+    let refused = fleet.actions.order_task(&fleet.operator, &random_key(), TaskOrder::Stop, &task, &everyone).await;
     assert_eq!(code(refused), "no_robots_match");
 }
 
@@ -384,7 +398,7 @@ async fn a_restored_database_leaves_robots_alone_until_the_next_order(database: 
     assert_eq!(fleet.view(&robots[0]).await.generation, Generation(0));
 
     let (task, first) = ("talker".parse().expect("valid"), "r0".parse().expect("valid"));
-    fleet.actions.order_task(&random_key(), TaskOrder::Stop, &task, &first).await.expect("ordered");
+    fleet.actions.order_task(&fleet.operator, &random_key(), TaskOrder::Stop, &task, &first).await.expect("ordered");
     let desired = fleet.desired(&robots[0]).await.expect("not withheld any more");
     assert_eq!((desired.generation, desired.tasks[0].run), (Generation(4), 4));
     assert_eq!(desired.tasks[0].package, lost.tasks[0].package);
@@ -395,7 +409,7 @@ async fn a_restored_database_leaves_robots_alone_until_the_next_order(database: 
     let desired = fleet.desired(&robots[1]).await.expect("not withheld any more");
     assert_eq!((desired.generation, desired.tasks.len()), (Generation(4), 1));
     assert_eq!(desired.tasks[0].deployment, next);
-    fleet.actions.cancel_deployment(&next).await.expect("cancelled");
+    fleet.actions.cancel_deployment(&fleet.operator, &next).await.expect("cancelled");
     assert_eq!(fleet.desired(&robots[1]).await.expect("state").tasks[0].deployment, lost.tasks[0].deployment);
     assert!(fleet.view(&robots[1]).await.conditions.is_empty());
 }

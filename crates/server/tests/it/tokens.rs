@@ -5,6 +5,7 @@ use task_proto::RobotId;
 use task_proto::api::CreateEnrollmentToken;
 use task_proto::token::{Token, TokenKind};
 use taskd::actions::Enrolled;
+use taskd::person::Person;
 use taskd::report_writer::ReportError;
 use taskd::store::{Admitted, Store, TokenHolder};
 
@@ -37,7 +38,10 @@ async fn enrolment_gives_identities_by_mac(database: TestDatabase) {
     let views = fleet.database.store.robots().await.expect("reads");
     assert_eq!(views.iter().map(|view| view.name.as_str()).collect::<Vec<_>>(), ["atlas", two.name.as_str()]);
     assert!(views.iter().all(|view| view.labels.len() == 1));
-    assert_eq!(fleet.database.store.find_robot("atlas").await.expect("reads"), Some(one.robot_id.clone()));
+    assert_eq!(
+        fleet.database.store.find_robot("atlas").await.expect("reads").map(|robot| robot.id),
+        Some(one.robot_id.clone())
+    );
 
     // With a token that was made for it, a robot comes back as itself; nobody else does.
     let bound = CreateEnrollmentToken { robot: Some("atlas".to_owned()), ..Default::default() };
@@ -56,7 +60,10 @@ async fn tokens_stand_for_their_holder_until_they_end(database: TestDatabase) {
     let now_ms = fleet.clock.now_ms();
     assert_eq!(store.token_holder(&operator, now_ms).await.expect("reads"), None);
     store.create_operator_token(&operator, now_ms).await.expect("stored");
-    assert_eq!(store.token_holder(&operator, now_ms).await.expect("reads"), Some(TokenHolder::Operator));
+    assert_eq!(
+        store.token_holder(&operator, now_ms).await.expect("reads"),
+        Some(TokenHolder::Person(Person::first(&operator)))
+    );
     let enrolment = fleet.enrolment_token(CreateEnrollmentToken { ttl_s: Some(60), ..Default::default() }).await;
     assert_eq!(store.token_holder(&enrolment, now_ms).await.expect("reads"), Some(TokenHolder::Enrolment));
     fleet.clock.advance_ms(60_000);
@@ -72,11 +79,11 @@ async fn tokens_stand_for_their_holder_until_they_end(database: TestDatabase) {
     drop(write);
     for unusable in ["no robot\0", "rob\u{e9}"] {
         let order = CreateEnrollmentToken { robot: Some(unusable.to_owned()), ..Default::default() };
-        assert_eq!(code(fleet.actions.create_enrollment_token(&order).await), "not_found");
+        assert_eq!(code(fleet.actions.create_enrollment_token(&fleet.operator, &order).await), "not_found");
     }
     for ttl_s in [0, u64::MAX] {
         let order = CreateEnrollmentToken { ttl_s: Some(ttl_s), ..Default::default() };
-        assert_eq!(code(fleet.actions.create_enrollment_token(&order).await), "invalid_request");
+        assert_eq!(code(fleet.actions.create_enrollment_token(&fleet.operator, &order).await), "invalid_request");
     }
 }
 
@@ -141,7 +148,7 @@ async fn a_new_token_ends_the_old_one_when_it_is_first_used(database: TestDataba
     let stored = write.reported_robots(std::slice::from_ref(&new.robot_id)).await.expect("reads");
     assert_eq!((stored[0].last_report, stored[0].token_number), ((1, 1), later_number));
     drop(write);
-    fleet.actions.remove_robot(&new.robot_id).await.expect("removed");
+    fleet.actions.remove_robot(&fleet.operator, &new.robot_id).await.expect("removed");
     assert_eq!(admit(&later).await, None);
 }
 

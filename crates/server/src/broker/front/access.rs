@@ -1,7 +1,7 @@
 //! Who may say and hear what: pure functions of the visitor and the topic. It never looks anything up.
 
 use task_proto::topic::{RobotTopic, Topic, TopicPrefix};
-use task_proto::{Digest, RobotId};
+use task_proto::{Digest, RobotId, UserName};
 
 use crate::broker::router::CANARY_TOPIC;
 
@@ -12,7 +12,7 @@ pub(super) enum Visitor {
         robot: RobotId,
         token_number: u64,
     },
-    Operator,
+    Operator(UserName),
     /// Our own watchdog.
     Canary,
 }
@@ -46,7 +46,7 @@ pub(super) enum Hearing {
 pub(super) fn may_publish(visitor: &Visitor, prefix: &TopicPrefix, topic: &str) -> Option<Route> {
     match visitor {
         Visitor::Canary => (topic == CANARY_TOPIC).then_some(Route::Canary),
-        Visitor::Operator => None,
+        Visitor::Operator(_) => None,
         Visitor::Robot { robot, .. } => match prefix.parse(topic)? {
             Topic::Robot(owner, last) if owner == *robot => match last {
                 RobotTopic::Report | RobotTopic::Status | RobotTopic::Reply | RobotTopic::Log => {
@@ -65,7 +65,7 @@ pub(super) fn may_publish(visitor: &Visitor, prefix: &TopicPrefix, topic: &str) 
 pub(super) fn may_subscribe(visitor: &Visitor, prefix: &TopicPrefix, filter: &str) -> Option<Hearing> {
     match visitor {
         Visitor::Canary => (filter == CANARY_TOPIC).then_some(Hearing::Router),
-        Visitor::Operator => {
+        Visitor::Operator(_) => {
             filter.strip_prefix(prefix.as_str()).is_some_and(|rest| rest.starts_with('/')).then_some(Hearing::Router)
         }
         Visitor::Robot { robot, .. } => match prefix.parse(filter)? {
@@ -100,6 +100,10 @@ mod tests {
         Visitor::Robot { robot: "r00000000000000a1".parse().expect("valid"), token_number: 0 }
     }
 
+    fn operator() -> Visitor {
+        Visitor::Operator("alice".parse().expect("valid"))
+    }
+
     #[test]
     fn a_robot_speaks_on_its_own_topics_only() {
         let prefix = TopicPrefix::default();
@@ -119,7 +123,7 @@ mod tests {
         ] {
             assert_eq!(route(denied), None, "{denied}");
         }
-        assert_eq!(may_publish(&Visitor::Operator, &prefix, "taskd/v1/r/r00000000000000a1/report"), None);
+        assert_eq!(may_publish(&operator(), &prefix, "taskd/v1/r/r00000000000000a1/report"), None);
     }
 
     #[test]
@@ -150,7 +154,7 @@ mod tests {
     #[test]
     fn an_operator_hears_what_lies_below_the_prefix() {
         let prefix = TopicPrefix::default();
-        let hearing = |filter: &str| may_subscribe(&Visitor::Operator, &prefix, filter);
+        let hearing = |filter: &str| may_subscribe(&operator(), &prefix, filter);
         for allowed in ["taskd/v1/#", "taskd/v1/r/+/report", "taskd/v1/r/r00000000000000a1/status"] {
             assert_eq!(hearing(allowed), Some(Hearing::Router), "{allowed}");
         }

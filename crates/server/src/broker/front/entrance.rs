@@ -32,6 +32,20 @@ pub(super) struct Guest {
     pub(super) will: Option<Will>,
     /// What was sent after CONNECT already, without waiting for the answer.
     pub(super) input: BytesMut,
+    login: Login,
+}
+
+impl Guest {
+    /// Asks once more, now that the guest has a seat: a person whose rights ended on the way to it was not there yet to be
+    /// asked to leave. (A robot's session by a token that ended is taken over.)
+    pub(super) async fn check_again(&self, context: &Context) -> Result<(), Rejection> {
+        let Visitor::Operator(user) = &self.visitor else { return Ok(()) };
+        let asked = context.gatekeeper.admit(self.login.clone());
+        match timeout(context.limits.admit_timeout, asked).await {
+            Ok(Ok(Principal::Operator(again))) if again == *user => Ok(()),
+            _ => Err(answer(ConnectReturnCode::NotAuthorized, "credentials that have just ended")),
+        }
+    }
 }
 
 /// Why a client does not come in.
@@ -87,7 +101,13 @@ where
     if connect.client_id.is_empty() && !connect.clean_session {
         return Err(answer(ConnectReturnCode::ClientIdentifierNotValid, "an empty client id without a clean session"));
     }
-    let visitor = admit(context, &connect, peer).await?;
+    let login = Login {
+        client_id: connect.client_id.clone(),
+        user_name: connect.user_name.clone(),
+        password: connect.password.clone(),
+        peer,
+    };
+    let visitor = admit(context, &connect, login.clone()).await?;
     if let Some(will) = &connect.will
         && may_publish(&visitor, &context.prefix, &will.topic).is_none()
     {
@@ -96,15 +116,15 @@ where
     let seat_name = match &visitor {
         Visitor::Robot { robot, .. } => SeatName::Robot(robot.clone()),
         Visitor::Canary => SeatName::Canary,
-        Visitor::Operator if connect.client_id.is_empty() => SeatName::Unnamed(rand::random()),
-        Visitor::Operator => SeatName::Operator(connect.client_id),
+        Visitor::Operator(user) if connect.client_id.is_empty() => SeatName::Unnamed(user.clone(), rand::random()),
+        Visitor::Operator(user) => SeatName::Operator(user.clone(), connect.client_id.clone()),
     };
     // 3.1.2.10: one and a half times what the client promised.
     let keep_alive = match connect.keep_alive_s {
         0 => None,
         seconds => Some(Duration::from_millis(u64::from(seconds) * 1500)),
     };
-    Ok(Guest { visitor, seat_name, keep_alive, will: connect.will, input })
+    Ok(Guest { visitor, seat_name, keep_alive, will: connect.will, input, login })
 }
 
 /// A CONNACK.
@@ -148,7 +168,7 @@ async fn read_connect<S: AsyncRead + Unpin>(stream: &mut S, input: &mut BytesMut
     }
 }
 
-async fn admit(context: &Context, connect: &Connect, peer: SocketAddr) -> Result<Visitor, Rejection> {
+async fn admit(context: &Context, connect: &Connect, login: Login) -> Result<Visitor, Rejection> {
     if connect.client_id == CANARY_ID {
         let pass = connect.password.as_deref().unwrap_or_default();
         return match context.canary_pass.redeem(pass) {
@@ -158,12 +178,6 @@ async fn admit(context: &Context, connect: &Connect, peer: SocketAddr) -> Result
             }
         };
     }
-    let login = Login {
-        client_id: connect.client_id.clone(),
-        user_name: connect.user_name.clone(),
-        password: connect.password.clone(),
-        peer,
-    };
     let principal = timeout(context.limits.admit_timeout, context.gatekeeper.admit(login)).await;
     match principal.unwrap_or(Err(Refusal::Unavailable)) {
         Err(Refusal::BadCredentials) => {
@@ -173,10 +187,10 @@ async fn admit(context: &Context, connect: &Connect, peer: SocketAddr) -> Result
         Err(Refusal::Unavailable) => {
             Err(answer(ConnectReturnCode::ServiceUnavailable, "credentials that can't be checked now"))
         }
-        Ok(Principal::Operator) if connect.client_id.len() > MAX_CLIENT_ID_BYTES => {
+        Ok(Principal::Operator(_)) if connect.client_id.len() > MAX_CLIENT_ID_BYTES => {
             Err(answer(ConnectReturnCode::ClientIdentifierNotValid, "a client id that is too long"))
         }
-        Ok(Principal::Operator) => Ok(Visitor::Operator),
+        Ok(Principal::Operator(user)) => Ok(Visitor::Operator(user)),
         Ok(Principal::Robot { .. }) if connect.client_id.is_empty() => {
             Err(answer(ConnectReturnCode::ClientIdentifierNotValid, "a robot's credentials without a client id"))
         }

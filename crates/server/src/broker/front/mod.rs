@@ -21,9 +21,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
-use task_proto::RobotId;
 use task_proto::api::{MqttTraffic, Traffic};
 use task_proto::topic::TopicPrefix;
+use task_proto::{RobotId, UserName};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
@@ -110,6 +110,10 @@ impl Front {
 
     pub(super) fn disconnect(&self, robot: &RobotId) {
         self.context.seats.ask_to_leave(robot);
+    }
+
+    pub(super) fn disconnect_person(&self, user: &UserName) {
+        self.context.seats.ask_person_to_leave(user);
     }
 
     pub(super) fn traffic(&self) -> MqttTraffic {

@@ -110,9 +110,10 @@ where
 {
     let guest = welcome(context, stream, peer).await?;
     let seat = context.seats.take(guest.seat_name.clone(), meter.clone()).await;
+    guest.check_again(context).await?;
     let listening = match guest.visitor {
         Visitor::Robot { .. } => return Ok((guest, seat, None)),
-        Visitor::Operator => Listening::Everything,
+        Visitor::Operator(_) => Listening::Everything,
         Visitor::Canary => Listening::Canary,
     };
     let unavailable = |error| Rejection::Answered {

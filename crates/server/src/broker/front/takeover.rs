@@ -1,10 +1,10 @@
-//! Who has which seat: one session for each robot and each operator's client id. A newcomer takes the seat over only
+//! Who has which seat: one session for each robot, and for each of a person's client ids. A newcomer takes the seat over only
 //! after the session before it has fully ended. It never touches a socket.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use task_proto::RobotId;
+use task_proto::{RobotId, UserName};
 use tokio_util::sync::CancellationToken;
 
 use super::doorbell::Doorbell;
@@ -14,9 +14,9 @@ use super::traffic::Meter;
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(super) enum SeatName {
     Robot(RobotId),
-    Operator(String),
+    Operator(UserName, String),
     /// An operator who left the choice of a client id to us.
-    Unnamed(u128),
+    Unnamed(UserName, u128),
     Canary,
 }
 
@@ -91,6 +91,15 @@ impl Seats {
     pub(super) fn ask_to_leave(&self, robot: &RobotId) {
         if let Some(occupant) = self.table().occupants.get(&SeatName::Robot(robot.clone())) {
             occupant.leave.cancel();
+        }
+    }
+
+    /// Asks all of a person's sessions to leave.
+    pub(super) fn ask_person_to_leave(&self, person: &UserName) {
+        for (name, occupant) in &self.table().occupants {
+            if matches!(name, SeatName::Operator(user, _) | SeatName::Unnamed(user, _) if user == person) {
+                occupant.leave.cancel();
+            }
         }
     }
 

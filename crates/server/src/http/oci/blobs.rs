@@ -14,9 +14,11 @@ use task_proto::{Digest, RepositoryName, RobotId};
 
 use super::{Answer, OciError, Registry, empty};
 use crate::blobs::Blob;
+use crate::person::Person;
+use crate::store::{Act, Deed};
 use crate::transfers::Claim;
 
-/// `GET /v2/<name>/blobs/<digest>` by an operator.
+/// `GET /v2/<name>/blobs/<digest>` by a person.
 pub(super) async fn get(registry: &Registry, repository: &RepositoryName, digest: Digest, request: &Parts) -> Answer {
     if !registry.store.has_blob(Some(repository), &digest).await? {
         return Err(OciError::blob_unknown());
@@ -47,8 +49,14 @@ pub(super) async fn get_for_robot(registry: &Registry, robot: &RobotId, digest: 
 }
 
 /// `DELETE /v2/<name>/blobs/<digest>`: out of this repository; the bytes go when nothing needs them.
-pub(super) async fn delete(registry: &Registry, repository: &RepositoryName, digest: Digest) -> Answer {
-    if registry.store.unlink_blob(repository, &digest).await? {
+pub(super) async fn delete(
+    registry: &Registry,
+    by: Option<&Person>,
+    repository: &RepositoryName,
+    digest: Digest,
+) -> Answer {
+    let deed = by.map(|by| Deed::by(by, Act::BlobDelete, repository).with("digest", digest));
+    if registry.store.unlink_blob(repository, &digest, deed.as_ref(), registry.clock.now_ms()).await? {
         empty(StatusCode::ACCEPTED, [])
     } else {
         Err(OciError::blob_unknown())

@@ -34,7 +34,7 @@ impl OciError {
     }
 
     /// 403: whoever asks may not.
-    pub fn denied(message: &'static str) -> Self {
+    pub fn denied(message: impl Into<String>) -> Self {
         Self::new(StatusCode::FORBIDDEN, "DENIED", message)
     }
 

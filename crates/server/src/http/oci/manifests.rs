@@ -18,7 +18,8 @@ use super::blobs::serve;
 use super::parsed::Parsed;
 use super::{Answer, OciError, Registry, empty};
 use crate::blobs::Blob;
-use crate::store::{NewManifest, PutManifest, Reference, StoredManifest};
+use crate::person::Person;
+use crate::store::{Act, Deed, NewManifest, PutManifest, Reference, StoredManifest};
 
 /// The largest manifest; the specification asks for at least this.
 const MAX_MANIFEST_BYTES: usize = 4 * 1024 * 1024;
@@ -47,16 +48,19 @@ pub(super) async fn get(
     serve(&blob, request, content_type, HeaderValue::from_static(cache))
 }
 
-/// `PUT`: stores the exact bytes, if all they refer to is in the repository. Of a caller who may push `only` one type of
-/// artifact, no other is taken.
-pub(super) async fn put(
-    registry: &Registry,
-    repository: &RepositoryName,
-    reference: Reference,
-    parts: &Parts,
-    body: Body,
-    only: Option<&str>,
-) -> Answer {
+/// What is pushed where, and by whom.
+pub(super) struct Push<'a> {
+    pub(super) repository: &'a RepositoryName,
+    pub(super) reference: Reference,
+    /// `None`: by a robot.
+    pub(super) by: Option<&'a Person>,
+    /// The only type of artifact that is taken.
+    pub(super) only: Option<&'static str>,
+}
+
+/// `PUT`: stores the exact bytes, if all they refer to is in the repository.
+pub(super) async fn put(registry: &Registry, push: Push<'_>, parts: &Parts, body: Body) -> Answer {
+    let Push { repository, reference, by, only } = push;
     let bytes = read_body(body).await?;
     let digest = Digest::of(&bytes);
     let tags = tags_to_set(parts, &reference)?;
@@ -100,27 +104,43 @@ pub(super) async fn put(
         package,
         output,
     };
-    match registry.store.put_manifest(repository, &new, now_ms).await? {
+    let deed = by.map(|by| pushed(by, repository, &new));
+    match registry.store.put_manifest(repository, &new, deed.as_ref(), now_ms).await? {
         PutManifest::PartsMissing(missing) => Err(OciError::parts_unknown(&missing)),
         PutManifest::Stored => created(repository, &digest, subject, parts, &new.tags),
     }
 }
 
+/// The push of a manifest, as the audit tells of it.
+fn pushed(by: &Person, repository: &RepositoryName, new: &NewManifest) -> Deed {
+    let tags: Vec<&str> = new.tags.iter().map(Tag::as_str).collect();
+    let deed = Deed::by(by, Act::ManifestPush, repository).with("manifest", new.manifest.digest);
+    deed.with("tags", tags.join(",")).with_some("type", new.artifact_type.as_ref())
+}
+
 /// `DELETE`: a tag alone, or a manifest with all its tags.
-pub(super) async fn delete(registry: &Registry, repository: &RepositoryName, reference: Reference) -> Answer {
+pub(super) async fn delete(
+    registry: &Registry,
+    by: Option<&Person>,
+    repository: &RepositoryName,
+    reference: Reference,
+) -> Answer {
+    let now_ms = registry.clock.now_ms();
     match reference {
         Reference::Tag(tag) => {
-            if !registry.store.delete_tag(repository, &tag).await? {
+            let deed = by.map(|by| Deed::by(by, Act::TagDelete, repository).with("tag", &tag));
+            if !registry.store.delete_tag(repository, &tag, deed.as_ref(), now_ms).await? {
                 return Err(OciError::manifest_unknown());
             }
         }
         Reference::Digest(digest) => {
             let _hold = registry.blobs.hold_collection().await;
-            let parts = registry.store.delete_manifest(repository, &digest).await?;
+            let deed = by.map(|by| Deed::by(by, Act::ManifestDelete, repository).with("manifest", digest));
+            let parts = registry.store.delete_manifest(repository, &digest, deed.as_ref(), now_ms).await?;
             let parts = parts.ok_or_else(OciError::manifest_unknown)?;
             // An order that looked the package up a moment ago still finds its bytes: they stay for a while.
             for blob in parts.into_iter().chain([digest]) {
-                registry.blobs.touch(blob, registry.clock.now_ms()).await?;
+                registry.blobs.touch(blob, now_ms).await?;
             }
         }
     }

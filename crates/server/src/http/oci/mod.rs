@@ -1,5 +1,5 @@
-//! The registry: the OCI distribution API v1.1, pull and push, under `/v2/`. Operators may do everything, a robot reads the
-//! blobs of the packages it should have and pushes outputs into its own repositories. What a repository holds is the store's, the bytes are the blob store's.
+//! The registry: the OCI distribution API v1.1, pull and push, under `/v2/`. People pull and push as their roles allow, a
+//! robot reads the blobs of the packages it should have and pushes outputs into its own repositories. What a repository holds is the store's, the bytes are the blob store's.
 
 mod blobs;
 mod error;
@@ -13,6 +13,7 @@ use axum::response::{IntoResponse, Response};
 use http::{HeaderMap, HeaderValue, Method, StatusCode, Uri};
 use serde::de::DeserializeOwned;
 use task_proto::output::{self, OUTPUT_TYPE};
+use task_proto::person::Permission;
 use task_proto::{Digest, RepositoryName, RobotId};
 
 pub use error::OciError;
@@ -20,6 +21,7 @@ pub use error::OciError;
 use super::auth::Caller;
 use crate::blobs::Blobs;
 use crate::clock::Clock;
+use crate::person::Person;
 use crate::store::{Reference, Store};
 use crate::transfers::Transfers;
 
@@ -71,7 +73,7 @@ fn endpoint(path: &str) -> Option<(&str, Endpoint<'_>)> {
 /// `GET /v2/`: tells that this is a registry, and whether the caller's token is good.
 pub async fn version(request: Request) -> Answer {
     match request.extensions().get::<Caller>() {
-        Some(Caller::Operator | Caller::Robot(_)) => {}
+        Some(Caller::Person(_) | Caller::Robot(_)) => {}
         _ => return Err(OciError::unauthorized()),
     }
     if !matches!(*request.method(), Method::GET | Method::HEAD) {
@@ -88,12 +90,15 @@ pub async fn dispatch(State(registry): State<Registry>, Path(path): Path<String>
     let (parts, body) = request.into_parts();
     let caller = parts.extensions.get::<Caller>().cloned();
     let (name, endpoint) = match &caller {
-        Some(Caller::Operator | Caller::Robot(_)) => endpoint(&path).ok_or_else(OciError::no_endpoint)?,
+        Some(Caller::Person(_) | Caller::Robot(_)) => endpoint(&path).ok_or_else(OciError::no_endpoint)?,
         _ => return Err(OciError::unauthorized()),
     };
     let repository: RepositoryName = name.parse().map_err(|error| OciError::name_invalid(&error))?;
     let method = parts.method.clone();
-    let robot = caller.as_ref().and_then(Caller::robot);
+    let (robot, person) = (caller.as_ref().and_then(Caller::robot), caller.as_ref().and_then(Caller::person));
+    if let Some(person) = person {
+        check_person(&registry, person, &repository, &method, &endpoint).await?;
+    }
     if let Some(robot) = robot
         && !may_push(robot, &repository, &method, &endpoint)
     {
@@ -110,12 +115,13 @@ pub async fn dispatch(State(registry): State<Registry>, Path(path): Path<String>
             match method {
                 Method::GET => blobs::get(&registry, &repository, digest, &parts).await,
                 Method::HEAD => blobs::head(&registry, &repository, digest, &parts).await,
-                Method::DELETE => blobs::delete(&registry, &repository, digest).await,
+                Method::DELETE => blobs::delete(&registry, person, &repository, digest).await,
                 _ => Err(OciError::method("GET, HEAD, DELETE")),
             }
         }
         Endpoint::Uploads if method == Method::POST => {
-            let may_mount = robot.is_none();
+            // A blob can be mounted from any repository, also from one that is none of the caller's business.
+            let may_mount = person.is_some_and(|person| person.scope.is_everything());
             uploads::begin(&registry, &repository, &parts, body, may_mount).await
         }
         Endpoint::Uploads => Err(OciError::method("POST")),
@@ -136,15 +142,55 @@ pub async fn dispatch(State(registry): State<Registry>, Path(path): Path<String>
                 Method::GET | Method::HEAD => manifests::get(&registry, &repository, reference, &parts).await,
                 Method::PUT => {
                     let only = robot.map(|_| OUTPUT_TYPE);
-                    manifests::put(&registry, &repository, reference?, &parts, body, only).await
+                    let push = manifests::Push { repository: &repository, reference: reference?, by: person, only };
+                    manifests::put(&registry, push, &parts, body).await
                 }
-                Method::DELETE => manifests::delete(&registry, &repository, reference?).await,
+                Method::DELETE => manifests::delete(&registry, person, &repository, reference?).await,
                 _ => Err(OciError::method("GET, HEAD, PUT, DELETE")),
             }
         }
         Endpoint::Tags | Endpoint::Referrers(_) if method != Method::GET => Err(OciError::method("GET")),
         Endpoint::Tags => lists::tags(&registry, &repository, &parts).await,
         Endpoint::Referrers(subject) => lists::referrers(&registry, &repository, subject, &parts).await,
+    }
+}
+
+/// Refuses what the person has no permission to, and other people's robots' outputs.
+async fn check_person(
+    registry: &Registry,
+    person: &Person,
+    repository: &RepositoryName,
+    method: &Method,
+    endpoint: &Endpoint<'_>,
+) -> Result<(), OciError> {
+    let permission = needed(repository, method, endpoint);
+    if !person.may(permission) {
+        let (name, roles) = (&person.name, &person.roles);
+        return Err(OciError::denied(format!("{name} has no permission to {permission} here (roles: {roles})")));
+    }
+    if person.scope.is_everything() {
+        return Ok(());
+    }
+    let Some((robot, _)) = output::owner(repository) else { return Ok(()) };
+    let robot = registry.store.find_robot(robot.as_str()).await?;
+    if robot.is_some_and(|robot| person.scope.covers(&robot.id, &robot.name, &robot.labels)) {
+        return Ok(());
+    }
+    let (name, scope) = (&person.name, person.scope.to_string());
+    Err(OciError::denied(format!("{repository} is outside of {name}'s scope {scope:?}")))
+}
+
+/// What a person needs for this. Outputs are the robots': one may be ended like the task it came from, and only who may do
+/// everything pushes in a robot's name.
+fn needed(repository: &RepositoryName, method: &Method, endpoint: &Endpoint<'_>) -> Permission {
+    let is_output = repository.as_str().starts_with("outputs/");
+    match (method, endpoint) {
+        (&Method::GET | &Method::HEAD, endpoint) if !matches!(endpoint, Endpoint::Uploads | Endpoint::Upload(_)) => {
+            Permission::Read
+        }
+        (&Method::DELETE, Endpoint::Manifest(_)) if is_output => Permission::Operate,
+        _ if is_output => Permission::Administer,
+        _ => Permission::Publish,
     }
 }
 

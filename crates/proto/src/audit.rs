@@ -1,0 +1,163 @@
+//! The audit: who did what to what, from where. Entries are numbered from 1 and chained: the digest of each covers its own
+//! text and the digest before it, so whoever changes, drops or inserts one has to change all that follow. It says what an
+//! entry is and whether a chain holds; where entries are kept is the server's.
+
+use std::collections::BTreeMap;
+use std::net::IpAddr;
+
+use serde::{Deserialize, Serialize};
+use serde_json::value::RawValue;
+
+use crate::{Digest, TokenId};
+
+/// One act, as it is written down. Its JSON, byte for byte, is what the chain covers.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct AuditEntry {
+    /// 1 for the first; each next one is one higher.
+    pub number: u64,
+    /// When, by the server's clock.
+    pub at_ms: u64,
+    /// Who: a user's name, `operator.token` for the first token, or `enrolment` for a machine that enrols.
+    pub who: String,
+    /// By which token.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub token: Option<TokenId>,
+    /// From where.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub address: Option<IpAddr>,
+    /// What was done, like `deployment.create`.
+    pub act: String,
+    /// To what: an id or a name.
+    pub target: String,
+    /// What else there is to know, by key.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub detail: BTreeMap<String, String>,
+}
+
+/// An entry with its place in the chain. Also a line of an export.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct AuditRecord {
+    /// The SHA-256 of the digest before it, as text, and of the entry's bytes.
+    pub digest: Digest,
+    /// An [`AuditEntry`], byte for byte as it was chained.
+    pub entry: Box<RawValue>,
+}
+
+impl AuditRecord {
+    /// What it says. One that a newer server wrote may say more.
+    pub fn read(&self) -> Option<AuditEntry> {
+        serde_json::from_str(self.entry.get()).ok()
+    }
+}
+
+/// How far a chain goes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Link {
+    /// The last entry's number; 0 before the first.
+    pub number: u64,
+    /// The last entry's digest.
+    pub digest: Digest,
+}
+
+impl Link {
+    /// Where every chain begins.
+    pub const START: Self = Self { number: 0, digest: Digest::from_bytes([0; 32]) };
+
+    /// The link that an entry with this text makes after this one.
+    pub fn next(&self, entry: &str) -> Self {
+        let digest = Digest::of(format!("{}\n{entry}", self.digest).as_bytes());
+        Self { number: self.number + 1, digest }
+    }
+
+    /// Goes one record on; an error if that is not the one that belongs here.
+    pub fn follow(self, record: &AuditRecord) -> Result<Self, BrokenChain> {
+        let next = self.next(record.entry.get());
+        let Some(entry) = record.read() else { return Err(BrokenChain::Unreadable { number: next.number }) };
+        if entry.number != next.number {
+            return Err(BrokenChain::Missing { expected: next.number, found: entry.number });
+        }
+        if record.digest == next.digest { Ok(next) } else { Err(BrokenChain::Changed { number: next.number }) }
+    }
+}
+
+/// Where a chain does not hold.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum BrokenChain {
+    /// There is a gap, or the order is another.
+    #[error("entry {expected} is missing: entry {found} is in its place")]
+    Missing {
+        /// The number that should be here.
+        expected: u64,
+        /// The number that is.
+        found: u64,
+    },
+    /// An entry is not what it was, or the ones before it are not.
+    #[error("entry {number} does not fit what is before it: it, or something before it, was changed")]
+    Changed {
+        /// Which.
+        number: u64,
+    },
+    /// It is no entry.
+    #[error("entry {number} can't be read")]
+    Unreadable {
+        /// Which.
+        number: u64,
+    },
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn entry(number: u64) -> AuditEntry {
+        let (who, act) = ("alice".to_owned(), "robot.edit".to_owned());
+        let target = format!("r{number}");
+        AuditEntry { number, at_ms: 5, who, token: None, address: None, act, target, detail: BTreeMap::new() }
+    }
+
+    fn chain(entries: impl IntoIterator<Item = AuditEntry>) -> Vec<AuditRecord> {
+        let mut link = Link::START;
+        let record = |entry: AuditEntry| {
+            let text = serde_json::to_string(&entry).expect("json");
+            link = link.next(&text);
+            AuditRecord { digest: link.digest, entry: RawValue::from_string(text).expect("json") }
+        };
+        entries.into_iter().map(record).collect()
+    }
+
+    fn verified(records: &[AuditRecord]) -> Result<Link, BrokenChain> {
+        records.iter().try_fold(Link::START, Link::follow)
+    }
+
+    #[test]
+    fn a_chain_holds_and_survives_an_export() {
+        let records = chain((1..=4).map(entry));
+        let last = verified(&records).expect("holds");
+        assert_eq!((last.number, last.digest), (4, records[3].digest));
+        let lines: Vec<String> = records.iter().map(|record| serde_json::to_string(record).expect("json")).collect();
+        let read: Vec<AuditRecord> = lines.iter().map(|line| serde_json::from_str(line).expect("a record")).collect();
+        assert_eq!(verified(&read), Ok(last));
+    }
+
+    #[test]
+    fn whatever_is_changed_dropped_or_moved_breaks_it() {
+        let records = chain((1..=4).map(entry));
+        let mut changed = records.clone();
+        let text = changed[1].entry.get().replace("alice", "mallo");
+        changed[1].entry = RawValue::from_string(text).expect("json");
+        assert_eq!(verified(&changed), Err(BrokenChain::Changed { number: 2 }));
+        // Whoever chains the changed one anew breaks the next.
+        let forged = Link::START.follow(&records[0]).expect("holds").next(changed[1].entry.get());
+        changed[1].digest = forged.digest;
+        assert_eq!(verified(&changed), Err(BrokenChain::Changed { number: 3 }));
+        let mut dropped = records.clone();
+        dropped.remove(1);
+        assert_eq!(verified(&dropped), Err(BrokenChain::Missing { expected: 2, found: 3 }));
+        let mut moved = records.clone();
+        moved.swap(1, 2);
+        assert_eq!(verified(&moved), Err(BrokenChain::Missing { expected: 2, found: 3 }));
+        let mut unreadable = records;
+        unreadable[3].entry = RawValue::from_string("{}".to_owned()).expect("json");
+        assert_eq!(verified(&unreadable), Err(BrokenChain::Unreadable { number: 4 }));
+    }
+}

@@ -1,0 +1,144 @@
+//! `taskd user`: who may use the server, and what each may do.
+
+use clap::{Args, Subcommand};
+use task_proto::UserName;
+use task_proto::api::{AddUser, ChangePassword, EditUser, Me, SetPassword, UserList, UserView};
+use task_proto::person::Roles;
+use task_proto::selector::Selector;
+
+use super::confirm::always;
+use super::output::{say, time};
+use super::password::{self, Secret};
+use super::{CommandError, Outcome, Session};
+
+/// What to do with users.
+#[derive(Debug, Subcommand)]
+pub enum Action {
+    /// Add a user
+    Add {
+        /// What they sign in with
+        name: UserName,
+        /// What they may do: viewer, operator, publisher, admin, or several joined by commas
+        #[arg(long, value_name = "ROLES")]
+        role: Roles,
+        /// Only robots that this selector means, like site=lab
+        #[arg(long, value_name = "SELECTOR")]
+        robots: Option<Selector>,
+        /// Without a password: only with tokens that an administrator makes for them
+        #[arg(long, conflicts_with = "password_stdin")]
+        no_password: bool,
+        #[command(flatten)]
+        from: PasswordFrom,
+    },
+    /// List users
+    List,
+    /// Change what a user may do
+    Edit {
+        /// Who
+        name: UserName,
+        /// The roles they have from now on
+        #[arg(long, value_name = "ROLES")]
+        role: Option<Roles>,
+        /// The robots they are limited to from now on; '*' for no limit
+        #[arg(long, value_name = "SELECTOR")]
+        robots: Option<Selector>,
+    },
+    /// Remove a user; their tokens end now
+    Remove {
+        /// Who
+        name: UserName,
+        /// Don't ask
+        #[arg(short, long)]
+        yes: bool,
+    },
+    /// Set a password: one's own, or with a name anybody's
+    Passwd {
+        /// Whose; absent: one's own, which takes the old one
+        name: Option<UserName>,
+        #[command(flatten)]
+        from: PasswordFrom,
+    },
+}
+
+/// Where a password is read. It is never an argument, which others could read.
+#[derive(Debug, Clone, Copy, Args)]
+pub struct PasswordFrom {
+    /// Read the password from standard input, a line each (for one's own: the old one, then the new one)
+    #[arg(long)]
+    pub password_stdin: bool,
+}
+
+pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, CommandError> {
+    let client = &session.client;
+    match action {
+        Action::Add { name, role, robots, no_password, from } => {
+            let password = match no_password {
+                true => None,
+                false => Some(password::new_one(from.password_stdin, &format!("password of {name}"))?.reveal()),
+            };
+            let order = AddUser { name, roles: role, scope: robots, password };
+            let view: UserView = client.once("/users", &order).await?;
+            show(session, &UserList { users: vec![view] })?;
+        }
+        Action::List => show(session, &client.get("/users", &[]).await?)?,
+        Action::Edit { name, role, robots } => {
+            if role.is_none() && robots.is_none() {
+                return Err(CommandError::Usage("give --role or --robots".to_owned()));
+            }
+            let order = EditUser { roles: role, scope: robots };
+            let view: UserView = client.change(&format!("/users/{name}"), &order).await?;
+            show(session, &UserList { users: vec![view] })?;
+        }
+        Action::Remove { name, yes } => {
+            always(&format!("remove the user {name}"), yes)?;
+            client.delete(&format!("/users/{name}")).await?;
+            say(&format!("removed {name}; their tokens have ended"));
+        }
+        Action::Passwd { name: Some(name), from } => {
+            let password = password::new_one(from.password_stdin, &format!("new password of {name}"))?.reveal();
+            client.put(&format!("/users/{name}/password"), &SetPassword { password }).await?;
+            say(&format!("set; what {name} was signed in to is signed out"));
+        }
+        Action::Passwd { name: None, from } => {
+            let me: Me = client.get("/me", &[]).await?;
+            let old =
+                password::ask(from.password_stdin, &format!("old password of {}", me.name)).map(Secret::reveal)?;
+            let new = password::new_one(from.password_stdin, "new password")?.reveal();
+            client.put("/password", &ChangePassword { old, new }).await?;
+            say("set; you are signed out everywhere else");
+        }
+    }
+    Ok(Outcome::Succeeded)
+}
+
+/// `taskd whoami`: whom the token stands for, and what it allows.
+pub(super) async fn who_am_i(session: &Session) -> Result<Outcome, CommandError> {
+    let me: Me = session.client.get("/me", &[]).await?;
+    session.output.described(&me, |me| {
+        let permissions: Vec<&str> = me.permissions.iter().map(|permission| permission.as_str()).collect();
+        let scope: Vec<String> = me.scope.iter().map(Selector::to_string).collect();
+        let facts = [
+            ("name", me.name.to_string()),
+            ("roles", me.roles.to_string()),
+            ("may", permissions.join(", ")),
+            ("robots", if scope.is_empty() { "*".to_owned() } else { scope.join(" and ") }),
+            ("token", me.token.to_string()),
+        ];
+        facts.iter().map(|(key, value)| format!("{key:<12}{value}\n")).collect()
+    })?;
+    Ok(Outcome::Succeeded)
+}
+
+fn show(session: &Session, list: &UserList) -> Result<(), CommandError> {
+    let row = |user: &UserView| {
+        vec![
+            user.name.to_string(),
+            user.roles.to_string(),
+            user.scope.as_ref().map_or_else(|| "*".to_owned(), Selector::to_string),
+            if user.has_password { "yes" } else { "no" }.to_owned(),
+            time(user.created_at_ms),
+        ]
+    };
+    let header = ["name", "roles", "robots", "password", "added"];
+    session.output.result(list, &header, |list| list.users.iter().map(row).collect())
+}

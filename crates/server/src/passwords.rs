@@ -1,0 +1,223 @@
+//! Passwords: which are good enough, how they are hashed and checked. Hashing is meant to be slow, so it happens off the
+//! async threads, few at a time, with a rest as long as the work, and a flood of sign-ins is turned away instead of waiting.
+//! It never sees who the password belongs to.
+
+use std::sync::Arc;
+
+use argon2::{Argon2, PasswordHasher as _, PasswordVerifier as _};
+use task_proto::UserName;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::time::Instant;
+
+/// How many wait for their turn; one more is turned away.
+const MOST_WAITING: usize = 32;
+/// The shortest password, in characters.
+const SHORTEST: usize = 12;
+/// The longest, in bytes.
+const LONGEST: usize = 1024;
+
+/// What is kept of a password: an argon2id hash in PHC form, with its own salt and costs.
+#[derive(Clone, PartialEq, Eq)]
+pub struct PasswordHash(String);
+
+impl PasswordHash {
+    /// As it is stored.
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+
+    /// As it was stored.
+    pub fn stored(text: String) -> Self {
+        Self(text)
+    }
+}
+
+impl std::fmt::Debug for PasswordHash {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("PasswordHash(…)")
+    }
+}
+
+/// Why a password was not hashed or checked.
+#[derive(Debug, thiserror::Error)]
+pub enum PasswordError {
+    /// It is too easy to guess, or too long.
+    #[error("{0}")]
+    Unfit(String),
+    /// Too many are under way.
+    #[error("too many sign-ins at once")]
+    Busy,
+    /// The hash can't be made, or what is stored is none.
+    #[error("a password could not be hashed")]
+    Failed,
+}
+
+/// Hashes and checks. Clones share the same turns.
+#[derive(Debug, Clone)]
+pub struct Passwords {
+    turns: Arc<Semaphore>,
+    places: Arc<Semaphore>,
+}
+
+impl Default for Passwords {
+    fn default() -> Self {
+        // A quarter of the cores, and half of each at that.
+        let cores = std::thread::available_parallelism().map_or(1, usize::from);
+        let at_once = (cores / 4).clamp(1, 4);
+        let places = Arc::new(Semaphore::new(at_once + MOST_WAITING));
+        Self { turns: Arc::new(Semaphore::new(at_once)), places }
+    }
+}
+
+impl Passwords {
+    /// The hash of a new password of `user`.
+    pub async fn hash(&self, user: &UserName, password: &str) -> Result<PasswordHash, PasswordError> {
+        check(user, password)?;
+        let password = password.to_owned();
+        self.work(move || hashed(&password)).await?
+    }
+
+    /// Whether `password` is the one that was hashed. Without a hash it takes as long, and is not.
+    pub async fn verify(&self, password: &str, hash: Option<&PasswordHash>) -> Result<bool, PasswordError> {
+        if password.len() > LONGEST {
+            return Ok(false);
+        }
+        let (password, hash) = (password.to_owned(), hash.cloned());
+        self.work(move || match hash {
+            Some(hash) => match Argon2::default().verify_password(password.as_bytes(), hash.as_str()) {
+                Ok(()) => Ok(true),
+                Err(argon2::password_hash::Error::PasswordInvalid) => Ok(false),
+                Err(_) => Err(PasswordError::Failed),
+            },
+            None => hashed(&password).map(|_| false),
+        })
+        .await?
+    }
+
+    async fn work<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> Result<T, PasswordError> {
+        let place = self.places.clone().try_acquire_owned().map_err(|_| PasswordError::Busy)?;
+        let turn = self.turns.clone().acquire_owned().await.map_err(|_| PasswordError::Busy)?;
+        let begun = Instant::now();
+        // The work goes on if the caller goes away, so its turn must as well.
+        let working = tokio::spawn(async move {
+            let done = tokio::task::spawn_blocking(work).await;
+            tokio::spawn(rest(begun, turn, place));
+            done
+        });
+        match working.await {
+            Ok(Ok(done)) => Ok(done),
+            Ok(Err(_)) | Err(_) => Err(PasswordError::Failed),
+        }
+    }
+}
+
+/// Keeps the turn for as long again as the work took.
+async fn rest(begun: Instant, turn: OwnedSemaphorePermit, place: OwnedSemaphorePermit) {
+    tokio::time::sleep(begun.elapsed()).await;
+    drop((turn, place));
+}
+
+fn hashed(password: &str) -> Result<PasswordHash, PasswordError> {
+    let salt: [u8; 16] = rand::random();
+    let hash = Argon2::default().hash_password_with_salt(password.as_bytes(), &salt);
+    hash.map(|hash: argon2::PasswordHash| PasswordHash(hash.to_string())).map_err(|_| PasswordError::Failed)
+}
+
+/// Long is all that a password has to be, as NIST SP 800-63B has it, and not what anyone would try first.
+fn check(user: &UserName, password: &str) -> Result<(), PasswordError> {
+    let unfit = |reason: &str| Err(PasswordError::Unfit(reason.to_owned()));
+    if password.chars().count() < SHORTEST {
+        return Err(PasswordError::Unfit(format!("it needs at least {SHORTEST} characters")));
+    }
+    if password.len() > LONGEST {
+        return Err(PasswordError::Unfit(format!("it may have at most {LONGEST} bytes")));
+    }
+    let lower = password.to_lowercase();
+    if lower.replace(user.as_str(), "").chars().count() < SHORTEST / 2 {
+        return unfit("it is little more than the user's name");
+    }
+    let mut different: Vec<char> = lower.chars().collect();
+    different.sort_unstable();
+    different.dedup();
+    if different.len() < 5 {
+        return unfit("it has too few different characters");
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn alice() -> UserName {
+        "alice".parse().expect("a name")
+    }
+
+    #[tokio::test]
+    async fn a_password_is_known_again_and_no_other_is() {
+        let passwords = Passwords::default();
+        let hash = passwords.hash(&alice(), "correct horse battery").await.expect("hashed");
+        assert!(hash.as_str().starts_with("$argon2id$v=19$m=19456,t=2,p=1$"), "{}", hash.as_str());
+        assert!(!format!("{hash:?}").contains("argon2"));
+        assert!(passwords.verify("correct horse battery", Some(&hash)).await.expect("checked"));
+        for wrong in ["correct horse batterz", "", "Correct horse battery", &"x".repeat(LONGEST + 1)] {
+            assert!(!passwords.verify(wrong, Some(&hash)).await.expect("checked"), "{wrong:?}");
+        }
+        assert!(!passwords.verify("correct horse battery", None).await.expect("checked"));
+        let nonsense = PasswordHash::stored("nonsense".to_owned());
+        assert!(matches!(passwords.verify("correct horse battery", Some(&nonsense)).await, Err(PasswordError::Failed)));
+        let again = passwords.hash(&alice(), "correct horse battery").await.expect("hashed");
+        assert_ne!(again, hash, "each has its own salt");
+    }
+
+    #[test]
+    fn what_anyone_would_try_is_refused() {
+        for bad in ["short", "elevenchars", "aliceAlice12", "aaaaaaaaaaaaaaa", "abababababab", &"x1y2z3".repeat(200)] {
+            assert!(matches!(check(&alice(), bad), Err(PasswordError::Unfit(_))), "{bad:?}");
+        }
+        for good in ["correct horse battery", "twelve chars", "pässwörter sind", "alice in chains live"] {
+            assert!(check(&alice(), good).is_ok(), "{good:?}");
+        }
+    }
+
+    #[tokio::test]
+    async fn a_flood_is_turned_away_and_the_rest_gets_its_turn() {
+        let passwords = Passwords::default();
+        let places = passwords.places.available_permits();
+        let mut flood = tokio::task::JoinSet::new();
+        // What is being checked is not let go before all have come.
+        let gate = Arc::new(std::sync::Barrier::new(2));
+        let held = passwords.turns.available_permits();
+        for _ in 0..held {
+            let (passwords, gate) = (passwords.clone(), gate.clone());
+            flood.spawn(async move {
+                passwords
+                    .work(move || {
+                        gate.wait();
+                    })
+                    .await
+                    .is_ok()
+            });
+        }
+        while passwords.turns.available_permits() > 0 {
+            tokio::task::yield_now().await;
+        }
+        for _ in held..places {
+            let passwords = passwords.clone();
+            flood.spawn(async move { passwords.work(|| ()).await.is_ok() });
+        }
+        while passwords.places.available_permits() > 0 {
+            tokio::task::yield_now().await;
+        }
+        assert!(matches!(passwords.verify("correct horse battery", None).await, Err(PasswordError::Busy)));
+        for _ in 0..held {
+            let gate = gate.clone();
+            tokio::task::spawn_blocking(move || {
+                gate.wait();
+            })
+            .await
+            .expect("let go");
+        }
+        assert!(flood.join_all().await.into_iter().all(|is_done| is_done));
+    }
+}

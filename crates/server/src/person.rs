@@ -1,0 +1,134 @@
+//! A person who asks: who they are, what they may, which robots are theirs, and from where they ask. Values only; who has
+//! which token is the store's to say.
+
+use std::fmt;
+use std::net::IpAddr;
+
+use task_proto::api::TokenOrigin;
+use task_proto::id::Labels;
+use task_proto::person::{Permission, Role, Roles};
+use task_proto::selector::Selector;
+use task_proto::token::Token;
+use task_proto::{RobotId, RobotName, TokenId, UserName};
+
+/// The name that stands for whoever holds the first token, the one in the data directory. No user has it.
+const FIRST: &str = "operator.token";
+
+/// Who asks.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Person {
+    /// The user's name.
+    pub name: UserName,
+    /// What the token they came with allows.
+    pub roles: Roles,
+    /// Which robots are theirs.
+    pub scope: Scope,
+    /// The token they came with.
+    pub token: TokenId,
+    /// Where that token came from.
+    pub origin: TokenOrigin,
+    /// From where they ask; only known once they have come.
+    pub address: Option<IpAddr>,
+}
+
+impl Person {
+    /// Whoever holds `token`, the first one: an administrator of everything.
+    pub fn first(token: &Token) -> Self {
+        let token = token.id().parse().expect("a token's id has its form");
+        let (roles, scope, origin) = (Roles::one(Role::Admin), Scope::everything(), TokenOrigin::First);
+        Self { name: first_name(), roles, scope, token, origin, address: None }
+    }
+
+    /// Whether this is whoever holds the first token, and no user.
+    pub fn is_first(&self) -> bool {
+        self.name.as_str() == FIRST
+    }
+
+    /// Whether this is the same person by the same token with the same rights, wherever they are.
+    pub fn has_the_rights_of(&self, other: &Self) -> bool {
+        let Self { name, roles, scope, token, origin, address: _ } = self;
+        (name, roles, scope, token, origin) == (&other.name, &other.roles, &other.scope, &other.token, &other.origin)
+    }
+
+    /// Whether they may. What concerns everybody is not for who is limited to some robots.
+    pub fn may(&self, permission: Permission) -> bool {
+        self.roles.allow(permission) && (permission != Permission::Administer || self.scope.is_everything())
+    }
+}
+
+/// The name of whoever holds the first token.
+pub fn first_name() -> UserName {
+    FIRST.parse().expect("it has the form of a name")
+}
+
+/// Which robots are someone's: those that every selector means, so all of them if there is none.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Scope(Vec<Selector>);
+
+impl Scope {
+    /// Every robot.
+    pub fn everything() -> Self {
+        Self::default()
+    }
+
+    /// The robots that all of these mean.
+    pub fn of(selectors: impl IntoIterator<Item = Selector>) -> Self {
+        Self(selectors.into_iter().collect())
+    }
+
+    /// Whether it has no limit.
+    pub fn is_everything(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    /// Whether this robot is in it.
+    pub fn covers(&self, id: &RobotId, name: &RobotName, labels: &Labels) -> bool {
+        self.0.iter().all(|selector| selector.matches(id, name, labels))
+    }
+
+    /// What it is made of.
+    pub fn selectors(&self) -> &[Selector] {
+        &self.0
+    }
+}
+
+impl fmt::Display for Scope {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if self.is_everything() {
+            return f.write_str("*");
+        }
+        for (i, selector) in self.0.iter().enumerate() {
+            write!(f, "{}{selector}", if i > 0 { " and " } else { "" })?;
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use task_proto::token::TokenKind;
+
+    use super::*;
+
+    fn selector(text: &str) -> Selector {
+        text.parse().expect("a selector")
+    }
+
+    #[test]
+    fn what_concerns_everybody_is_not_for_who_is_limited() {
+        let mut person = Person::first(&Token::random(TokenKind::Operator));
+        assert!(person.is_first() && Permission::ALL.into_iter().all(|permission| person.may(permission)));
+        person.scope = Scope::of([selector("site=lab")]);
+        assert!(person.may(Permission::Maintain) && !person.may(Permission::Administer));
+    }
+
+    #[test]
+    fn a_robot_is_in_a_scope_if_all_of_it_mean_it() {
+        let (id, name) = (RobotId::random(), "atlas".parse().expect("a name"));
+        let labels: Labels = [("site".parse().expect("a key"), "lab".parse().expect("a value"))].into();
+        let covers = |texts: &[&str]| Scope::of(texts.iter().map(|text| selector(text))).covers(&id, &name, &labels);
+        assert!(covers(&[]) && covers(&["*"]) && covers(&["site=lab"]) && covers(&["site=lab", "atlas"]));
+        assert!(!covers(&["site=field"]) && !covers(&["site=lab", "boreas"]));
+        assert_eq!(Scope::of([selector("site=lab"), selector("a,b")]).to_string(), "site=lab and a,b");
+    }
+}

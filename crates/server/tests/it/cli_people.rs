@@ -1,0 +1,134 @@
+//! The commands about people, with the real binary: users, signing in, tokens and the audit.
+
+use std::fs::File;
+use std::os::unix::fs::PermissionsExt as _;
+
+use serde_json::Value;
+
+use crate::cli::{Bench, Ran, command, run};
+
+const PASSWORD: &str = "correct horse battery";
+
+/// A person at another machine: they know the server's URL, and what they signed in to is kept in their own directory.
+struct Away<'a> {
+    bench: &'a Bench,
+}
+
+impl Away<'_> {
+    fn command(&self, arguments: &[&str]) -> std::process::Command {
+        let mut command = command(arguments);
+        command.env("TASKD_SERVER", format!("http://{}", self.bench.server().addresses().http));
+        command.env("XDG_CONFIG_HOME", self.bench.dir.path().join("config"));
+        command.env("XDG_DATA_HOME", self.bench.dir.path().join("nothing"));
+        command
+    }
+
+    async fn taskd(&self, arguments: &[&str]) -> Ran {
+        run(self.command(arguments)).await
+    }
+
+    /// The same with these lines on standard input.
+    async fn told(&self, lines: &[&str], arguments: &[&str]) -> Ran {
+        let mut command = self.command(arguments);
+        command.stdin(input(self.bench, lines));
+        run(command).await
+    }
+}
+
+fn input(bench: &Bench, lines: &[&str]) -> File {
+    let path = bench.dir.path().join(format!("input-{:08x}", rand::random::<u32>()));
+    std::fs::write(&path, lines.iter().map(|line| format!("{line}\n")).collect::<String>()).unwrap();
+    File::open(path).unwrap()
+}
+
+async fn add_user(bench: &Bench, name: &str, more: &[&str]) -> Ran {
+    let mut command = command(&[&["user", "add", name, "--password-stdin"], more].concat());
+    command.env("TASKD_DATA", bench.data()).stdin(input(bench, &[PASSWORD]));
+    run(command).await
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_user_is_added_signs_in_and_out() {
+    let bench = Bench::start().await;
+    let away = Away { bench: &bench };
+    add_user(&bench, "alice", &["--role", "operator,publisher", "--robots", "site=lab"]).await.expect(0, "");
+    add_user(&bench, "alice", &["--role", "viewer"]).await.expect(1, "user_exists");
+    add_user(&bench, "Bob!", &["--role", "viewer"]).await.expect(2, "is not a valid user name");
+    add_user(&bench, "bob", &["--role", "root"]).await.expect(2, "is not a role");
+    bench.taskd(&["user", "add", "ci", "--role", "publisher", "--no-password"]).await.expect(0, "");
+    let list = bench.taskd(&["user", "list"]).await.expect(0, "").stdout;
+    assert!(list.contains("alice  operator,publisher  site=lab  yes"), "{list}");
+    assert!(list.contains("ci     publisher           *         no"), "{list}");
+    bench.taskd(&["user", "add", "bob", "--role", "viewer"]).await.expect(2, "give --password-stdin");
+
+    away.taskd(&["whoami"]).await.expect(2, "sign in with taskd login");
+    away.told(&["wrong"], &["login", "alice", "--password-stdin"]).await.expect(4, "or the password is wrong");
+    away.told(&[PASSWORD], &["login", "alice", "--password-stdin"]).await.expect(0, "as alice until");
+    let kept = bench.dir.path().join("config/taskd/credentials.json");
+    assert_eq!(std::fs::metadata(&kept).unwrap().permissions().mode() & 0o777, 0o600);
+    let me = away.taskd(&["whoami", "-o", "json"]).await.expect(0, "").json();
+    assert_eq!((&me["name"], &me["scope"][0]), (&Value::from("alice"), &Value::from("site=lab")));
+    assert_eq!(me["permissions"], serde_json::json!(["read", "operate", "publish"]));
+    away.taskd(&["user", "list"]).await.expect(4, "alice has no permission to administer");
+
+    let token = away.taskd(&["token", "create", "--title", "ci", "--role", "publisher"]).await.expect(0, "of alice");
+    let token = token.stdout.trim().to_owned();
+    assert!(token.starts_with("tsko_"));
+    let by_token = away.taskd(&["--token", &token, "whoami", "-o", "json"]).await.expect(0, "").json();
+    assert_eq!(by_token["permissions"], serde_json::json!(["read", "publish"]));
+    let listed = away.taskd(&["token", "list", "-o", "json"]).await.expect(0, "").json();
+    let origins: Vec<_> = listed["tokens"].as_array().unwrap().iter().map(|token| token["origin"].clone()).collect();
+    assert_eq!(origins, ["token", "login"]);
+    away.taskd(&["token", "revoke", by_token["token"].as_str().unwrap()]).await.expect(0, "revoked");
+    away.taskd(&["--token", &token, "whoami"]).await.expect(4, "expired or revoked");
+
+    let passwd = ["user", "passwd", "--password-stdin"];
+    away.told(&["wrong", "another long one"], &passwd).await.expect(2, "old: it is wrong");
+    away.told(&[PASSWORD, "another long one"], &passwd).await.expect(0, "signed out everywhere else");
+    away.taskd(&["whoami"]).await.expect(0, "");
+    away.taskd(&["logout"]).await.expect(0, "signed out at http://");
+    away.taskd(&["whoami"]).await.expect(2, "no token");
+    away.taskd(&["logout"]).await.expect(2, "you are not signed in");
+
+    bench.taskd(&["user", "edit", "alice", "--role", "viewer", "--robots", "*"]).await.expect(0, "");
+    bench.taskd(&["user", "remove", "alice"]).await.expect(2, "give --yes");
+    bench.taskd(&["user", "remove", "alice", "--yes"]).await.expect(0, "removed alice");
+    away.told(&["another long one"], &["login", "alice", "--password-stdin"]).await.expect(4, "is wrong");
+    bench.server.unwrap().stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_audit_is_shown_exported_and_verified() {
+    let bench = Bench::start().await;
+    add_user(&bench, "alice", &["--role", "viewer"]).await.expect(0, "");
+    let package = bench.package("1", "");
+    bench.taskd(&["push", &package]).await.expect(0, "");
+    bench.taskd(&["enroll-token", "create"]).await.expect(0, "");
+    let shown = bench.taskd(&["audit"]).await.expect(0, "").stdout;
+    let acts: Vec<_> = shown.lines().skip(1).map(|line| line.split_whitespace().nth(5).unwrap()).collect();
+    assert_eq!(acts, ["user.add", "manifest.push", "enrolment_token.create"], "{shown}");
+    assert!(shown.contains("operator.token") && shown.contains("127.0.0.1") && !shown.contains(PASSWORD), "{shown}");
+    let pushed = bench.taskd(&["audit", "--act", "manifest.", "-o", "json"]).await.expect(0, "").json();
+    assert_eq!(pushed["records"].as_array().unwrap().len(), 1);
+    assert_eq!(pushed["records"][0]["entry"]["target"], "hello");
+
+    let seen = bench.taskd(&["audit", "--verify"]).await.expect(0, "all 3 entries hold").stdout;
+    assert!(seen.starts_with("3:sha256:"), "{seen}");
+    let export = bench.taskd(&["audit", "--export"]).await.expect(0, "").stdout;
+    assert_eq!(export.lines().count(), 3);
+    let path = bench.dir.path().join("audit.jsonl");
+    let file = path.to_str().unwrap();
+    let verify = async |text: String| {
+        std::fs::write(&path, text).unwrap();
+        bench.taskd(&["audit", "--verify", "--file", file, "--expect", seen.trim()]).await
+    };
+    assert_eq!(verify(export.clone()).await.expect(0, "all 3 entries hold").stdout, seen);
+    verify(export.replace("\"hello\"", "\"other\"")).await.expect(1, "the audit does not hold: entry 2");
+    let shorter: String = export.lines().take(2).map(|line| format!("{line}\n")).collect();
+    verify(shorter).await.expect(1, "entry 3 was seen before, and now the last is 2");
+    verify("nonsense\n".to_owned()).await.expect(2, "line 1: it is no record");
+    let other = format!("2:{}", seen.trim().split_once(':').unwrap().1);
+    bench.taskd(&["audit", "--verify", "--expect", &other]).await.expect(1, "not the one that was seen before");
+    bench.taskd(&["audit", "--verify", "--expect", "x"]).await.expect(2, "what --verify prints");
+    bench.server.unwrap().stop().await;
+}

@@ -1,0 +1,459 @@
+//! The story of people, told on every database: who may what, their tokens, their passwords, and the audit of it all.
+
+use std::net::IpAddr;
+
+use task_proto::api::{
+    AddUser, AuditPage, AuditQuery, ChangePassword, CreateToken, EditRobot, EditUser, LogIn, TokenOrigin,
+};
+use task_proto::audit::{AuditEntry, Link};
+use task_proto::manifest::TaskKind;
+use task_proto::person::{Permission, Roles};
+use task_proto::report::Phase;
+use task_proto::selector::Selector;
+use task_proto::token::{Token, TokenKind};
+use task_proto::{Digest, TokenId, UserName};
+use taskd::actions::{ActionError, TaskOrder};
+use taskd::person::Person;
+use taskd::store::{Store, StoreError, TokenHolder};
+
+use crate::database::{TestDatabase, on_both_databases};
+use crate::fleet::{Fleet, order_of, package, random_key};
+use crate::story::code;
+
+on_both_databases! {
+    a_person_may_what_roles_and_token_both_allow,
+    an_order_beyond_the_scope_is_refused_as_a_whole,
+    a_robot_stays_in_its_editors_scope,
+    a_password_opens_and_a_changed_one_closes,
+    wrong_passwords_are_counted_by_account_and_by_address,
+    the_last_way_in_stays_open,
+    tokens_end_with_what_they_came_from,
+    what_is_done_is_written_down_and_nothing_else_is,
+    an_act_that_fails_leaves_no_entry,
+    a_changed_audit_is_found_out,
+    another_persons_key_is_another_key,
+}
+
+pub const PASSWORD: &str = "correct horse battery";
+const HERE: IpAddr = IpAddr::V4(std::net::Ipv4Addr::new(192, 0, 2, 1));
+
+pub fn name(text: &str) -> UserName {
+    text.parse().expect("a name")
+}
+
+pub fn roles(text: &str) -> Roles {
+    text.parse().expect("roles")
+}
+
+pub fn selector(text: &str) -> Selector {
+    text.parse().expect("a selector")
+}
+
+impl Fleet {
+    async fn add(&self, who: &str, may: &str, scope: Option<&str>) {
+        let (password, scope) = (Some(PASSWORD.to_owned()), scope.map(selector));
+        let order = AddUser { name: name(who), roles: roles(may), scope, password };
+        self.actions.add_user(&self.operator, &order).await.expect("added");
+    }
+
+    async fn sign_in(&self, who: &str, password: &str, from: IpAddr) -> Result<Token, ActionError> {
+        let order = LogIn { user: name(who), password: password.to_owned(), ttl_s: None };
+        Ok(self.actions.sign_in(&order, TokenOrigin::Login, from).await?.token)
+    }
+
+    /// The person that the token stands for now.
+    async fn person(&self, token: &Token) -> Option<Person> {
+        match self.database.store.admit(token, self.clock.now_ms()).await.expect("reads")?.holder {
+            TokenHolder::Person(person) => Some(Person { address: Some(HERE), ..person }),
+            other => panic!("{other:?} is no person"),
+        }
+    }
+
+    async fn signed_in(&self, who: &str) -> Person {
+        let token = self.sign_in(who, PASSWORD, HERE).await.expect("signed in");
+        self.person(&token).await.expect("good")
+    }
+
+    async fn label(&self, robot: &crate::fleet::Robot, labels: &str) {
+        let labels = labels.split_once('=').expect("a label");
+        let labels = [(labels.0.parse().expect("a key"), labels.1.parse().expect("a value"))].into();
+        let edit = EditRobot { name: None, labels: Some(labels) };
+        self.actions.edit_robot(&self.operator, &robot.id, &edit).await.expect("edited");
+    }
+
+    async fn audit(&self) -> Vec<AuditEntry> {
+        let query = AuditQuery { after: Some(0), ..AuditQuery::default() };
+        let page = self.database.store.audit(&query).await.expect("reads");
+        verified(&page).expect("holds");
+        page.records.iter().map(|record| record.read().expect("an entry")).collect()
+    }
+
+    /// What was written down since there were `before` entries: who, what, to what.
+    async fn acts_since(&self, before: usize) -> Vec<(String, String, String)> {
+        let entries = self.audit().await.split_off(before);
+        entries.into_iter().map(|entry| (entry.who, entry.act, entry.target)).collect()
+    }
+}
+
+fn verified(page: &AuditPage) -> Result<Link, task_proto::audit::BrokenChain> {
+    page.records.iter().try_fold(Link::START, Link::follow)
+}
+
+fn act(who: &str, act: &str, target: impl ToString) -> (String, String, String) {
+    (who.to_owned(), act.to_owned(), target.to_string())
+}
+
+async fn a_person_may_what_roles_and_token_both_allow(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    fleet.add("alice", "operator,publisher", Some("site=lab")).await;
+    let alice = fleet.signed_in("alice").await;
+    let allowed = |person: &Person| Permission::ALL.into_iter().filter(|&p| person.may(p)).collect::<Vec<_>>();
+    assert_eq!(allowed(&alice), [Permission::Read, Permission::Operate, Permission::Publish]);
+    assert_eq!((alice.name.as_str(), alice.scope.to_string()), ("alice", "site=lab".to_owned()));
+
+    let narrow = CreateToken {
+        title: "a dashboard".to_owned(),
+        roles: Some(roles("publisher")),
+        scope: Some(selector("r1,r2")),
+        ttl_s: Some(3600),
+        ..CreateToken::default()
+    };
+    let made = fleet.actions.create_token(&alice, &narrow).await.expect("made");
+    let token: Token = made.token.parse().expect("a token");
+    let dashboard = fleet.person(&token).await.expect("good");
+    assert_eq!(allowed(&dashboard), [Permission::Read, Permission::Publish]);
+    assert_eq!(dashboard.scope.to_string(), "site=lab and r1,r2");
+    assert_eq!(made.expires_at_ms, fleet.clock.now_ms() + 3_600_000);
+    // It makes no others, for it would never end; and nobody makes one that allows more than they may.
+    assert_eq!(code(fleet.actions.create_token(&dashboard, &CreateToken::default()).await), "forbidden");
+    let wide = CreateToken { roles: Some(roles("admin")), ..CreateToken::default() };
+    assert_eq!(code(fleet.actions.create_token(&alice, &wide).await), "invalid_request");
+    let for_bob = CreateToken { user: Some(name("bob")), ..CreateToken::default() };
+    assert_eq!(code(fleet.actions.create_token(&alice, &for_bob).await), "forbidden");
+    assert_eq!(code(fleet.actions.create_token(&fleet.operator, &for_bob).await), "not_found");
+    assert_eq!(code(fleet.actions.create_token(&fleet.operator, &CreateToken::default()).await), "invalid_request");
+
+    // What the user loses, the token loses; what is left to neither is no token.
+    let edit = |may: &str| EditUser { roles: Some(roles(may)), scope: Some(selector("*")) };
+    fleet.actions.edit_user(&fleet.operator, &name("alice"), &edit("publisher")).await.expect("edited");
+    assert_eq!(fleet.person(&token).await.expect("good").scope.to_string(), "r1,r2");
+    fleet.actions.edit_user(&fleet.operator, &name("alice"), &edit("viewer")).await.expect("edited");
+    assert_eq!(fleet.person(&token).await, None);
+    // An administrator with a scope does not administer what concerns everybody.
+    fleet.add("boss", "admin", Some("site=lab")).await;
+    let boss = fleet.signed_in("boss").await;
+    assert!(boss.may(Permission::Maintain) && !boss.may(Permission::Administer));
+}
+
+async fn an_order_beyond_the_scope_is_refused_as_a_whole(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let mut robots = fleet.enroll(3).await;
+    fleet.label(&robots[0], "site=lab").await;
+    fleet.label(&robots[1], "site=lab").await;
+    fleet.add("alice", "operator", Some("site=lab")).await;
+    let alice = fleet.signed_in("alice").await;
+    let (bundle, before) = (package("1", TaskKind::Service), fleet.audit().await.len());
+    let order = |to: &str| task_proto::api::CreateDeployment { selector: selector(to), ..order_of(&bundle) };
+    let ordered = |to: &'static str| {
+        let (fleet, alice, order, bundle) = (&fleet, &alice, order(to), &bundle);
+        async move { fleet.actions.create_deployment(alice, &random_key(), &order, bundle).await }
+    };
+    let refused = ordered("*").await.expect_err("refused");
+    let expected = "1 of the 3 robots of \"*\" are outside of alice's scope \"site=lab\"; nothing was done";
+    assert_eq!((refused.code(), refused.to_string().as_str()), ("out_of_scope", expected));
+    assert_eq!(code(ordered("r2").await), "out_of_scope");
+    assert_eq!(code(ordered("r0,r2").await), "out_of_scope");
+    assert_eq!(code(fleet.actions.matching_robots(&alice, &selector("*")).await), "out_of_scope");
+    assert_eq!(code(ordered("site=mars").await), "no_robots_match");
+    assert_eq!(fleet.acts_since(before).await, []);
+    assert!(fleet.desired(&robots[0]).await.expect("state").tasks.is_empty(), "not even those that are hers");
+    let own = ordered("site=lab").await.expect("ordered");
+
+    // What is there already counts like what is asked for.
+    let everywhere = fleet.deploy("2", |_| ()).await;
+    for robot in &mut robots {
+        fleet.follow(robot, Phase::Running).await;
+    }
+    let (task, key) = ("talker".parse().expect("a name"), random_key());
+    let stop = fleet.actions.order_task(&alice, &key, TaskOrder::Stop, &task, &selector("*")).await;
+    assert_eq!(code(stop), "out_of_scope");
+    assert_eq!(code(fleet.actions.robots_with_task(&alice, &task, &selector("*")).await), "out_of_scope");
+    assert_eq!(code(fleet.actions.cancel_deployment(&alice, &everywhere).await), "out_of_scope");
+    assert_eq!(code(fleet.actions.resume_deployment(&alice, &everywhere).await), "out_of_scope");
+    fleet.actions.cancel_deployment(&alice, &own).await.expect("all of it is hers");
+    let lab = selector("site=lab");
+    let stopped = fleet.actions.order_task(&alice, &key, TaskOrder::Stop, &task, &lab).await.expect("ordered");
+    assert_eq!(stopped.len(), 2);
+    assert_eq!(fleet.phases(&everywhere).await[2], Phase::Running);
+
+    // And of lists she sees her part.
+    let mine = fleet.database.store.robots_in(&alice.scope).await.expect("reads");
+    assert_eq!(mine.len(), 2);
+    let parts = fleet.database.store.deployments_of(&mine).await.expect("reads");
+    let counted = parts.iter().map(|part| (part.id.clone(), part.counts.iter().map(|count| count.count).sum::<u64>()));
+    assert_eq!(counted.collect::<Vec<_>>(), [(everywhere, 2), (own, 2)]);
+    let none = fleet.database.store.deployments_of(&[]).await.expect("reads");
+    assert_eq!(none, []);
+}
+
+async fn a_robot_stays_in_its_editors_scope(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let robots = fleet.enroll(2).await;
+    fleet.label(&robots[0], "site=lab").await;
+    fleet.add("boss", "admin", Some("site=lab")).await;
+    let boss = fleet.signed_in("boss").await;
+    let field = [("site".parse().expect("a key"), "field".parse().expect("a value"))].into();
+    let out = EditRobot { name: None, labels: Some(field) };
+    assert_eq!(code(fleet.actions.edit_robot(&boss, &robots[0].id, &out).await), "out_of_scope");
+    let lab = [("site".parse().expect("a key"), "lab".parse().expect("a value"))].into();
+    let pulled_in = EditRobot { name: None, labels: Some(lab) };
+    assert_eq!(code(fleet.actions.edit_robot(&boss, &robots[1].id, &pulled_in).await), "out_of_scope");
+    assert_eq!(code(fleet.actions.remove_robot(&boss, &robots[1].id).await), "out_of_scope");
+    let renamed = EditRobot { name: Some("atlas".parse().expect("a name")), labels: None };
+    fleet.actions.edit_robot(&boss, &robots[0].id, &renamed).await.expect("it is his");
+    fleet.actions.remove_robot(&boss, &robots[0].id).await.expect("it is his");
+}
+
+async fn a_password_opens_and_a_changed_one_closes(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    fleet.add("alice", "operator", None).await;
+    for (who, password) in [("alice", "wrong"), ("bob", PASSWORD), ("operator.token", PASSWORD)] {
+        assert_eq!(code(fleet.sign_in(who, password, HERE).await), "unauthorized", "{who}");
+    }
+    let (token, other) = (fleet.sign_in("alice", PASSWORD, HERE).await, fleet.sign_in("alice", PASSWORD, HERE).await);
+    let (token, other) = (token.expect("signed in"), other.expect("signed in"));
+    let alice = fleet.person(&token).await.expect("good");
+    let made = fleet.actions.create_token(&alice, &CreateToken::default()).await.expect("made");
+    let change = |old: &str, new: &str| ChangePassword { old: old.to_owned(), new: new.to_owned() };
+    let changed = fleet.actions.change_password(&alice, &change("wrong", "another long one")).await;
+    assert_eq!(changed.expect_err("refused").to_string(), "old: it is wrong");
+    assert_eq!(code(fleet.actions.change_password(&alice, &change(PASSWORD, "short")).await), "invalid_request");
+    fleet.actions.change_password(&alice, &change(PASSWORD, "another long one")).await.expect("changed");
+    assert_eq!(code(fleet.sign_in("alice", PASSWORD, HERE).await), "unauthorized");
+    fleet.sign_in("alice", "another long one", HERE).await.expect("signed in");
+    assert!(fleet.person(&token).await.is_some(), "the one who changed it");
+    assert_eq!(fleet.person(&other).await, None);
+    assert!(fleet.person(&made.token.parse().expect("a token")).await.is_some(), "what was made on purpose");
+    // An administrator who sets it signs everybody out.
+    fleet.actions.set_password(&fleet.operator, &name("alice"), PASSWORD).await.expect("set");
+    assert_eq!(fleet.person(&token).await, None);
+    assert_eq!(code(fleet.actions.set_password(&fleet.operator, &name("bob"), PASSWORD).await), "not_found");
+    let first = fleet.actions.change_password(&fleet.operator, &change(PASSWORD, PASSWORD)).await;
+    assert_eq!(code(first), "forbidden");
+    // Without a password nobody comes in by one.
+    let order = AddUser { name: name("ci"), roles: roles("publisher"), scope: None, password: None };
+    assert!(!fleet.actions.add_user(&fleet.operator, &order).await.expect("added").has_password);
+    assert_eq!(code(fleet.sign_in("ci", "", HERE).await), "unauthorized");
+    assert_eq!(code(fleet.actions.add_user(&fleet.operator, &order).await), "user_exists");
+    let reserved = AddUser { name: name("operator.token"), ..order };
+    assert_eq!(code(fleet.actions.add_user(&fleet.operator, &reserved).await), "user_exists");
+}
+
+async fn wrong_passwords_are_counted_by_account_and_by_address(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    fleet.add("alice", "operator", None).await;
+    fleet.sign_in("alice", PASSWORD, HERE).await.expect("signed in");
+    let stranger = |n: u8| IpAddr::from([203, 0, 113, n]);
+    for n in 0..10 {
+        assert_eq!(code(fleet.sign_in("alice", "wrong", stranger(n)).await), "unauthorized");
+    }
+    let before = fleet.audit().await.len();
+    for n in 10..13 {
+        let refused = fleet.sign_in("alice", PASSWORD, stranger(n)).await.expect_err("not even the right one");
+        assert_eq!(refused.code(), "too_many_requests");
+        assert_eq!(refused.to_string(), "too many wrong passwords; try again in 900 s");
+    }
+    assert_eq!(fleet.acts_since(before).await, [act("server", "sign_in.blocked", "alice")], "once");
+    fleet.sign_in("alice", PASSWORD, HERE).await.expect("from where she came before she still can");
+    for n in 0..50 {
+        assert_eq!(code(fleet.sign_in(&format!("nobody{n}"), "wrong", stranger(99)).await), "unauthorized");
+    }
+    fleet.add("bob", "viewer", None).await;
+    assert_eq!(code(fleet.sign_in("bob", PASSWORD, stranger(99)).await), "too_many_requests");
+    fleet.clock.advance_ms(15 * 60 * 1000);
+    fleet.sign_in("alice", PASSWORD, stranger(10)).await.expect("the time is over");
+    fleet.sign_in("bob", PASSWORD, stranger(99)).await.expect("likewise");
+}
+
+async fn the_last_way_in_stays_open(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let first = Token::random(TokenKind::Operator);
+    fleet.database.store.create_operator_token(&first, fleet.clock.now_ms()).await.expect("stored");
+    let first_id: TokenId = first.id().parse().expect("an id");
+    let by = fleet.person(&first).await.expect("good");
+    assert!(by.is_first());
+    let revoked = fleet.actions.revoke_token(&by, &first_id).await;
+    let said = "operator.token is the last administrator with a way in; give another one a password first";
+    assert_eq!(revoked.expect_err("refused").to_string(), said);
+    for (who, may, scope) in [("boss", "admin", None), ("other", "admin", Some("site=lab")), ("op", "operator", None)] {
+        fleet.add(who, may, scope).await;
+    }
+    let boss = fleet.signed_in("boss").await;
+    fleet.actions.revoke_token(&boss, &first_id).await.expect("there is another");
+    fleet.actions.revoke_token(&boss, &first_id).await.expect("twice is harmless");
+    assert_eq!(fleet.person(&first).await, None);
+    let demoted = EditUser { roles: Some(roles("viewer")), scope: None };
+    let limited = EditUser { roles: None, scope: Some(selector("site=lab")) };
+    assert_eq!(code(fleet.actions.edit_user(&boss, &name("boss"), &demoted).await), "last_administrator");
+    assert_eq!(code(fleet.actions.edit_user(&boss, &name("boss"), &limited).await), "last_administrator");
+    assert_eq!(code(fleet.actions.remove_user(&boss, &name("boss")).await), "last_administrator");
+    // The token in the data directory does not come back to life.
+    fleet.actions.expire().await.expect("done");
+    let stored = fleet.database.store.create_operator_token(&first, fleet.clock.now_ms()).await;
+    assert!(stored.is_err_and(|error| error.is_unique_violation()));
+    fleet.actions.remove_user(&boss, &name("other")).await.expect("she was none");
+}
+
+async fn tokens_end_with_what_they_came_from(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    fleet.add("alice", "operator", None).await;
+    fleet.add("bob", "viewer", None).await;
+    let token = fleet.sign_in("alice", PASSWORD, HERE).await.expect("signed in");
+    let (alice, bob) = (fleet.person(&token).await.expect("good"), fleet.signed_in("bob").await);
+    let listed = fleet.actions.tokens(&alice, false).await.expect("reads").tokens;
+    assert_eq!(listed.len(), 1);
+    assert_eq!((&listed[0].id, listed[0].origin), (&alice.token, TokenOrigin::Login));
+    assert_eq!(code(fleet.actions.revoke_token(&bob, &alice.token).await), "not_found");
+    fleet.actions.sign_out(&alice).await.expect("out");
+    assert_eq!(fleet.person(&token).await, None);
+
+    let ttl = CreateToken { ttl_s: Some(60), ..CreateToken::default() };
+    let alice = fleet.signed_in("alice").await;
+    let made = fleet.actions.create_token(&alice, &ttl).await.expect("made");
+    let short: Token = made.token.parse().expect("a token");
+    assert!(fleet.person(&short).await.is_some());
+    fleet.clock.advance_ms(60_000);
+    assert_eq!(fleet.person(&short).await, None);
+    let ended = fleet.actions.expire().await.expect("done");
+    assert!(ended.contains(&name("alice")) && !ended.contains(&name("bob")), "{ended:?}");
+    let made = fleet.actions.create_token(&alice, &CreateToken::default()).await.expect("made");
+    let lasting: Token = made.token.parse().expect("a token");
+    fleet.actions.remove_user(&fleet.operator, &name("alice")).await.expect("removed");
+    assert_eq!(fleet.person(&lasting).await, None);
+    // Whoever has the name next has none of it.
+    fleet.add("alice", "admin", None).await;
+    assert_eq!(fleet.person(&lasting).await, None);
+    // Signing in over and over leaves a bounded number of tokens.
+    let newest = fleet.signed_in("alice").await;
+    for _ in 0..3 {
+        fleet.signed_in("alice").await;
+    }
+    assert!(fleet.actions.tokens(&newest, false).await.expect("reads").tokens.len() <= 50);
+}
+
+async fn what_is_done_is_written_down_and_nothing_else_is(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let mut robots = fleet.enroll(1).await;
+    fleet.add("alice", "admin", None).await;
+    let alice = fleet.signed_in("alice").await;
+    let entries = fleet.audit().await;
+    let said: Vec<_> = entries.iter().map(|entry| (entry.who.as_str(), entry.act.as_str())).collect();
+    let expected = [
+        ("operator.token", "enrolment_token.create"),
+        ("enrolment", "robot.enroll"),
+        ("operator.token", "user.add"),
+        ("alice", "sign_in"),
+    ];
+    assert_eq!(said, expected);
+    assert_eq!((entries[3].address, entries[3].number), (Some(HERE), 4));
+    let text = serde_json::to_string(&entries).expect("json");
+    assert!(!text.contains(PASSWORD) && !text.contains("argon2"), "no secret: {text}");
+
+    let before = entries.len();
+    let (task, all) = ("talker".parse().expect("a name"), selector("*"));
+    let bundle = package("1", TaskKind::Service);
+    let key = random_key();
+    let id = fleet.actions.create_deployment(&alice, &key, &order_of(&bundle), &bundle).await.expect("ordered");
+    fleet.actions.create_deployment(&alice, &key, &order_of(&bundle), &bundle).await.expect("the same again");
+    // Robots' reports are not people's acts.
+    fleet.follow(&mut robots[0], Phase::Running).await;
+    fleet.actions.expire().await.expect("nobody's business");
+    for order in [TaskOrder::Stop, TaskOrder::Start, TaskOrder::Remove] {
+        fleet.actions.order_task(&alice, &random_key(), order, &task, &all).await.expect("ordered");
+    }
+    fleet.actions.cancel_deployment(&alice, &id).await.expect("cancelled");
+    fleet.actions.cancel_deployment(&alice, &id).await.expect("again is nothing");
+    let made = fleet.actions.create_token(&alice, &CreateToken::default()).await.expect("made");
+    fleet.actions.revoke_token(&alice, &made.id).await.expect("revoked");
+    fleet.actions.remove_robot(&alice, &robots[0].id).await.expect("removed");
+    let expected = [
+        act("alice", "deployment.create", &id),
+        act("alice", "task.stop", "talker"),
+        act("alice", "task.start", "talker"),
+        act("alice", "task.remove", "talker"),
+        act("alice", "deployment.cancel", &id),
+        act("alice", "token.create", &made.id),
+        act("alice", "token.revoke", &made.id),
+        act("alice", "robot.remove", &robots[0].id),
+    ];
+    assert_eq!(fleet.acts_since(before).await, expected);
+    let created = &fleet.audit().await[before];
+    assert_eq!((created.token.as_ref(), created.address), (Some(&alice.token), Some(HERE)));
+    assert_eq!(created.detail["package"], "talker 1");
+    assert_eq!((created.detail["robots"].as_str(), created.detail["count"].as_str()), ("*", "1"));
+
+    let found = async |query: AuditQuery| -> Vec<u64> {
+        let page = fleet.database.store.audit(&query).await.expect("reads");
+        page.records.iter().map(|record| record.read().expect("an entry").number).collect()
+    };
+    let by = |who: &str| AuditQuery { who: Some(who.to_owned()), ..AuditQuery::default() };
+    assert_eq!(found(by("enrolment")).await, [2]);
+    assert_eq!(found(AuditQuery { act: Some("task.".to_owned()), ..by("alice") }).await, [8, 7, 6]);
+    assert_eq!(found(AuditQuery { target: Some(id.to_string()), ..AuditQuery::default() }).await, [9, 5]);
+    assert_eq!(found(AuditQuery { before: Some(4), limit: Some(2), ..AuditQuery::default() }).await, [3, 2]);
+    assert_eq!(found(AuditQuery { after: Some(10), ..AuditQuery::default() }).await, [11, 12]);
+}
+
+async fn an_act_that_fails_leaves_no_entry(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let robots = fleet.enroll(2).await;
+    let before = fleet.audit().await.len();
+    let taken = EditRobot { name: Some("r1".parse().expect("a name")), labels: None };
+    assert_eq!(code(fleet.actions.edit_robot(&fleet.operator, &robots[0].id, &taken).await), "name_taken");
+    let repository = "talker".parse().expect("a name");
+    let deed = taskd::store::Deed::by(&fleet.operator, taskd::store::Act::ManifestDelete, &repository);
+    let store = &fleet.database.store;
+    let missing = store.delete_manifest(&repository, &Digest::of(b"x"), Some(&deed), 1).await.expect("reads");
+    assert_eq!(missing, None);
+    assert!(!store.delete_tag(&repository, &"latest".parse().expect("a tag"), Some(&deed), 1).await.expect("reads"));
+    // A write that is dropped after its entry was written takes the entry with it.
+    let mut write = store.begin().await.expect("begins");
+    write.audit(&deed, 1).await.expect("written");
+    drop(write);
+    assert_eq!(fleet.acts_since(before).await, []);
+    let mut write = store.begin().await.expect("begins");
+    write.audit(&deed, 1).await.expect("written");
+    write.commit().await.expect("stored");
+    assert_eq!(fleet.acts_since(before).await, [act("operator.token", "manifest.delete", "talker")]);
+}
+
+async fn a_changed_audit_is_found_out(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    fleet.enroll(3).await;
+    let url = fleet.database.url.clone();
+    let whole = AuditQuery { after: Some(0), ..AuditQuery::default() };
+    let page = fleet.database.store.audit(&whole).await.expect("reads");
+    assert_eq!(verified(&page).expect("holds").number, page.last);
+    fleet.database.forge_audit(2, "r0", "r9").await;
+    let store = Store::open(&url).await.expect("opens");
+    let page: Result<AuditPage, StoreError> = store.audit(&whole).await;
+    let broken = verified(&page.expect("reads")).expect_err("found out");
+    assert_eq!(broken, task_proto::audit::BrokenChain::Changed { number: 2 });
+    fleet.database.drop_audit(2).await;
+    let broken = verified(&store.audit(&whole).await.expect("reads")).expect_err("found out");
+    assert_eq!(broken, task_proto::audit::BrokenChain::Missing { expected: 2, found: 3 });
+}
+
+async fn another_persons_key_is_another_key(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    fleet.enroll(1).await;
+    fleet.add("alice", "operator", None).await;
+    fleet.add("bob", "operator", None).await;
+    let (alice, bob) = (fleet.signed_in("alice").await, fleet.signed_in("bob").await);
+    let (key, bundle) = (random_key(), package("1", TaskKind::Service));
+    let id = fleet.actions.create_deployment(&alice, &key, &order_of(&bundle), &bundle).await.expect("ordered");
+    let again = fleet.actions.create_deployment(&alice, &key, &order_of(&bundle), &bundle).await.expect("the same");
+    assert_eq!(again, id);
+    let other = fleet.actions.create_deployment(&bob, &key, &order_of(&bundle), &bundle).await;
+    assert_eq!(code(other), "idempotency_key_reused");
+}

@@ -1,0 +1,444 @@
+//! Who may what, found out by trying: every HTTP route is called by everybody, every MQTT topic of a robot is spoken and heard
+//! on by everybody, and what comes of it is docs/permissions.md. After a wanted change:
+//! `UPDATE_GOLDEN=1 cargo test -p taskd --test it permissions`. A new route of the table is tried by itself; give it a body
+//! in `body` and its parameters a value in `Town::path`, if it needs them.
+
+use std::fmt::Write as _;
+use std::path::Path;
+
+use reqwest::Method;
+use serde_json::{Value, json};
+use task_proto::api::{DeploymentView, EnrollmentToken, ServerInfo, TokenOrigin};
+use task_proto::desired::PackageRef;
+use task_proto::person::{Permission, Role, Roles};
+use task_proto::token::{Token, TokenKind};
+use task_proto::topic::RobotTopic;
+use task_proto::{Digest, UserName};
+use taskd::http::{Route, routes};
+use taskd::store::{NewToken, Store, User, sqlite_url};
+
+use crate::harness::{NOW_MS, TestRobot, TestServer, answer};
+use crate::mqtt_harness::{Connect, PATIENCE, Raw, publish, subscribe, topic};
+
+const DOCUMENT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/permissions.md");
+
+/// Everybody who could come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Comer {
+    Nobody,
+    Enrolment,
+    Itself,
+    OtherRobot,
+    Person(Role),
+    /// Someone with this role, limited to another robot.
+    Elsewhere(Role),
+}
+
+impl Comer {
+    const ALL: [Self; 10] = [
+        Self::Nobody,
+        Self::Enrolment,
+        Self::Itself,
+        Self::OtherRobot,
+        Self::Person(Role::Viewer),
+        Self::Person(Role::Operator),
+        Self::Person(Role::Publisher),
+        Self::Person(Role::Admin),
+        Self::Elsewhere(Role::Operator),
+        Self::Elsewhere(Role::Admin),
+    ];
+
+    fn title(self) -> String {
+        match self {
+            Self::Nobody => "nobody".to_owned(),
+            Self::Enrolment => "enrolment token".to_owned(),
+            Self::Itself => "the robot".to_owned(),
+            Self::OtherRobot => "another robot".to_owned(),
+            Self::Person(role) => role.to_string(),
+            Self::Elsewhere(role) => format!("{role} of other robots"),
+        }
+    }
+}
+
+/// A call to be made.
+struct Probe {
+    title: String,
+    method: Method,
+    path: String,
+    body: Option<Value>,
+}
+
+/// A server with one of each.
+struct Town {
+    server: TestServer,
+    /// The same database, where people and tokens are made without hashing and signing in.
+    store: Store,
+    robot: TestRobot,
+    other_robot: TestRobot,
+    enrolment: String,
+    package: PackageRef,
+    deployment: DeploymentView,
+}
+
+impl Town {
+    async fn new() -> Self {
+        let server = TestServer::start().await;
+        let store = Store::open(&sqlite_url(&server.data().join("taskd.sqlite"))).await.expect("opens");
+        let (robot, other_robot) = (server.enroll("atlas").await, server.enroll("boreas").await);
+        let (talker, package) = (server.push("talker", "1.0.0").await, server.push("walker", "1.0.0").await);
+        let deployment = server.deploy(&talker, "atlas", "talker").await;
+        server.deploy(&package, "atlas", "walker").await;
+        let enrolment: EnrollmentToken = server.post("/api/v1/enrollment-tokens", &json!({})).await;
+        Self { server, store, robot, other_robot, enrolment: enrolment.token, package, deployment }
+    }
+
+    /// A fresh token of a user who is as they were.
+    async fn sign_in(&self, user: &str, role: Role, scope: Option<&str>) -> Token {
+        let name: UserName = user.parse().expect("a name");
+        let scope = scope.map(|scope| scope.parse().expect("a selector"));
+        let user = User { name: name.clone(), roles: Roles::one(role), scope, password: None, created_at_ms: NOW_MS };
+        let token = Token::random(TokenKind::Operator);
+        let mut write = self.store.begin().await.expect("begins");
+        write.put_user(&user).await.expect("stored");
+        let new = NewToken {
+            token: &token,
+            user: &name,
+            origin: TokenOrigin::Login,
+            title: "",
+            roles: None,
+            scope: None,
+            expires_at_ms: NOW_MS + 3_600_000,
+        };
+        write.create_token(&new, NOW_MS).await.expect("stored");
+        write.commit().await.expect("stored");
+        token
+    }
+
+    async fn token(&self, comer: Comer) -> Option<String> {
+        Some(match comer {
+            Comer::Nobody => return None,
+            Comer::Enrolment => self.enrolment.clone(),
+            Comer::Itself => self.robot.token.clone(),
+            Comer::OtherRobot => self.other_robot.token.clone(),
+            Comer::Person(role) => self.sign_in(role.as_str(), role, None).await.reveal(),
+            Comer::Elsewhere(role) => self.sign_in(&format!("{role}2"), role, Some("boreas")).await.reveal(),
+        })
+    }
+
+    /// The path with values for its parameters: things that are there, and may go.
+    async fn path(&self, probe: &Probe) -> String {
+        let mut path = probe.path.replace("{deployment}", self.deployment.id.as_str());
+        if path.contains("{robot}") {
+            let robot = match probe.method == Method::DELETE {
+                true => self.server.enroll(&format!("gone-{:08x}", rand::random::<u32>())).await.id,
+                false => self.robot.id.clone(),
+            };
+            path = path.replace("{robot}", robot.as_str());
+        }
+        if path.contains("{user}") || path.contains("{token}") {
+            let token = self.sign_in("bob", Role::Viewer, None).await;
+            path = path.replace("{user}", "bob").replace("{token}", &token.id());
+        }
+        path =
+            path.replace("{task}", "walker").replace("{*file}", "app.js").replace("{itself}", self.robot.id.as_str());
+        path = path.replace("{blob}", &self.package.content.digest.to_string());
+        assert!(!path.contains('{'), "{path}: this test has to be told of a value for the parameter");
+        path
+    }
+
+    /// What comes of it: `✓`, or the status it is refused with.
+    async fn try_out(&self, probe: &Probe, comer: Comer) -> String {
+        let mut request = self.server.bare(probe.method.clone(), &self.path(probe).await);
+        if let Some(token) = self.token(comer).await {
+            request = request.bearer_auth(token);
+        }
+        if let Some(body) = &probe.body {
+            request = request.header("idempotency-key", format!("{:08x}", rand::random::<u32>())).json(body);
+        }
+        let response = request.send().await.expect("an answer");
+        let status = response.status();
+        assert!(!status.is_server_error() || status.as_u16() == 504, "{} by {comer:?}: {status}", probe.title);
+        let is_registry = probe.path.starts_with("/v2");
+        match status.as_u16() {
+            refused @ (401 | 403) => refused.to_string(),
+            // In the registry nothing is hidden, it is only not there.
+            404 if !is_registry => "404".to_owned(),
+            _ => "✓".to_owned(),
+        }
+    }
+
+    /// A session by the comer's credentials; `None` if they do not come in.
+    async fn connect(&self, comer: Comer) -> Option<Raw> {
+        let (client_id, user_name) = match comer {
+            Comer::Itself => (self.robot.id.to_string(), self.robot.id.to_string()),
+            Comer::OtherRobot => (self.other_robot.id.to_string(), self.other_robot.id.to_string()),
+            _ => (String::new(), "anyone".to_owned()),
+        };
+        let password = self.token(comer).await;
+        let connect = Connect {
+            client_id,
+            user_name: password.is_some().then_some(user_name),
+            password,
+            clean: true,
+            keep_alive_s: 0,
+            will: None,
+        };
+        let stream = tokio::net::TcpStream::connect(&self.server.server.addresses().mqtt).await.expect("listens");
+        let mut raw = Raw { stream };
+        raw.send(&connect.packet()).await;
+        (raw.read(4).await? == [0x20, 2, 0, 0]).then_some(raw)
+    }
+
+    async fn messages_refused(&self) -> u64 {
+        self.server.get::<ServerInfo>("/api/v1/server").await.traffic.messages_refused
+    }
+
+    async fn publishes(&self, comer: Comer, topic: &str, payload: &[u8]) -> String {
+        let Some(mut raw) = self.connect(comer).await else { return "–".to_owned() };
+        let before = self.messages_refused().await;
+        raw.send(&publish(topic, 1, 7, payload)).await;
+        let is_acknowledged = raw.read(4).await.is_some_and(|answer| answer == [0x40, 2, 0, 7]);
+        let is_refused = self.messages_refused().await > before;
+        assert_ne!(is_acknowledged, is_refused, "{topic} by {comer:?}");
+        if is_acknowledged { "✓" } else { "no" }.to_owned()
+    }
+
+    async fn subscribes(&self, comer: Comer, filter: &str) -> String {
+        let Some(mut raw) = self.connect(comer).await else { return "–".to_owned() };
+        raw.send(&subscribe(7, &[(filter, 1)])).await;
+        let answer = raw.read(5).await.expect("a SUBACK");
+        assert_eq!(answer[..4], [0x90, 3, 0, 7], "{filter} by {comer:?}");
+        if answer[4] == 0x80 { "no" } else { "✓" }.to_owned()
+    }
+}
+
+impl Raw {
+    /// So many bytes; `None` if the other side closes before.
+    async fn read(&mut self, count: usize) -> Option<Vec<u8>> {
+        use tokio::io::AsyncReadExt as _;
+        let mut bytes = vec![0; count];
+        let read = tokio::time::timeout(PATIENCE, self.stream.read_exact(&mut bytes));
+        read.await.expect("an answer or an end").ok().map(|_| bytes)
+    }
+}
+
+/// What a route is called with, so that it is understood as far as it matters.
+fn body(method: &Method, path: &str) -> Option<Value> {
+    Some(match (method.as_str(), path) {
+        ("POST", "/api/v1/deployments") => {
+            let digest = Digest::of(b"x");
+            json!({ "package": "walker", "manifest": digest, "selector": "atlas", "dry_run": true })
+        }
+        ("POST", path) if path.starts_with("/api/v1/tasks/") => json!({ "selector": "atlas", "dry_run": true }),
+        ("POST", "/api/v1/robots/{robot}/ask") => json!({ "type": "nodes" }),
+        ("POST", "/api/v1/users") => {
+            json!({ "name": format!("new-{:08x}", rand::random::<u32>()), "roles": ["viewer"] })
+        }
+        ("PUT", "/api/v1/users/{user}/password") => json!({ "password": "correct horse battery" }),
+        ("PUT", "/api/v1/password") => json!({ "old": "correct horse battery", "new": "another long password" }),
+        ("POST" | "PUT" | "PATCH", _) => json!({}),
+        _ => return None,
+    })
+}
+
+fn probes(route: &Route) -> Vec<Probe> {
+    let probe = |title: &str, method: &Method, path: &str, body: Option<Value>| Probe {
+        title: format!("`{method} {title}`"),
+        method: method.clone(),
+        path: path.to_owned(),
+        body,
+    };
+    let Some(method) = &route.method else { return registry_probes(route.path) };
+    let mut probes = vec![probe(route.path, method, route.path, body(method, route.path))];
+    match (method.as_str(), route.path) {
+        ("POST", "/api/v1/robots/{robot}/ask") => {
+            let change = json!({ "type": "lifecycle", "node": "/talker", "transition": "activate" });
+            let mut changing = probe(route.path, method, route.path, Some(change));
+            changing.title += " what changes something";
+            probes.push(changing);
+        }
+        ("GET", "/api/v1/tokens") => {
+            probes.push(probe("/api/v1/tokens?all=true", method, "/api/v1/tokens?all=true", None));
+        }
+        _ => {}
+    }
+    probes
+}
+
+/// Below `/v2` a handler looks at the method itself.
+fn registry_probes(path: &str) -> Vec<Probe> {
+    let cases: &[(&str, &str, &str)] = match path {
+        "/v2/{*path}" => &[
+            ("GET", "/v2/walker/tags/list", "/v2/NAME/tags/list"),
+            ("GET", "/v2/walker/manifests/1.0.0", "/v2/NAME/manifests/TAG"),
+            ("GET", "/v2/walker/referrers/{blob}", "/v2/NAME/referrers/DIGEST"),
+            ("GET", "/v2/walker/blobs/{blob}", "/v2/NAME/blobs/DIGEST"),
+            ("POST", "/v2/walker/blobs/uploads/", "/v2/NAME/blobs/uploads/"),
+            ("PUT", "/v2/walker/manifests/2.0.0", "/v2/NAME/manifests/TAG"),
+            ("DELETE", "/v2/walker/manifests/none", "/v2/NAME/manifests/TAG"),
+            ("DELETE", "/v2/other/blobs/{blob}", "/v2/NAME/blobs/DIGEST"),
+            ("GET", "/v2/outputs/{itself}/mapping/tags/list", "/v2/outputs/ROBOT/TASK/tags/list"),
+            ("GET", "/v2/outputs/{itself}/mapping/blobs/{blob}", "/v2/outputs/ROBOT/TASK/blobs/DIGEST"),
+            ("POST", "/v2/outputs/{itself}/mapping/blobs/uploads/", "/v2/outputs/ROBOT/TASK/blobs/uploads/"),
+            ("PUT", "/v2/outputs/{itself}/mapping/manifests/x", "/v2/outputs/ROBOT/TASK/manifests/TAG"),
+            ("DELETE", "/v2/outputs/{itself}/mapping/manifests/x", "/v2/outputs/ROBOT/TASK/manifests/TAG"),
+        ],
+        "/v2" => &[("GET", "/v2", "/v2")],
+        "/v2/" => &[("GET", "/v2/", "/v2/")],
+        other => panic!("{other}: this test has to be told what its handler does"),
+    };
+    let probe = |&(method, path, title): &(&str, &str, &str)| Probe {
+        title: format!("`{method} {title}`"),
+        method: method.parse().expect("a method"),
+        path: path.to_owned(),
+        body: None,
+    };
+    cases.iter().map(probe).collect()
+}
+
+fn table(header: &[String], rows: &[Vec<String>]) -> String {
+    let mut text = format!("| {} |\n|{}\n", header.join(" | "), "---|".repeat(header.len()));
+    for row in rows {
+        writeln!(text, "| {} |", row.join(" | ")).expect("written");
+    }
+    text
+}
+
+async fn http_table(town: &Town) -> String {
+    let mut header = vec!["route".to_owned()];
+    header.extend(Comer::ALL.map(Comer::title));
+    let mut rows = Vec::new();
+    for route in routes() {
+        for probe in probes(&route) {
+            let mut row = vec![probe.title.clone()];
+            for comer in Comer::ALL {
+                row.push(town.try_out(&probe, comer).await);
+            }
+            rows.push(row);
+        }
+    }
+    table(&header, &rows)
+}
+
+async fn mqtt_table(town: &mut Town) -> String {
+    let comers = [
+        Comer::Nobody,
+        Comer::Enrolment,
+        Comer::Itself,
+        Comer::OtherRobot,
+        Comer::Person(Role::Viewer),
+        Comer::Person(Role::Admin),
+        Comer::Elsewhere(Role::Admin),
+    ];
+    let mut header = vec!["topic".to_owned()];
+    header.extend(comers.map(Comer::title));
+    let state = town.server.desired(&town.robot).await;
+    let report = town.robot.next_report(&state, task_proto::report::Phase::Fetching);
+    let report = serde_json::to_vec(&report).expect("json");
+    let topics = [
+        RobotTopic::Desired,
+        RobotTopic::Report,
+        RobotTopic::Status,
+        RobotTopic::Telemetry,
+        RobotTopic::Log,
+        RobotTopic::Request,
+        RobotTopic::Reply,
+    ];
+    let parts = format!("taskd/v1/p/{}", town.package.content.digest);
+    let mut rows = Vec::new();
+    for last in topics {
+        let topic = topic(&town.robot.id, last);
+        let shown = topic.replace(town.robot.id.as_str(), "ROBOT");
+        let payload: &[u8] = if last == RobotTopic::Report { &report } else { b"{}" };
+        let mut row = vec![format!("publish `{shown}`")];
+        for comer in comers {
+            row.push(town.publishes(comer, &topic, payload).await);
+        }
+        rows.push(row);
+        let mut row = vec![format!("subscribe `{shown}`")];
+        for comer in comers {
+            row.push(town.subscribes(comer, &topic).await);
+        }
+        rows.push(row);
+    }
+    let wide = format!("taskd/v1/r/{}/+", town.robot.id);
+    let filters = [
+        ("taskd/v1/p/DIGEST", parts.as_str()),
+        ("taskd/v1/r/ROBOT/+", wide.as_str()),
+        ("taskd/v1/r/+/desired", "taskd/v1/r/+/desired"),
+        ("taskd/v1/#", "taskd/v1/#"),
+        ("#", "#"),
+        ("$SYS/#", "$SYS/#"),
+    ];
+    for (shown, filter) in filters {
+        let mut row = vec![format!("subscribe `{shown}`")];
+        for comer in comers {
+            row.push(town.subscribes(comer, filter).await);
+        }
+        rows.push(row);
+    }
+    let mut row = vec!["publish `taskd/v1/p/DIGEST`".to_owned()];
+    for comer in comers {
+        row.push(town.publishes(comer, &parts, b"x").await);
+    }
+    rows.push(row);
+    table(&header, &rows)
+}
+
+fn roles_table() -> String {
+    let mut header = vec!["role".to_owned()];
+    header.extend(Permission::ALL.map(|permission| permission.to_string()));
+    let row = |role: Role| {
+        let is_allowed = |permission| if role.permissions().contains(&permission) { "✓" } else { "" };
+        let mut row = vec![role.to_string()];
+        row.extend(Permission::ALL.map(|permission| is_allowed(permission).to_owned()));
+        row
+    };
+    table(&header, &Role::ALL.map(row))
+}
+
+const HEAD: &str = "\
+# Who may what
+
+Made by the test `permissions`, which calls every route and speaks and listens on every topic as everybody; it fails when this
+page is not what comes of it. `UPDATE_GOLDEN=1 cargo test -p taskd --test it permissions` writes it anew.
+
+A user has one role or several, and may do what any of them allows. Whoever is limited to some robots has `administer` for
+none of what concerns everybody, though an admin; see [people.md](people.md).
+
+";
+
+const HTTP: &str = "
+## HTTP
+
+`✓`: let in, whatever comes of it then. A number: refused with that status. \"Of other robots\": limited to robots among which
+the one in question is not; they see lists without it.
+
+";
+
+const MQTT: &str = "
+## MQTT
+
+`ROBOT` is the robot's id. `–`: does not come in at all.
+
+";
+
+#[tokio::test(flavor = "multi_thread")]
+async fn permissions_are_as_the_page_has_them() {
+    let mut town = Town::new().await;
+    let mut found = format!("{HEAD}{}{HTTP}", roles_table());
+    found += &http_table(&town).await;
+    found += MQTT;
+    found += &mqtt_table(&mut town).await;
+    // Nothing of all that opened a way for whoever was turned away.
+    let me: Value = answer(town.server.request(Method::GET, "/api/v1/me")).await;
+    assert_eq!(me["name"], "operator.token");
+    if std::env::var_os("UPDATE_GOLDEN").is_some() {
+        std::fs::write(DOCUMENT, &found).expect("written");
+    }
+    let written = std::fs::read_to_string(Path::new(DOCUMENT)).unwrap_or_default();
+    for (line, (is, was)) in found.lines().zip(written.lines()).enumerate() {
+        assert_eq!(is, was, "docs/permissions.md, line {}", line + 1);
+    }
+    assert_eq!(found.lines().count(), written.lines().count(), "docs/permissions.md has another length");
+}

@@ -1,0 +1,268 @@
+//! Someone who is limited to some robots, over HTTP and MQTT: what they see, what they are refused, and that nothing of what
+//! they lose goes on.
+
+use std::time::Duration;
+
+use futures_util::StreamExt as _;
+use reqwest::{Method, RequestBuilder, StatusCode};
+use serde_json::{Value, json};
+use task_proto::api::{AccessToken, DeploymentList, DeploymentView, OutputList, RobotList};
+use task_proto::report::Phase;
+use tokio::io::AsyncReadExt as _;
+
+use crate::harness::{TestRobot, TestServer, answer, refusal};
+use crate::mqtt_harness::{Connect, PATIENCE, Raw};
+use crate::outputs::{Push, file, output};
+use crate::people::PASSWORD;
+
+/// A server with a robot in the lab, one in the field, and people.
+struct Sites {
+    server: TestServer,
+    lab: TestRobot,
+    field: TestRobot,
+}
+
+impl Sites {
+    async fn new() -> Self {
+        let server = TestServer::start().await;
+        let (lab, field) = (server.enroll("atlas").await, server.enroll("boreas").await);
+        for (robot, site) in [(&lab, "lab"), (&field, "field")] {
+            let path = format!("/api/v1/robots/{}", robot.id);
+            let edit = server.request(Method::PATCH, &path).json(&json!({ "labels": { "site": site } }));
+            let _: Value = answer(edit).await;
+        }
+        Self { server, lab, field }
+    }
+
+    async fn add(&self, name: &str, roles: &[&str], scope: Option<&str>) {
+        let user = json!({ "name": name, "roles": roles, "scope": scope, "password": PASSWORD });
+        let _: Value = self.server.post("/api/v1/users", &user).await;
+    }
+
+    async fn log_in(&self, name: &str) -> AccessToken {
+        let request = self.server.bare(Method::POST, "/api/v1/login");
+        answer(request.json(&json!({ "user": name, "password": PASSWORD }))).await
+    }
+}
+
+/// Someone who asks by their token.
+struct Asker<'a> {
+    server: &'a TestServer,
+    token: String,
+}
+
+impl Asker<'_> {
+    fn ask(&self, method: Method, path: &str) -> RequestBuilder {
+        self.server.bare(method, path).bearer_auth(&self.token)
+    }
+
+    async fn status(&self, method: Method, path: &str) -> u16 {
+        self.ask(method, path).send().await.expect("an answer").status().as_u16()
+    }
+}
+
+fn out_of_scope() -> (u16, String) {
+    (403, "out_of_scope".to_owned())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn lists_and_views_have_only_ones_own_robots() {
+    let mut sites = Sites::new().await;
+    sites.add("alice", &["operator"], Some("site=lab")).await;
+    let package = sites.server.push("talker", "1.0.0").await;
+    let everywhere = sites.server.deploy(&package, "*", "everywhere").await;
+    let elsewhere = sites.server.deploy(&package, "boreas", "elsewhere").await;
+    for robot in [&sites.lab, &sites.field] {
+        let push = Push::new(&sites.server, robot, format!("outputs/{}/mapping", robot.id));
+        let map = push.blob(b"a map").await;
+        assert_eq!(push.output(&output(robot, 1, vec![file("map", map)])).await, StatusCode::CREATED);
+    }
+    let state = sites.server.desired(&sites.lab).await;
+    sites.server.report(&mut sites.lab, &state, Phase::Running).await;
+    let alice = Asker { server: &sites.server, token: sites.log_in("alice").await.token };
+
+    let robots: RobotList = answer(alice.ask(Method::GET, "/api/v1/robots")).await;
+    assert_eq!(robots.robots.iter().map(|robot| robot.name.as_str()).collect::<Vec<_>>(), ["atlas"]);
+    let robots: RobotList = answer(alice.ask(Method::GET, "/api/v1/robots?selector=boreas")).await;
+    assert!(robots.robots.is_empty());
+    let outputs: OutputList = answer(alice.ask(Method::GET, "/api/v1/outputs")).await;
+    assert_eq!(outputs.outputs.iter().map(|output| output.robot_name.as_str()).collect::<Vec<_>>(), ["atlas"]);
+    let deployments: DeploymentList = answer(alice.ask(Method::GET, "/api/v1/deployments")).await;
+    assert_eq!(deployments.deployments.len(), 1);
+    assert_eq!(deployments.deployments[0].counts.iter().map(|count| count.count).sum::<u64>(), 1);
+    let path = format!("/api/v1/deployments/{}", everywhere.id);
+    let part: DeploymentView = answer(alice.ask(Method::GET, &path)).await;
+    assert_eq!(part.counts, deployments.deployments[0].counts);
+    assert_eq!(part.state, task_proto::api::DeploymentState::Settled, "hers runs");
+    assert_eq!(part.assignments.expect("asked for").len(), 1);
+
+    let own = ["/api/v1/robots/atlas", "/api/v1/robots/atlas/logs", "/api/v1/outputs?robot=atlas"];
+    for path in own {
+        assert_eq!(alice.status(Method::GET, path).await, 200, "{path}");
+    }
+    let foreign = [
+        "/api/v1/robots/boreas".to_owned(),
+        format!("/api/v1/robots/{}", sites.field.id),
+        "/api/v1/robots/boreas/logs".to_owned(),
+        "/api/v1/robots/boreas/logs?follow=true".to_owned(),
+        "/api/v1/outputs?robot=boreas".to_owned(),
+        format!("/api/v1/deployments/{}", elsewhere.id),
+    ];
+    for path in foreign {
+        assert_eq!(refusal(alice.ask(Method::GET, &path)).await, out_of_scope(), "{path}");
+    }
+    let ask =
+        |robot: &str| alice.ask(Method::POST, &format!("/api/v1/robots/{robot}/ask")).json(&json!({ "type": "nodes" }));
+    assert_eq!(refusal(ask("atlas")).await, (409, "robot_offline".to_owned()));
+    assert_eq!(refusal(ask("boreas")).await, out_of_scope());
+
+    // In the registry: packages, and the outputs of her own robots.
+    assert_eq!(alice.status(Method::GET, "/v2/talker/tags/list").await, 200);
+    let tags = |robot: &TestRobot| format!("/v2/outputs/{}/mapping/tags/list", robot.id);
+    assert_eq!(alice.status(Method::GET, &tags(&sites.lab)).await, 200);
+    assert_eq!(alice.status(Method::GET, &tags(&sites.field)).await, 403);
+    let map = task_proto::Digest::of(b"a map");
+    let mount = format!("/v2/own/blobs/uploads/?mount={map}&from=outputs/{}/mapping", sites.field.id);
+    assert_eq!(alice.status(Method::POST, &mount).await, 403, "an operator does not push");
+    sites.add("carol", &["publisher"], Some("site=lab")).await;
+    let carol = Asker { server: &sites.server, token: sites.log_in("carol").await.token };
+    assert_eq!(carol.status(Method::POST, &mount).await, 202, "an upload begins instead");
+    assert_eq!(carol.status(Method::GET, &format!("/v2/own/blobs/{map}")).await, 404);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_order_says_how_many_robots_are_not_ones_own() {
+    let sites = Sites::new().await;
+    sites.add("alice", &["operator"], Some("site=lab")).await;
+    let package = sites.server.push("talker", "1.0.0").await;
+    let alice = Asker { server: &sites.server, token: sites.log_in("alice").await.token };
+    let order = |selector: &str, key: &str| {
+        let body = json!({ "package": package.name, "manifest": package.manifest.digest, "selector": selector });
+        alice.ask(Method::POST, "/api/v1/deployments").header("idempotency-key", key).json(&body)
+    };
+    let refused = order("*", "one").send().await.expect("an answer");
+    assert_eq!(refused.status(), StatusCode::FORBIDDEN);
+    let body: Value = refused.json().await.expect("json");
+    let said = "1 of the 2 robots of \"*\" are outside of alice's scope \"site=lab\"; nothing was done";
+    assert_eq!((&body["error"]["code"], &body["error"]["message"]), (&json!("out_of_scope"), &json!(said)));
+    assert_eq!(refusal(order("boreas", "two")).await, out_of_scope());
+    let ordered: DeploymentView = answer(order("site=lab", "three")).await;
+    assert_eq!(ordered.assignments.expect("asked for").len(), 1);
+    // What she may not at all says so in other words.
+    let me = alice.ask(Method::DELETE, "/api/v1/robots/atlas").send().await.expect("an answer");
+    let body: Value = me.json().await.expect("json");
+    assert_eq!(body["error"]["message"], "alice has no permission to maintain (roles: operator)");
+}
+
+/// The events that come on a stream, by name and data.
+struct Events {
+    chunks: futures_util::stream::BoxStream<'static, reqwest::Result<bytes::Bytes>>,
+    text: String,
+}
+
+impl Events {
+    async fn open(asker: &Asker<'_>) -> Self {
+        let response = asker.ask(Method::GET, "/api/v1/events").send().await.expect("an answer");
+        assert_eq!(response.status(), StatusCode::OK);
+        let mut events = Self { chunks: response.bytes_stream().boxed(), text: String::new() };
+        events.until(|text| text.contains("hello")).await;
+        events
+    }
+
+    /// Reads on until what came is enough.
+    async fn until(&mut self, is_enough: impl Fn(&str) -> bool) -> &str {
+        while !is_enough(&self.text) {
+            let chunk = tokio::time::timeout(PATIENCE, self.chunks.next()).await.expect("it should come");
+            let chunk = chunk.expect("the stream should go on").expect("no error");
+            self.text.push_str(std::str::from_utf8(&chunk).expect("text"));
+        }
+        &self.text
+    }
+
+    /// The stream ends by itself.
+    async fn ended(mut self) {
+        while let Some(Ok(_)) = tokio::time::timeout(PATIENCE, self.chunks.next()).await.expect("it should end") {}
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn events_are_of_ones_own_robots_and_end_with_ones_rights() {
+    let sites = Sites::new().await;
+    sites.add("alice", &["viewer"], Some("site=lab")).await;
+    let alice = Asker { server: &sites.server, token: sites.log_in("alice").await.token };
+    let mut events = Events::open(&alice).await;
+    let mut all = Events::open(&Asker { server: &sites.server, token: sites.server.operator.reveal() }).await;
+    let package = sites.server.push("talker", "1.0.0").await;
+    sites.server.deploy(&package, "boreas", "elsewhere").await;
+    let everywhere = sites.server.deploy(&package, "*", "everywhere").await;
+    let last = |text: &str| text.contains(everywhere.id.as_str());
+    all.until(|text| last(text) && text.contains("\"boreas\"") && text.contains("\"atlas\"")).await;
+    let seen = events.until(|text| last(text) && text.contains("\"atlas\"")).await;
+    assert!(!seen.contains("boreas") && !seen.contains(sites.field.id.as_str()), "{seen}");
+    let counted = seen.split("\"counts\":").nth(1).expect("a deployment");
+    assert!(counted.starts_with("[{\"phase\":\"assigned\",\"count\":1}]"), "{counted}");
+    // A robot that is removed elsewhere is none of her business either.
+    sites.server.request(Method::DELETE, "/api/v1/robots/boreas").send().await.expect("an answer");
+    all.until(|text| text.contains("robot_removed")).await;
+    sites.server.request(Method::DELETE, "/api/v1/robots/atlas").send().await.expect("an answer");
+    let seen = events.until(|text| text.contains("robot_removed")).await;
+    assert!(!seen.contains(sites.field.id.as_str()), "{seen}");
+
+    let edit = sites.server.request(Method::PATCH, "/api/v1/users/alice").json(&json!({ "scope": "site=field" }));
+    let _: Value = answer(edit).await;
+    events.ended().await;
+    let again = Events::open(&alice).await;
+    let gone = sites.server.request(Method::DELETE, "/api/v1/users/alice").send().await.expect("an answer");
+    assert_eq!(gone.status(), StatusCode::NO_CONTENT);
+    again.ended().await;
+    assert_eq!(alice.status(Method::GET, "/api/v1/events").await, 401);
+}
+
+async fn mqtt(sites: &Sites, token: &str) -> (Raw, [u8; 4]) {
+    let connect = Connect { password: Some(token.to_owned()), ..Connect::operator("") };
+    let stream = tokio::net::TcpStream::connect(&sites.server.server.addresses().mqtt).await.expect("listens");
+    let mut raw = Raw { stream };
+    raw.send(&connect.packet()).await;
+    let mut answer = [0; 4];
+    let read = tokio::time::timeout(PATIENCE, raw.stream.read_exact(&mut answer)).await.expect("an answer");
+    read.expect("an answer");
+    (raw, answer)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_revoked_token_ends_its_mqtt_session_at_once() {
+    let sites = Sites::new().await;
+    sites.add("alice", &["viewer"], None).await;
+    sites.add("bob", &["viewer"], Some("site=lab")).await;
+    let (alice, bob) = (sites.log_in("alice").await, sites.log_in("bob").await);
+    let (mut session, answer) = mqtt(&sites, &alice.token).await;
+    assert_eq!(answer, [0x20, 2, 0, 0]);
+    let (_, refused) = mqtt(&sites, &bob.token).await;
+    assert_eq!(refused, [0x20, 2, 0, 5], "over MQTT one hears every robot");
+    let path = format!("/api/v1/tokens/{}", alice.id);
+    let revoked = sites.server.request(Method::DELETE, &path).send().await.expect("an answer");
+    assert_eq!(revoked.status(), StatusCode::NO_CONTENT);
+    session.expect_close().await;
+    let (_, refused) = mqtt(&sites, &alice.token).await;
+    assert_eq!(refused, [0x20, 2, 0, 4]);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_sign_in_flood_does_not_keep_robots_waiting() {
+    let sites = Sites::new().await;
+    let mut flood = tokio::task::JoinSet::new();
+    for n in 0..200 {
+        let request = sites.server.bare(Method::POST, "/api/v1/login");
+        let request = request.json(&json!({ "user": format!("nobody{n}"), "password": "guess" }));
+        flood.spawn(async move { request.send().await.expect("an answer").status().as_u16() });
+    }
+    // While it lasts, a robot is answered.
+    for _ in 0..20 {
+        let asked = tokio::time::timeout(Duration::from_secs(5), sites.server.ask_desired(&sites.lab)).await;
+        assert_eq!(asked.expect("answered").status(), StatusCode::OK);
+    }
+    let answers = flood.join_all().await;
+    let count = |status: u16| answers.iter().filter(|answer| **answer == status).count();
+    assert_eq!(count(401) + count(429), answers.len(), "{answers:?}");
+    assert!(count(401) <= 50 && count(429) >= 150, "one address has its limit: {answers:?}");
+}

@@ -15,7 +15,7 @@ use http_body::{Body, Frame, SizeHint};
 use super::{Blob, BlobError};
 
 /// The most bytes handed out at once.
-const SLICE_BYTES: u64 = 256 * 1024;
+const SLICE_BYTES: u64 = 128 * 1024;
 /// The most bytes that are looked at ahead for whether they are in memory, in one system call, and that are read ahead if
 /// they are not. They may be thrown out again before they are sent; then a page is read where it should not be, which costs
 /// other connections a moment.

@@ -28,8 +28,9 @@ use crate::store::{Store, StoreError};
 const MAX_AT_ONCE: usize = 4;
 /// How often it is looked for something to do, if nothing has changed.
 const LOOK_INTERVAL: Duration = Duration::from_secs(5);
-/// How long after one look comes the next, whatever changes: what changes meanwhile is looked at together.
-const LOOK_PAUSE: Duration = Duration::from_millis(200);
+/// How long after one look comes the next, whatever changes: what changes meanwhile is looked at together. Robots that hear of
+/// an order ask for its parts at once, and are refused until it is seen here.
+const LOOK_PAUSE: Duration = Duration::from_millis(25);
 
 /// What fanning out needs. Clones share it.
 #[derive(Clone)]

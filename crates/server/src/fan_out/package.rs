@@ -13,8 +13,8 @@ use task_proto::{DeploymentId, RobotId};
 use tokio::sync::Notify;
 use tokio::time::{Instant, timeout};
 
+use super::FanOutWorker;
 use super::course::{Course, GivenUp, Step};
-use super::{FanOutWorker, LOOK_PAUSE};
 use crate::blobs::Blob;
 use crate::broker::{FanOut, FanOutError, FanOutSettings, Part, PartQos};
 use crate::part_requests::Listening;
@@ -24,7 +24,9 @@ use crate::store::StoreError;
 const TURN: Duration = Duration::from_millis(250);
 /// How long to wait for others once somebody has begun to listen: they tend to come together.
 const JOIN_PAUSE: Duration = Duration::from_millis(20);
-/// How often the database is asked who still needs the package, if nothing is known to have changed.
+/// How often the database is asked at most who still needs the package,
+const SYNC_PAUSE: Duration = Duration::from_millis(200);
+/// and how often if nothing is known to have changed.
 const SYNC_INTERVAL: Duration = Duration::from_secs(2);
 /// How long the last parts may take to be acknowledged before robots are waited for in another way.
 const SETTLE: Duration = Duration::from_secs(10);
@@ -46,6 +48,8 @@ struct Package<'a> {
     owners: BTreeMap<RobotId, Vec<DeploymentId>>,
     changed: Arc<Notify>,
     synced_at: Option<Instant>,
+    /// Whether orders may have changed since then.
+    is_stale: bool,
 }
 
 /// Why a fan-out ends before its time. It is tried again from the start.
@@ -110,6 +114,7 @@ impl FanOutWorker {
             owners: BTreeMap::new(),
             changed,
             synced_at: None,
+            is_stale: true,
         }))
     }
 
@@ -173,13 +178,13 @@ impl Package<'_> {
     /// Takes note of everything that may have happened, and tells those that were given up on to pull.
     async fn sync(&mut self) -> Result<(), Interrupted> {
         let now_ms = self.now_ms();
-        let has_changed = tokio::select! {
+        self.is_stale |= tokio::select! {
             biased;
             () = self.changed.notified() => true,
             () = std::future::ready(()) => false,
         };
-        let is_due =
-            self.synced_at.is_none_or(|at| at.elapsed() >= if has_changed { LOOK_PAUSE } else { SYNC_INTERVAL });
+        let pause = if self.is_stale { SYNC_PAUSE } else { SYNC_INTERVAL };
+        let is_due = self.synced_at.is_none_or(|at| at.elapsed() >= pause);
         if is_due {
             self.read_orders(now_ms).await?;
         }
@@ -197,7 +202,7 @@ impl Package<'_> {
     }
 
     async fn read_orders(&mut self, now_ms: u64) -> Result<(), Interrupted> {
-        self.synced_at = Some(Instant::now());
+        (self.synced_at, self.is_stale) = (Some(Instant::now()), false);
         self.owners.clear();
         for (deployment, robot) in self.worker.store.awaiting_parts(&self.content.digest).await? {
             self.owners.entry(robot).or_default().push(deployment);

@@ -18,7 +18,7 @@ impl Store {
     pub async fn direct_pushes(&self) -> Result<Vec<(DeploymentId, PackageRef)>, StoreError> {
         let rows: Vec<(String, String)> = sqlx::query_as(AssertSqlSafe(format!(
             "SELECT d.id, d.package FROM deployments d
-             WHERE EXISTS (SELECT 1 FROM assignments WHERE assignments.deployment_id = d.id AND {AWAITING})
+             WHERE d.id IN (SELECT assignments.deployment_id FROM assignments WHERE {AWAITING})
              ORDER BY d.priority DESC, d.number"
         )))
         .fetch_all(&self.reads)

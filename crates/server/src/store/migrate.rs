@@ -15,6 +15,7 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[
     (5, "broker_credentials", include_str!("../migrations/0005_broker_credentials.sql")),
     (6, "delivery", include_str!("../migrations/0006_delivery.sql")),
     (7, "people", include_str!("../migrations/0007_people.sql")),
+    (8, "direct_pushes", include_str!("../migrations/0008_direct_pushes.sql")),
 ];
 
 /// Applies what has not been applied yet.

@@ -41,6 +41,10 @@ pub use robots::{BrokerCredential, DesiredTasks, FetchedBy, KnownRobot};
 pub use tokens::{Admitted, EnrolmentTerms, TokenHolder};
 pub use users::{NewToken, User};
 
+/// What of a SQLite database the writer keeps in memory: 16 MiB.
+const WRITER_CACHE: &str = "PRAGMA cache_size = -16384";
+/// The same of each reader; what it lacks is in the system's memory.
+const READER_CACHE: &str = "PRAGMA cache_size = -4096";
 /// Connections that read at the same time.
 const READERS: u32 = 4;
 /// How long a statement waits for a connection or for another process's write.
@@ -153,9 +157,9 @@ impl Store {
         sqlx::any::install_default_drivers();
         let open_error = |source| StoreError::Open { url: without_password(url), source };
         // One writer: its transactions queue for this connection instead of failing each other.
-        let writes = pool_options(url, 1).connect(url).await.map_err(open_error)?;
+        let writes = pool_options(url, 1, WRITER_CACHE).connect(url).await.map_err(open_error)?;
         migrate::run(&writes).await.map_err(|source| StoreError::Migrate { url: without_password(url), source })?;
-        let reads = pool_options(url, READERS).connect(url).await.map_err(open_error)?;
+        let reads = pool_options(url, READERS, READER_CACHE).connect(url).await.map_err(open_error)?;
         Ok(Self { reads, writes, access: Access::default(), first_uses: FirstUses::default() })
     }
 
@@ -189,7 +193,7 @@ impl Store {
     }
 }
 
-fn pool_options(url: &str, connections: u32) -> AnyPoolOptions {
+fn pool_options(url: &str, connections: u32, cache: &'static str) -> AnyPoolOptions {
     let is_sqlite = url.starts_with("sqlite:");
     AnyPoolOptions::new().max_connections(connections).acquire_timeout(PATIENCE).after_connect(move |connection, _| {
         Box::pin(async move {
@@ -197,10 +201,11 @@ fn pool_options(url: &str, connections: u32) -> AnyPoolOptions {
                 // The pool can't carry SQLite's own options through `Any`. FULL: a commit survives a power cut.
                 sqlx::raw_sql(
                     "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; PRAGMA foreign_keys = ON;
-                     PRAGMA busy_timeout = 30000; PRAGMA cache_size = -16384;",
+                     PRAGMA busy_timeout = 30000;",
                 )
-                .execute(connection)
+                .execute(&mut *connection)
                 .await?;
+                sqlx::raw_sql(cache).execute(connection).await?;
             }
             Ok(())
         })

@@ -203,7 +203,7 @@ async fn more_than_an_announcement_carries_is_refused(database: TestDatabase) {
     assert_eq!(message, "delivery: talker 1 has 32769 B, inline carries at most 32768 B");
     order.delivery = DeliveryChoice::Adaptive;
     let id = fleet.actions.create_deployment(&fleet.operator, &random_key(), &order, &large).await.expect("ordered");
-    let because = "size 32769 B > 32768 B, batch 1 < 8";
+    let because = "size 32769 B > 32768 B";
     assert_eq!(decisions(&fleet, &id).await, [decision(Delivery::PushPull, "otherwise", because)]);
 }
 

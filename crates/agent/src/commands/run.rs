@@ -112,7 +112,8 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
         let access = MqttAccess { host, port, prefix, robot: robot_id, token: credential, status, message_bytes };
         converse(access, shared, heard, data, &config, robot);
     } else {
-        // Nobody is to wait for parts.
+        // Nobody is to wait for a session, or for parts.
+        shared.mqtt_tried.send_replace(true);
         shared.listening.session(false);
     }
     let stop = tokio::spawn(cancel_on_signal(shutdown));

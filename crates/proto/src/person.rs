@@ -2,8 +2,9 @@
 //!
 //! ```
 //! use task_proto::person::{Permission, Roles};
-//! let roles: Roles = "operator,publisher".parse().unwrap();
+//! let roles: Roles = "operator,publisher".parse()?;
 //! assert!(roles.allow(Permission::Operate) && !roles.allow(Permission::Administer));
+//! # Ok::<(), <Roles as std::str::FromStr>::Err>(())
 //! ```
 
 use std::collections::BTreeSet;

@@ -218,8 +218,8 @@ impl Write {
         Ok(())
     }
 
-    /// Forgets tokens that are good for nothing any more, and says whose they were if they were users'. The first token stays when it was revoked: it is in the data
-    /// directory, and must not come back to life at the next start.
+    /// Forgets tokens that are good for nothing any more, and says whose they were if they were users'. The first token stays
+    /// when it was revoked: it is in the data directory, and must not come back to life at the next start.
     pub async fn forget_ended_tokens(&mut self, now_ms: u64) -> Result<BTreeSet<UserName>, StoreError> {
         let users: Vec<Option<String>> = sqlx::query_scalar(
             "DELETE FROM tokens

@@ -23,8 +23,8 @@ use crate::server::{Sent, Server, ServerError};
 
 /// The longest wait before a report is posted again.
 const MAX_POST_BACKOFF_MS: u64 = 60 * 1000;
-/// Within this time a robot whose session takes reports also posts one, for the name and labels that only an answer brings.
-/// A fleet that starts at once spreads over it.
+/// Within this time a robot whose session takes its reports also posts one, for the name and labels that only an answer
+/// brings. A fleet that starts at once spreads over it.
 const FIRST_POST: Duration = Duration::from_secs(15);
 /// The longest wait between polls while the server refuses the token.
 const REFUSED_POLL: Duration = Duration::from_secs(300);
@@ -153,7 +153,11 @@ pub async fn over_http(server: Server, shared: Shared, intervals: Intervals, hea
         () = shared.shutdown.cancelled() => return,
     }
     let polling = poll(server.clone(), shared.clone(), intervals, heard.clone());
+    let stores = *shared.mqtt_stores.borrow();
     let asking = async {
+        if !stores {
+            return;
+        }
         tokio::time::sleep(FIRST_POST.mul_f64(rand::random())).await;
         shared.post.notify_one();
     };

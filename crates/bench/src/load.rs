@@ -4,9 +4,8 @@
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use anyhow::{Context as _, anyhow, ensure};
+use anyhow::{Context as _, anyhow};
 use clap::Args;
-use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use reqwest::Url;
 use task_proto::api::{CreateDeployment, CreateEnrollmentToken, DeliveryChoice, EnrollRequest, PhaseCount};
 use task_proto::id::Labels;
@@ -15,6 +14,7 @@ use task_proto::token::Token;
 use task_proto::{DeploymentId, Digest, MacAddress, TaskName, Version};
 
 use crate::load_report::{Facts, Format, LoadReport};
+use crate::machine::allow_files;
 use crate::measure::{PHASE_LIMIT, Phase, Sample, every};
 use crate::robot::{Identity, Robot};
 use crate::server::Server;
@@ -195,15 +195,8 @@ impl Load {
         let manifest = self.server.push_package(&package, &version).await?;
         self.manifest = Some(manifest);
         let order = CreateDeployment {
-            package,
-            manifest,
-            selector: self.label().parse()?,
             delivery: DeliveryChoice::PushPull,
-            priority: 0,
-            batch: None,
-            max_failures: None,
-            expires_in_s: None,
-            dry_run: false,
+            ..CreateDeployment::new(package, manifest, self.label().parse()?)
         };
         let begun = Instant::now();
         let deployment = self.server.order(&order).await?.id;
@@ -283,14 +276,4 @@ impl Load {
 fn host_and_port(text: &str) -> Result<(String, u16), String> {
     let (host, port) = text.rsplit_once(':').ok_or("expected HOST:PORT")?;
     Ok((host.to_owned(), port.parse().map_err(|_| format!("{port:?} is not a port"))?))
-}
-
-/// Each connection is an open file; many systems allow a program 1024 unless it asks for more.
-pub(crate) fn allow_files(needed: u64) -> anyhow::Result<()> {
-    let (soft, hard) = getrlimit(Resource::RLIMIT_NOFILE).context("the limit of open files")?;
-    ensure!(needed <= hard, "{needed} open files are needed, this system allows {hard} (ulimit -Hn)");
-    if soft < needed {
-        setrlimit(Resource::RLIMIT_NOFILE, needed, hard).context("the limit of open files")?;
-    }
-    Ok(())
 }

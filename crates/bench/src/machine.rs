@@ -1,8 +1,10 @@
 //! What a figure can't be read without: the machine and the commit it was measured with. What can't be found out is
-//! `unknown`, never an error.
+//! `unknown`, never an error. Also how much of the machine a run may use.
 
 use std::path::Path;
 
+use anyhow::{Context as _, ensure};
+use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use nix::sys::utsname::uname;
 use serde::{Deserialize, Serialize};
 
@@ -59,6 +61,20 @@ fn field(text: &str, name: &str, separator: char) -> Option<String> {
         let (key, value) = line.split_once(separator)?;
         (key.trim() == name).then(|| value.trim().trim_matches('"').to_owned())
     })
+}
+
+/// Lets this program and its children have `needed` open files each: every connection is one, on both sides.
+pub fn allow_files(needed: u64) -> anyhow::Result<()> {
+    let (soft, hard) = getrlimit(Resource::RLIMIT_NOFILE).context("the limit of open files")?;
+    if soft >= needed {
+        return Ok(());
+    }
+    let raised = setrlimit(Resource::RLIMIT_NOFILE, needed, hard.max(needed));
+    ensure!(
+        raised.is_ok(),
+        "{needed} open files are needed, this system allows {hard} (ulimit -Hn): raise it, run as root or ask for less"
+    );
+    Ok(())
 }
 
 #[cfg(test)]

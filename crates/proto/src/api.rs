@@ -355,6 +355,23 @@ pub struct CreateDeployment {
     pub dry_run: bool,
 }
 
+impl CreateDeployment {
+    /// An order that leaves everything else to the server.
+    pub fn new(package: TaskName, manifest: Digest, selector: Selector) -> Self {
+        Self {
+            package,
+            manifest,
+            selector,
+            delivery: DeliveryChoice::default(),
+            priority: 0,
+            batch: None,
+            max_failures: None,
+            expires_in_s: None,
+            dry_run: false,
+        }
+    }
+}
+
 /// Answer to a dry run, and to an order on tasks: the robots meant.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct MatchedRobots {

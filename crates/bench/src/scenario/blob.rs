@@ -11,7 +11,7 @@ use task_proto::desired::BlobRef;
 use super::cold;
 use crate::downloads::{Got, Target, Until, download};
 use crate::enrolment::enrol;
-use crate::load::allow_files;
+use crate::machine::allow_files;
 use crate::package::Package;
 use crate::peer::Peer;
 use crate::process::Usage;
@@ -121,17 +121,8 @@ pub(crate) async fn order_blob(
     let package = Package::random(name.parse()?, "1".parse()?, size, seed);
     let (name, content) = (package.name.clone(), package.content_blob());
     let manifest = server.push(package).await?;
-    let order = CreateDeployment {
-        package: name,
-        manifest,
-        selector: selector.parse()?,
-        delivery: DeliveryChoice::Poll,
-        priority: 0,
-        batch: None,
-        max_failures: None,
-        expires_in_s: None,
-        dry_run: false,
-    };
+    let order =
+        CreateDeployment { delivery: DeliveryChoice::Poll, ..CreateDeployment::new(name, manifest, selector.parse()?) };
     server.order(&order).await?;
     Ok(content)
 }

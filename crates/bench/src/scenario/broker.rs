@@ -17,7 +17,7 @@ use tokio::process::ChildStdin;
 use tokio::sync::Notify;
 use tokio::task::JoinHandle;
 
-use crate::load::allow_files;
+use crate::machine::allow_files;
 use crate::mqtt::{Heard, Link, Login, acknowledgement, message};
 use crate::peer::Peer;
 use crate::process::{Process, Program, Usage};

@@ -2,13 +2,13 @@
 
 use std::time::{Duration, Instant};
 
-use anyhow::{Context as _, ensure};
+use anyhow::Context as _;
 use clap::{Args, ValueEnum};
-use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use task_proto::api::DeliveryChoice;
 
 use super::run_once::{OneOrder, run_once};
 use crate::fleet::{FILES_PER_ROBOT, Fleet, ROBOTS_PER_PROCESS};
+use crate::machine::allow_files;
 use crate::progress::{RunProgress, say};
 use crate::run::{Figure, Plot, Point, Run, RunFlags, Unit};
 use crate::taskd::{Taskd, TaskdFlags, TaskdOrder};
@@ -154,18 +154,4 @@ fn plots() -> Vec<Plot> {
         plot("The server's own memory during the deployment", "server_anonymous", "RssAnon", Figure::Max),
         plot("Processor time of the server for the deployment", "server_cpu", "CPU", Figure::Max),
     ]
-}
-
-/// Each connection is an open file, on both sides; children inherit what is allowed here.
-fn allow_files(needed: u64) -> anyhow::Result<()> {
-    let (soft, hard) = getrlimit(Resource::RLIMIT_NOFILE).context("the limit of open files")?;
-    if soft >= needed {
-        return Ok(());
-    }
-    let raised = setrlimit(Resource::RLIMIT_NOFILE, needed, hard.max(needed));
-    ensure!(
-        raised.is_ok(),
-        "--robots: {needed} open files are needed, this system allows {hard} (ulimit -Hn): raise it, or run as root"
-    );
-    Ok(())
 }

@@ -60,17 +60,8 @@ pub async fn run_once(taskd: &Taskd, fleet: &mut Fleet, order: OneOrder) -> anyh
     let package = tokio::task::spawn_blocking(move || Package::random(of, version, bytes, seed)).await?;
     let payload = package.payload;
     let manifest = taskd.server.push(package).await.context("the package can't be pushed")?;
-    let create = CreateDeployment {
-        package: name.clone(),
-        manifest,
-        selector: first(order.robots, fleet.robots).parse()?,
-        delivery: order.choice,
-        priority: 0,
-        batch: None,
-        max_failures: None,
-        expires_in_s: None,
-        dry_run: false,
-    };
+    let selector = first(order.robots, fleet.robots).parse()?;
+    let create = CreateDeployment { delivery: order.choice, ..CreateDeployment::new(name.clone(), manifest, selector) };
     let (before, own) = own_bytes(taskd).await?;
     let (server, robots) = (taskd.usage(), fleet.usage());
     let ordered_ns = monotonic_ns();

@@ -17,7 +17,7 @@ use task_proto::{DeploymentId, Digest, Generation, InstanceId};
 use tokio::io::AsyncWriteExt as _;
 
 use crate::enrolment::enrol;
-use crate::load::allow_files;
+use crate::machine::allow_files;
 use crate::mqtt::{Heard, Link, Login, message};
 use crate::progress::{RunProgress, say};
 use crate::run::{Point, Run, RunFlags, Unit};
@@ -102,17 +102,8 @@ async fn connect(taskd: &Taskd, count: usize) -> anyhow::Result<Vec<Reporter>> {
     let robots = enrol(&taskd.server, count).await?;
     let (package, version) = ("status".parse()?, "1".parse()?);
     let manifest = taskd.server.push_package(&package, &version).await?;
-    let order = CreateDeployment {
-        package,
-        manifest,
-        selector: "*".parse()?,
-        delivery: DeliveryChoice::Poll,
-        priority: 0,
-        batch: None,
-        max_failures: None,
-        expires_in_s: None,
-        dry_run: false,
-    };
+    let order =
+        CreateDeployment { delivery: DeliveryChoice::Poll, ..CreateDeployment::new(package, manifest, "*".parse()?) };
     let deployment = taskd.server.order(&order).await?.id;
     let connecting = robots.iter().enumerate().map(|(number, robot)| {
         let deployment = &deployment;

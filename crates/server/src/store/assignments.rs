@@ -8,7 +8,7 @@ use sqlx::{AssertSqlSafe, Row as _};
 use task_proto::report::Phase;
 use task_proto::{DeploymentId, RobotId, TaskName};
 
-use super::rows::{groups, id, stored, values};
+use super::rows::{groups, id, parts_of, stored, values};
 use super::{StoreError, Write};
 
 /// What may be ordered about a task that a robot has.
@@ -277,10 +277,7 @@ impl Write {
             for robot in group {
                 query = query.bind(robot.as_str());
             }
-            let rows: Vec<(String, String)> = query.fetch_all(self.connection()).await?;
-            for (deployment, robot) in rows {
-                changed.push((id("assignments.deployment_id", &deployment)?, id("assignments.robot_id", &robot)?));
-            }
+            changed.extend(parts_of(query.fetch_all(self.connection()).await?)?);
         }
         let robots: Vec<RobotId> = changed.iter().map(|(_, robot)| robot.clone()).collect();
         self.raise_generations(&robots).await?;

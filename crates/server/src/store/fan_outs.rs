@@ -4,7 +4,7 @@ use sqlx::AssertSqlSafe;
 use task_proto::desired::{Delivery, PackageRef};
 use task_proto::{DeploymentId, Digest, RobotId};
 
-use super::rows::{from_json, groups, id, stored, values};
+use super::rows::{from_json, groups, id, parts_of, stored, values};
 use super::{Store, StoreError, Write};
 
 /// Assignments whose robot is to hear the package, and has not got all of it. Diverged robots are left alone.
@@ -78,10 +78,7 @@ impl Write {
             for (deployment, robot) in group {
                 query = query.bind(deployment.as_str()).bind(robot.as_str());
             }
-            let rows: Vec<(String, String)> = query.fetch_all(self.connection()).await?;
-            for (deployment, robot) in rows {
-                changed.push((id("assignments.deployment_id", &deployment)?, id("assignments.robot_id", &robot)?));
-            }
+            changed.extend(parts_of(query.fetch_all(self.connection()).await?)?);
         }
         let robots: Vec<RobotId> = changed.iter().map(|(_, robot)| robot.clone()).collect();
         self.raise_generations(&robots).await?;

@@ -5,6 +5,8 @@ use serde::de::DeserializeOwned;
 use sqlx::Row as _;
 use std::str::FromStr;
 
+use task_proto::{DeploymentId, RobotId};
+
 use super::StoreError;
 
 /// The most rows one statement carries; with [`groups`], a statement comes in few lengths, so its plan is reused. More would
@@ -63,6 +65,14 @@ pub(super) fn id<T: FromStr>(column: &'static str, text: &str) -> Result<T, Stor
 /// The same for a column that may be empty.
 pub(super) fn optional<T: FromStr>(column: &'static str, text: Option<String>) -> Result<Option<T>, StoreError> {
     text.map(|text| id(column, &text)).transpose()
+}
+
+/// Whose part of which deployment each row is.
+pub(super) fn parts_of(rows: Vec<(String, String)>) -> Result<Vec<(DeploymentId, RobotId)>, StoreError> {
+    let read = |(deployment, robot): (String, String)| {
+        Ok((id("assignments.deployment_id", &deployment)?, id("assignments.robot_id", &robot)?))
+    };
+    rows.into_iter().map(read).collect()
 }
 
 /// Cuts rows into groups of 64, 8 and 1.

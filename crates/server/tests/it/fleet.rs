@@ -3,9 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use task_proto::api::{
-    CreateDeployment, CreateEnrollmentToken, DeliveryChoice, DeploymentView, EnrollRequest, PackageView, RobotView,
-};
+use task_proto::api::{CreateDeployment, CreateEnrollmentToken, DeploymentView, EnrollRequest, PackageView, RobotView};
 use task_proto::desired::{BlobRef, DesiredState, DesiredTask, PackageRef};
 use task_proto::envelope::{DESIRED_STATE_TYPE, SigningKey};
 use task_proto::manifest::{TaskKind, TaskManifest};
@@ -226,15 +224,6 @@ pub fn package(version: &str, kind: TaskKind) -> PackageView {
 }
 
 pub fn order_of(package: &PackageView) -> CreateDeployment {
-    CreateDeployment {
-        package: package.package.name.clone(),
-        manifest: package.package.manifest.digest,
-        selector: "*".parse().expect("a selector"),
-        delivery: DeliveryChoice::default(),
-        priority: 0,
-        batch: None,
-        max_failures: None,
-        expires_in_s: None,
-        dry_run: false,
-    }
+    let package = &package.package;
+    CreateDeployment::new(package.name.clone(), package.manifest.digest, "*".parse().expect("a selector"))
 }

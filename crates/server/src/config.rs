@@ -6,7 +6,7 @@ mod settings;
 mod tables;
 
 use std::ffi::OsString;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -57,6 +57,8 @@ pub struct Config {
     pub max_mqtt_connections: usize,
     /// The most connections of one address that have said nothing yet, at each listener; the oldest is closed for a further one.
     pub max_silent_per_address: usize,
+    /// The addresses of reverse proxies that are believed about where a request came from.
+    pub trusted_proxies: Vec<IpAddr>,
     /// The most bytes one blob may have.
     pub max_blob_bytes: u64,
     /// How packages travel to robots.
@@ -229,6 +231,7 @@ impl Config {
             max_http_connections: 20_000,
             max_mqtt_connections: 20_000,
             max_silent_per_address: 2048,
+            trusted_proxies: Vec::new(),
             max_blob_bytes: 16 << 30,
             delivery: DeliverySettings::default(),
             transfers: TransferLimits::default(),

@@ -135,6 +135,7 @@ impl Server {
             events: EventFeed::new(),
             key: public_key,
             mqtt: Arc::new(mqtt),
+            trusted_proxies: config.trusted_proxies.clone().into(),
             http_traffic: http_traffic.clone(),
             data: data.path().to_owned(),
             stop: stop.clone(),

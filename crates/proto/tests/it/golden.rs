@@ -184,13 +184,13 @@ fn from_the_future(value: &Value) -> Value {
     }
 }
 
-fn check<T: Serialize + DeserializeOwned + PartialEq + Debug>(name: &str, value: &T) {
+pub fn check<T: Serialize + DeserializeOwned + PartialEq + Debug>(name: &str, value: &T) {
     check_text::<T>(name, value);
     let text = golden(name);
     assert_eq!(&serde_json::from_str::<T>(&text).expect("golden file parses"), value, "{name} reads back");
 }
 
-fn check_text<T: Serialize + DeserializeOwned>(name: &str, value: &T) {
+pub fn check_text<T: Serialize + DeserializeOwned>(name: &str, value: &T) {
     let written = serde_json::to_string_pretty(value).expect("json") + "\n";
     update_golden(name, &written);
     assert_eq!(written, golden(name), "{name} has changed on the wire");
@@ -198,7 +198,7 @@ fn check_text<T: Serialize + DeserializeOwned>(name: &str, value: &T) {
 }
 
 /// A reader of this version must not mind what a later version adds. Only where maps hold no free keys.
-fn check_tolerance<T: DeserializeOwned + PartialEq + Debug>(name: &str) {
+pub fn check_tolerance<T: DeserializeOwned + PartialEq + Debug>(name: &str) {
     let value: Value = serde_json::from_str(&golden(name)).expect("json");
     let now: T = serde_json::from_value(value.clone()).expect("reads its own");
     assert_eq!(serde_json::from_value::<T>(from_the_future(&value)).expect("reads the future"), now, "{name}");

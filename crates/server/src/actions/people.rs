@@ -273,7 +273,9 @@ impl Actions {
         let now_ms = self.clock.now_ms();
         if let Err(Blocked { until_ms, is_news }) = self.sign_ins.begin(name, hash.is_some(), address, now_ms) {
             if is_news {
-                self.note_blocked(name, address, until_ms, now_ms).await?;
+                // A name that nobody has may be a password in the wrong field.
+                let whose = if user.is_some() { name.as_str() } else { "nobody" };
+                self.note_blocked(whose, address, until_ms, now_ms).await?;
             }
             return Err(ActionError::SignInBlocked { seconds: until_ms.saturating_sub(now_ms).div_ceil(1000) });
         }
@@ -288,16 +290,10 @@ impl Actions {
         user.ok_or(ActionError::SignInRefused)
     }
 
-    async fn note_blocked(
-        &self,
-        name: &UserName,
-        address: IpAddr,
-        until_ms: u64,
-        now_ms: u64,
-    ) -> Result<(), StoreError> {
+    async fn note_blocked(&self, whose: &str, address: IpAddr, until_ms: u64, now_ms: u64) -> Result<(), StoreError> {
         let mut write = self.store.begin_reports().await?;
         // Nobody knows who it is, so nobody is named as the one who did it.
-        let deed = Deed::new("server".to_owned(), None, Some(address), Act::SignInBlocked, name);
+        let deed = Deed::new("server".to_owned(), None, Some(address), Act::SignInBlocked, whose);
         write.audit(&deed.with("until_ms", until_ms), now_ms).await?;
         write.commit().await
     }

@@ -1,6 +1,6 @@
 //! The one table of all settings that have a flag, a variable and a key in the file, and how their values are read.
 
-use std::net::{SocketAddr, ToSocketAddrs as _};
+use std::net::{IpAddr, SocketAddr, ToSocketAddrs as _};
 use std::path::PathBuf;
 
 use task_proto::part::{MAX_PART_BYTES, MIN_PART_BYTES};
@@ -153,6 +153,20 @@ pub(super) const SETTINGS: &[Setting] = &[
         set: |config, text| count(text, 1_000_000).map(|n| config.max_silent_per_address = n as usize),
     },
     Setting {
+        name: "trusted-proxies",
+        value_name: "ADDR,…",
+        help: "Addresses of reverse proxies whose X-Forwarded-For is believed [default: none]",
+        set: |config, text| {
+            let addresses = text.split(',').map(str::trim).filter(|text| !text.is_empty());
+            let parsed = addresses.map(|text| match text.parse::<IpAddr>() {
+                Ok(address) => Ok(address.to_canonical()),
+                Err(_) => Err(format!("{text:?} is not an IP address")),
+            });
+            config.trusted_proxies = parsed.collect::<Result<_, _>>()?;
+            Ok(())
+        },
+    },
+    Setting {
         name: "max-blob-bytes",
         value_name: "BYTES",
         help: "Most bytes of one blob [default: 17179869184]",
@@ -283,6 +297,18 @@ mod tests {
         for bad in ["", "KB", "-1 KB", "1.5 MB", "1 kb", "1 TB", "20000000000 GB", "1 KB "] {
             assert_eq!(size(bad), None, "{bad}");
         }
+    }
+
+    #[test]
+    fn proxies_are_a_list_of_addresses() {
+        let mut config = Config::with_data(PathBuf::new());
+        let setting = Setting::by_key("trusted_proxies").expect("there");
+        assert_eq!((setting.set)(&mut config, "::1, ::ffff:10.0.0.1"), Ok(()));
+        assert_eq!(config.trusted_proxies, [IpAddr::from([0, 0, 0, 0, 0, 0, 0, 1]), IpAddr::from([10, 0, 0, 1])]);
+        let error = (setting.set)(&mut config, "10.0.0.1,nginx").expect_err("refused");
+        assert_eq!(error, "\"nginx\" is not an IP address");
+        assert_eq!((setting.set)(&mut config, ""), Ok(()));
+        assert!(config.trusted_proxies.is_empty());
     }
 
     #[test]

@@ -18,12 +18,14 @@ pub mod oci;
 mod outputs;
 mod packages;
 mod people;
+mod proxy;
 mod robots;
 pub mod session;
 mod tasks;
 pub mod traffic;
 mod views;
 
+use std::net::IpAddr;
 use std::ops::Deref;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -94,6 +96,8 @@ pub struct AppParts {
     pub key: PublicKey,
     /// Where robots reach MQTT, and with which password.
     pub mqtt: Arc<MqttAccess>,
+    /// The addresses of reverse proxies that are believed about where a request came from.
+    pub trusted_proxies: Arc<[IpAddr]>,
     /// What went over HTTP.
     pub http_traffic: Arc<traffic::HttpTotals>,
     /// The data directory, which must be writable.
@@ -245,7 +249,7 @@ pub fn routes() -> Vec<Route> {
 
 /// All routes behind their guards.
 pub fn router(app: App) -> Router {
-    let mut router = Router::new();
+    let (mut router, trusted) = (Router::new(), app.trusted_proxies.clone());
     for route in routes() {
         let gate = Gate { app: app.clone(), access: route.access, deadline: route.deadline };
         let guard = middleware::from_fn_with_state(gate, guard);
@@ -257,12 +261,17 @@ pub fn router(app: App) -> Router {
         };
         router = router.route(route.path, handler);
     }
-    router
+    let router = router
         .fallback(nothing_here)
         .method_not_allowed_fallback(method_not_allowed)
         .layer(middleware::map_response(harden))
-        .layer(middleware::map_request(drain::drain_unread))
-        .with_state(app)
+        .layer(middleware::map_request(drain::drain_unread));
+    // Nothing stands in the way of each request where nobody is to be believed.
+    let router = match trusted.is_empty() {
+        true => router,
+        false => router.layer(middleware::map_request_with_state(trusted, proxy::see_through)),
+    };
+    router.with_state(app)
 }
 
 async fn nothing_here() -> ApiError {

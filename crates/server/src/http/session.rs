@@ -9,9 +9,9 @@ use axum::Json;
 use axum::extract::{ConnectInfo, State};
 use axum::response::{IntoResponse, Response};
 use http::{HeaderMap, StatusCode, header};
-use task_proto::Digest;
 use task_proto::api::{LogIn, SessionView, SignIn, TokenOrigin};
 use task_proto::token::Token;
+use task_proto::{Digest, UserName};
 use tokio_util::sync::{CancellationToken, DropGuard};
 
 use super::App;
@@ -28,6 +28,8 @@ const COOKIE: &str = "taskd_session";
 const LIFETIME_MS: u64 = PAGE_LIFETIME_MS;
 /// Sessions at a time; one more ends the oldest.
 const MOST_SESSIONS: usize = 1_024;
+/// Sessions of one person at a time, likewise: nobody signs everybody else out.
+const MOST_OF_ONE: usize = 32;
 
 /// Who is signed in. A session is found by the SHA-256 of its id.
 #[derive(Debug, Default)]
@@ -45,6 +47,8 @@ struct Entry {
 pub struct Session {
     /// The token it was begun with: a session ends when its token does.
     pub token: Token,
+    /// Whose it is.
+    pub user: UserName,
     /// When it ends by itself.
     pub expires_at_ms: u64,
     /// Cancelled when it ends before that.
@@ -53,16 +57,19 @@ pub struct Session {
 
 impl Sessions {
     /// Begins a session and gives the cookie's value.
-    fn begin(&self, token: Token, now_ms: u64) -> String {
+    fn begin(&self, token: Token, user: UserName, now_ms: u64) -> String {
         let id = format!("{:032x}{:032x}", rand::random::<u128>(), rand::random::<u128>());
         let mut sessions = self.lock();
         sessions.retain(|_, entry| entry.session.expires_at_ms > now_ms);
-        if sessions.len() >= MOST_SESSIONS {
-            let oldest = sessions.iter().min_by_key(|(_, entry)| entry.session.expires_at_ms).map(|(key, _)| *key);
+        let is_own = |entry: &Entry| entry.session.user == user;
+        let own = sessions.values().filter(|entry| is_own(entry)).count();
+        if own >= MOST_OF_ONE || sessions.len() >= MOST_SESSIONS {
+            let candidates = sessions.iter().filter(|(_, entry)| own < MOST_OF_ONE || is_own(entry));
+            let oldest = candidates.min_by_key(|(_, entry)| entry.session.expires_at_ms).map(|(key, _)| *key);
             oldest.map(|key| sessions.remove(&key));
         }
         let ended = CancellationToken::new();
-        let session = Session { token, expires_at_ms: now_ms + LIFETIME_MS, ended: ended.clone() };
+        let session = Session { token, user, expires_at_ms: now_ms + LIFETIME_MS, ended: ended.clone() };
         sessions.insert(Digest::of(id.as_bytes()), Entry { session, _end: ended.drop_guard() });
         id
     }
@@ -107,23 +114,24 @@ pub(super) async fn sign_in(
         require_same_origin(&headers)?;
     }
     let now_ms = app.clock.now_ms();
-    let token = match request {
+    let (token, user) = match request {
         SignIn { token: Some(token), user: None, password: None } => known_token(&app, &token, now_ms).await?,
         SignIn { token: None, user: Some(user), password: Some(password) } => {
             let order = LogIn { user, password, ttl_s: None };
-            app.actions.sign_in(&order, TokenOrigin::Page, peer.ip().to_canonical()).await?.token
+            let signed_in = app.actions.sign_in(&order, TokenOrigin::Page, peer.ip().to_canonical()).await?;
+            (signed_in.token, order.user)
         }
         _ => return Err(ApiError::invalid("user: expected a user and a password, or else a token")),
     };
-    let id = app.sessions.begin(token, now_ms);
+    let id = app.sessions.begin(token, user, now_ms);
     let view = SessionView { expires_at_ms: Some(now_ms + LIFETIME_MS) };
     Ok((set_cookie(&id, LIFETIME_MS / 1000), Json(view)).into_response())
 }
 
-async fn known_token(app: &App, text: &str, now_ms: u64) -> Result<Token, ApiError> {
+async fn known_token(app: &App, text: &str, now_ms: u64) -> Result<(Token, UserName), ApiError> {
     let token: Token = text.parse().map_err(|error| ApiError::unauthorized(format!("token: {error}")))?;
     match app.store.token_holder(&token, now_ms).await? {
-        Some(TokenHolder::Person(_)) => Ok(token),
+        Some(TokenHolder::Person(person)) => Ok((token, person.name)),
         _ => Err(ApiError::unauthorized("token: it is unknown, expired or revoked, or not a person's")),
     }
 }
@@ -152,6 +160,10 @@ mod tests {
 
     use super::*;
 
+    fn user(name: &str) -> UserName {
+        name.parse().expect("a name")
+    }
+
     fn with_cookie(text: String) -> HeaderMap {
         HeaderMap::from_iter([(header::COOKIE, text.parse().expect("a header"))])
     }
@@ -159,7 +171,7 @@ mod tests {
     #[test]
     fn a_session_is_found_until_it_expires_or_ends() {
         let sessions = Sessions::default();
-        let id = sessions.begin(Token::random(TokenKind::Operator), 1_000);
+        let id = sessions.begin(Token::random(TokenKind::Operator), user("alice"), 1_000);
         let headers = with_cookie(format!("theme=dark; {COOKIE}={id}"));
         let found = sessions.find(&headers, 1_001).expect("it lives");
         assert!(sessions.find(&headers, 1_000 + LIFETIME_MS).is_none());
@@ -173,8 +185,14 @@ mod tests {
     #[test]
     fn sessions_are_bounded() {
         let sessions = Sessions::default();
+        let bob = sessions.begin(Token::random(TokenKind::Operator), user("bob"), 0);
+        for now_ms in 1..2 * MOST_SESSIONS as u64 {
+            sessions.begin(Token::random(TokenKind::Operator), user("alice"), now_ms);
+        }
+        assert_eq!(sessions.lock().len(), MOST_OF_ONE + 1);
+        assert!(sessions.find(&with_cookie(format!("{COOKIE}={bob}")), 1).is_some(), "nobody signs others out");
         for now_ms in 0..2 * MOST_SESSIONS as u64 {
-            sessions.begin(Token::random(TokenKind::Operator), now_ms);
+            sessions.begin(Token::random(TokenKind::Operator), user(&format!("user{now_ms}")), now_ms);
         }
         assert_eq!(sessions.lock().len(), MOST_SESSIONS);
     }

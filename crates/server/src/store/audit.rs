@@ -238,6 +238,23 @@ mod tests {
     use super::*;
 
     #[test]
+    fn no_statement_changes_or_removes_an_entry() {
+        let here = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
+        let mut looked_at = 0;
+        for directory in ["store", "migrations"] {
+            for file in std::fs::read_dir(here.join(directory)).expect("a directory") {
+                let text = std::fs::read_to_string(file.expect("a file").path()).expect("text");
+                let statements = text.split_whitespace().collect::<Vec<_>>().join(" ").to_lowercase();
+                for verb in ["update", "delete from", "drop table", "alter table", "truncate"] {
+                    assert!(!statements.contains(&format!("{verb} audit ")), "{verb}");
+                }
+                looked_at += usize::from(statements.contains("into audit ("));
+            }
+        }
+        assert_eq!(looked_at, 1, "entries are added in one place");
+    }
+
+    #[test]
     fn a_text_is_kept_short_and_harmless() {
         assert_eq!(shortened("site=lab"), "site=lab");
         assert_eq!(shortened("a\u{1b}[2J\0b\n"), "a [2J b ");

@@ -248,6 +248,30 @@ async fn a_revoked_token_ends_its_mqtt_session_at_once() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_trusted_proxy_says_who_asks_and_nobody_else_does() {
+    let directory = tempfile::TempDir::new().expect("a directory");
+    let server = TestServer::start_in(directory, |config| config.trusted_proxies = vec![[127, 0, 0, 1].into()]).await;
+    let create = server.request(Method::POST, "/api/v1/enrollment-tokens").json(&json!({}));
+    let _: Value = answer(create.header("x-forwarded-for", "198.51.100.1, 192.0.2.7")).await;
+    let from = |audit: &Value| audit["records"][0]["entry"]["address"].clone();
+    assert_eq!(from(&server.get("/api/v1/audit").await), "192.0.2.7");
+    // Addresses behind it are counted apart.
+    let sign_in = |n: u8, from: &str| {
+        let request = server.bare(Method::POST, "/api/v1/login").header("x-forwarded-for", from);
+        request.json(&json!({ "user": format!("nobody{n}"), "password": "guess" })).send()
+    };
+    for n in 0..50 {
+        assert_eq!(sign_in(n, "192.0.2.7").await.expect("an answer").status(), 401);
+    }
+    assert_eq!(sign_in(50, "192.0.2.7").await.expect("an answer").status(), 429);
+    assert_eq!(sign_in(50, "192.0.2.8").await.expect("an answer").status(), 401);
+    let server = server.restart().await;
+    let create = server.request(Method::POST, "/api/v1/enrollment-tokens").json(&json!({}));
+    let _: Value = answer(create.header("x-forwarded-for", "192.0.2.7")).await;
+    assert_eq!(from(&server.get("/api/v1/audit").await), "127.0.0.1");
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_sign_in_flood_does_not_keep_robots_waiting() {
     let sites = Sites::new().await;
     let mut flood = tokio::task::JoinSet::new();

@@ -1,0 +1,77 @@
+//! The documents about people and the audit.
+
+use std::fmt::Debug;
+
+use task_proto::api::{AccessToken, Me, TokenOrigin, TokenView, UserView};
+use task_proto::audit::{AuditEntry, AuditRecord, Link};
+use task_proto::person::Permission;
+
+use crate::golden::{check, check_text, check_tolerance};
+
+fn parsed<T: std::str::FromStr<Err: Debug>>(text: &str) -> T {
+    text.parse().expect(text)
+}
+
+#[test]
+fn people_and_their_tokens() {
+    let user = UserView {
+        name: parsed("alice"),
+        roles: parsed("operator,publisher"),
+        scope: Some(parsed("site=lab")),
+        has_password: true,
+        created_at_ms: 1_800_000_000_000,
+    };
+    check("user_view.json", &user);
+    let token = TokenView {
+        id: parsed("0123456789ab"),
+        user: parsed("alice"),
+        origin: TokenOrigin::Token,
+        title: "a dashboard".to_owned(),
+        roles: Some(parsed("publisher")),
+        scope: None,
+        created_at_ms: 1_800_000_000_000,
+        expires_at_ms: Some(1_807_776_000_000),
+        revoked_at_ms: None,
+    };
+    check("token_view.json", &token);
+    let me = Me {
+        name: parsed("alice"),
+        roles: parsed("operator"),
+        permissions: vec![Permission::Read, Permission::Operate],
+        scope: vec![parsed("site=lab"), parsed("atlas,boreas")],
+        token: parsed("0123456789ab"),
+    };
+    check("me.json", &me);
+    let made = AccessToken {
+        id: parsed("0123456789ab"),
+        token: "tsko_…".to_owned(),
+        user: parsed("alice"),
+        expires_at_ms: 1_807_776_000_000,
+    };
+    check_text("access_token.json", &made);
+    check_tolerance::<UserView>("user_view.json");
+    check_tolerance::<TokenView>("token_view.json");
+    check_tolerance::<Me>("me.json");
+}
+
+/// An entry's bytes and how they are chained may never change: what was written down once has to hold for ever.
+#[test]
+fn entries_of_the_audit() {
+    let entry = AuditEntry {
+        number: 1,
+        at_ms: 1_800_000_000_000,
+        who: "alice".to_owned(),
+        token: Some(parsed("0123456789ab")),
+        address: Some(parsed("192.0.2.7")),
+        act: "deployment.create".to_owned(),
+        target: "d00000000000000b2".to_owned(),
+        detail: [("robots".to_owned(), "site=lab".to_owned())].into(),
+    };
+    check("audit_entry.json", &entry);
+    let text = serde_json::to_string(&entry).expect("json");
+    let link = Link::START.next(&text);
+    let entry = serde_json::value::RawValue::from_string(text).expect("json");
+    let record = AuditRecord { digest: link.digest, entry };
+    check_text("audit_record.json", &record);
+    assert_eq!(Link::START.follow(&record), Ok(link));
+}

@@ -10,11 +10,13 @@ use rumqttc::{AsyncClient, Event, EventLoop, MqttOptions, Packet, QoS};
 use serde_json::Value;
 use task_proto::RobotId;
 use task_proto::api::{LogsFrom, LogsView, ServerInfo};
+use task_proto::desired::Delivery;
 use task_proto::report::Phase;
 use tempfile::TempDir;
 use tokio::net::TcpStream;
 
-use crate::harness::{PATIENCE, Process, Robot, Server, eventually, write_package};
+use crate::harness::{PATIENCE, Process, Robot, Server, add_ballast, eventually, write_package};
+use crate::proxy::Proxy;
 
 const PASSWORD: &str = "the-servers-password";
 
@@ -185,6 +187,33 @@ async fn a_fleet_works_through_mosquitto_and_survives_the_loss_of_all_its_sessio
     })
     .await;
     assert!(!server_log(&server).contains(PASSWORD));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn packages_travel_inside_mosquittos_messages_when_the_order_says_so() {
+    let dir = TempDir::new().expect("temp dir");
+    let mosquitto = Mosquitto::start(dir.path()).await;
+    let server = Server::start_unready(&dir.path().join("server"), &[("TASKD_BROKER", &mosquitto.url())]).await;
+    let proxy = Proxy::start(server.http, u64::MAX).await;
+    let url = format!("http://{}", proxy.address);
+    let robot = Robot::start_with(&server, dir.path(), "robot-1", 1, &url, &[]).await;
+    mosquitto.learn(&server).await;
+    server.wait_ready().await;
+    wait_connected(&server, 1).await;
+    let ways = [("inline", Delivery::Inline, 24_000), ("direct-push", Delivery::DirectPush, 4 * 1024 * 1024)];
+    for (number, (name, delivery, bytes)) in ways.into_iter().enumerate() {
+        let version = format!("{}.0.0", number + 1);
+        let package = worker(dir.path(), &version);
+        add_ballast(&package, bytes);
+        let before = proxy.bytes_to_clients();
+        let ordered = server.push_with(&package, "*", &["--delivery", name]).await;
+        runs(&server, &robot.name, &version).await;
+        let pulled = proxy.bytes_to_clients() - before;
+        assert!(pulled < bytes as u64 / 2, "{name}: {pulled} bytes came over HTTP");
+        let view = server.deployment(ordered.id.as_str()).await.expect("known");
+        let chosen = view.assignments.expect("asked for")[0].delivery.clone().expect("its batch has begun");
+        assert_eq!(chosen.mechanism, delivery, "{chosen:?}");
+    }
 }
 
 /// A client with a robot's own name and password at the broker.

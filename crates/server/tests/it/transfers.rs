@@ -5,10 +5,13 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use reqwest::{Method, Response, StatusCode};
+use serde_json::json;
 use task_proto::Digest;
+use task_proto::api::{DeploymentView, RobotView};
+use taskd::config::SiteLimits;
 use tempfile::TempDir;
 
-use crate::harness::{TestRobot, TestServer};
+use crate::harness::{TestRobot, TestServer, answer};
 
 /// More than a connection holds while nobody reads.
 const BLOB_BYTES: usize = 8 * 1024 * 1024;
@@ -93,18 +96,77 @@ async fn who_waits_is_told_when_to_come_back_and_only_robots_wait() {
     assert_eq!(second.bytes().await.expect("bytes").len(), BLOB_BYTES);
 }
 
+/// When a robot is told to come back: after how many seconds.
+async fn told(server: &TestServer, robot: &TestRobot, blob: Digest) -> u64 {
+    let response = get(server, robot, blob).await;
+    assert_eq!(response.status(), StatusCode::TOO_MANY_REQUESTS);
+    response.headers()["retry-after"].to_str().expect("text").parse().expect("whole seconds")
+}
+
 #[tokio::test(flavor = "multi_thread")]
-async fn all_transfers_of_a_site_share_its_bandwidth() {
+async fn robots_of_an_order_with_priority_are_told_to_come_back_before_all_others() {
+    const OTHERS: usize = 5;
+    let directory = TempDir::new().expect("a directory");
+    let server = TestServer::start_in(directory, |config| config.transfers.all.max = Some(1)).await;
+    let calm = server.push_content("calm", "1.0.0", vec![7; BLOB_BYTES]).await;
+    let urgent = server.push_content("urgent", "1.0.0", vec![8; BLOB_BYTES]).await;
+    let hurried = server.enroll("hurried").await;
+    let mut others = Vec::new();
+    for number in 0..=OTHERS {
+        others.push(server.enroll(&format!("other-{number}")).await);
+    }
+    server.deploy(&calm, "*", "calm").await;
+    let (package, manifest) = (&urgent.name, urgent.manifest.digest);
+    let order = json!({ "package": package, "manifest": manifest, "selector": "hurried", "priority": 1 });
+    let _: DeploymentView = answer(server.order("/api/v1/deployments", "urgent", &order)).await;
+    // Nobody reads it, so the one transfer there may be stays under way.
+    let first = get(&server, &others[0], calm.content.digest).await;
+    assert_eq!(first.status(), StatusCode::OK);
+    let mut waiting = tokio::task::JoinSet::new();
+    let server = Arc::new(server);
+    for other in others.split_off(1) {
+        let (server, blob) = (server.clone(), calm.content.digest);
+        waiting.spawn(async move { told(&server, &other, blob).await });
+    }
+    let latest = waiting.join_all().await.into_iter().max().expect("some");
+    // A second is what each is taken to last, and up to half as much again is by chance.
+    assert!(latest >= OTHERS as u64, "{latest}");
+    let hurried = told(&server, &hurried, urgent.content.digest).await;
+    assert!(hurried <= 2, "{hurried}: it came last and is next");
+}
+
+/// Two robots in the same hall get a package through `limit`, which lets all of it through in a second.
+async fn two_pulls_take_two_seconds(limit: impl FnOnce(&mut taskd::config::Config, u64)) {
     const SMALL: usize = 256 * 1024;
     let directory = TempDir::new().expect("a directory");
-    let limit = |config: &mut taskd::config::Config| config.transfers.all.bytes_per_s = Some(SMALL as u64);
-    let server = TestServer::start_in(directory, limit).await;
+    let server = TestServer::start_in(directory, |config| limit(config, SMALL as u64)).await;
     let package = server.push_content("talker", "1.0.0", vec![7; SMALL]).await;
-    let (one, two) = (server.enroll("one").await, server.enroll("two").await);
+    let mut robots = Vec::new();
+    for name in ["one", "two"] {
+        let robot = server.enroll(name).await;
+        let path = format!("/api/v1/robots/{}", robot.id);
+        let edit = server.request(Method::PATCH, &path).json(&json!({ "labels": { "site": "hall" } }));
+        let _: RobotView = answer(edit).await;
+        robots.push(robot);
+    }
     server.deploy(&package, "*", "key-1").await;
     let begun = tokio::time::Instant::now();
     let whole = async |robot| get(&server, robot, package.content.digest).await.bytes().await.expect("bytes").len();
-    assert_eq!(tokio::join!(whole(&one), whole(&two)), (SMALL, SMALL));
-    // Two seconds' worth of bytes, the last piece and the first moment aside.
+    assert_eq!(tokio::join!(whole(&robots[0]), whole(&robots[1])), (SMALL, SMALL));
+    // The last piece and the first moment aside.
     assert!(begun.elapsed() >= Duration::from_millis(1_500));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn all_transfers_share_the_bandwidth() {
+    two_pulls_take_two_seconds(|config, pace| config.transfers.all.bytes_per_s = Some(pace)).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn all_transfers_of_a_site_share_its_bandwidth() {
+    two_pulls_take_two_seconds(|config, pace| {
+        let hall = SiteLimits { max: None, bytes_per_s: Some(pace) };
+        config.transfers.sites.insert("hall".parse().expect("valid"), hall);
+    })
+    .await;
 }

@@ -1,5 +1,5 @@
 //! The only place that reads the time. Waits and elapsed times use milliseconds since boot, suspend included, because a
-//! robot's wall clock may jump; the wall clock is only asked whether a signed state has expired.
+//! robot's wall clock may jump; the wall clock is only asked whether a signed state or a certificate has expired.
 
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
@@ -18,7 +18,12 @@ pub fn wall_ms() -> u64 {
 }
 
 /// Milliseconds since the Unix epoch before which this program did not exist: a wall clock that shows less is wrong.
-pub const PROGRAM_EXISTS_SINCE_MS: u64 = 1_767_225_600_000;
+pub const PROGRAM_EXISTS_SINCE_MS: u64 = task_transport::BUILT_MS;
+
+/// The wall clock as certificates are judged by it.
+pub fn for_certificates() -> task_transport::Clock {
+    task_transport::Clock::new(wall_ms)
+}
 
 fn millis(duration: Duration) -> u64 {
     u64::try_from(duration.as_millis()).unwrap_or(u64::MAX)

@@ -37,6 +37,9 @@ pub struct Settings {
     /// Whether MQTT is used; `false`: the robot only polls.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub mqtt: Option<bool>,
+    /// How MQTT gets to the server.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub mqtt_transport: Option<MqttTransport>,
     /// The name the robot gives itself; the server's wins.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub name: Option<RobotName>,
@@ -85,6 +88,19 @@ pub struct GateSettings {
     /// What it means when it hangs, crashes or can't be run.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub default: Option<GateDefault>,
+}
+
+/// How MQTT gets to the server.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum MqttTransport {
+    /// Over its own port; where that can't be reached, as a WebSocket over the HTTP port.
+    #[default]
+    Auto,
+    /// Only over its own port.
+    Tcp,
+    /// Only as a WebSocket over the HTTP port.
+    Websocket,
 }
 
 /// What holds when the gate gives no answer.
@@ -173,6 +189,8 @@ pub struct Config {
     pub server: Option<reqwest::Url>,
     /// Whether MQTT is used.
     pub mqtt: bool,
+    /// How it gets to the server.
+    pub mqtt_transport: MqttTransport,
     /// The name the robot gives itself.
     pub name: Option<RobotName>,
     /// The labels it gives itself, if it gives any.
@@ -276,6 +294,7 @@ impl Config {
         let config = Self {
             server: settings.server.as_deref().map(parse_server).transpose()?,
             mqtt: settings.mqtt.unwrap_or(true),
+            mqtt_transport: settings.mqtt_transport.unwrap_or_default(),
             name: settings.name,
             labels: settings.labels,
             underlays: settings.underlays.unwrap_or_default(),
@@ -344,7 +363,7 @@ pub fn parse_server(text: &str) -> Result<reqwest::Url, ConfigError> {
 fn override_by(table: &mut Table, name: &str, text: &str) -> Result<(), ConfigError> {
     let key = name[VARIABLE_PREFIX.len()..].to_ascii_lowercase();
     let value = match key.as_str() {
-        "server" | "name" | "task_user" => Value::String(text.to_owned()),
+        "server" | "name" | "task_user" | "mqtt_transport" => Value::String(text.to_owned()),
         "gate_command" => Value::Array(vec![Value::String(text.to_owned())]),
         "underlays" => {
             let paths = text.split(':').filter(|path| !path.is_empty());

@@ -8,7 +8,8 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use task_proto::api::MqttEndpoint;
 use task_proto::envelope::PublicKey;
-use task_proto::{MacAddress, RobotId};
+use task_proto::{CaPin, MacAddress, RobotId};
+use task_transport::Trust;
 
 use crate::{durable, permanent_address};
 
@@ -34,6 +35,9 @@ pub struct Identity {
     pub server: String,
     /// The key that signs its desired states.
     pub server_key: PublicKey,
+    /// The certificate authority that made the server's certificate; absent: the system's roots vouch for it, if it has one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ca_pin: Option<CaPin>,
     /// How to reach MQTT.
     pub mqtt: MqttEndpoint,
     /// The MAC it was registered by.
@@ -87,6 +91,11 @@ impl Identity {
             Err(error) if error.kind() == io::ErrorKind::NotFound => Err(IdentityError::Missing(path.to_owned())),
             Err(source) => Err(IdentityError::Io { path: path.to_owned(), source }),
         }
+    }
+
+    /// Whom the robot takes for its server.
+    pub fn trust(&self) -> Trust {
+        Trust::by(self.ca_pin)
     }
 
     /// Writes it, readable by its owner only.
@@ -175,7 +184,8 @@ mod tests {
             token_since_ms: 0,
             server: "http://server".to_owned(),
             server_key: task_proto::envelope::SigningKey::random().public_key(),
-            mqtt: MqttEndpoint { host: None, port: 1883, prefix: Default::default(), external: None },
+            ca_pin: None,
+            mqtt: MqttEndpoint { host: None, port: 1883, prefix: Default::default(), tls: false, external: None },
             mac: "02:00:00:00:00:01".parse().expect("valid"),
         };
         identity.write(&path).expect("written");

@@ -6,14 +6,17 @@
 //! What is heard is acknowledged by hand: a part once it was written, all else at once. A part that nobody takes is all
 //! that is held here; until somebody does, nothing more is read.
 
+mod line;
+mod room;
 mod subscriptions;
+mod ways;
 
 use std::collections::VecDeque;
 use std::time::Duration;
 
 use rumqttc::{
     AsyncClient, ConnectReturnCode, ConnectionError, Event, EventLoop, LastWill, MqttOptions, Outgoing, Packet,
-    Publish, QoS, StateError,
+    Publish, QoS, StateError, Transport,
 };
 use task_proto::RobotId;
 use task_proto::api::{ExternalBroker, MqttEndpoint};
@@ -21,11 +24,16 @@ use task_proto::desired::{Doorbell, MAX_DOORBELL_BYTES};
 use task_proto::report::Status;
 use task_proto::request::Request;
 use task_proto::topic::{RobotTopic, Topic, TopicPrefix};
+use task_transport::Route;
 use tokio::sync::mpsc;
 use tokio::time::Instant;
 
+use self::line::{Line, LineError};
+use self::room::MessageRoom;
 use self::subscriptions::Subscriptions;
+pub use self::ways::Ways;
 use crate::credential::Credential;
+use crate::effects::chain;
 use crate::link::{Heard, Message, Shared, Talk};
 use crate::parts::{Acknowledgement, Arrived, Due};
 use crate::plan::backoff_ms;
@@ -33,7 +41,7 @@ use crate::plan::backoff_ms;
 /// How often the broker hears from an idle robot.
 const KEEP_ALIVE: Duration = Duration::from_secs(20);
 /// How long connecting may take.
-const CONNECT_TIMEOUT_S: u64 = 10;
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(10);
 /// The longest wait between two tries to connect.
 const MAX_BACKOFF_MS: u64 = 60 * 1000;
 /// The longest wait after the broker refused this robot.
@@ -72,6 +80,8 @@ pub struct MqttAccess {
     pub status: Status,
     /// The largest message that is read at first, [`MESSAGE_BYTES`]. Only for a wanted package it gets larger.
     pub message_bytes: usize,
+    /// How to get there.
+    pub ways: Ways,
 }
 
 /// Why a session ended.
@@ -82,6 +92,8 @@ enum Ended {
     TooNarrow,
     /// The server says that it goes elsewhere.
     Moved,
+    /// The way to the broker is not open.
+    Unreachable(LineError),
     /// Anything else.
     Lost(ConnectionError),
     /// The agent ends.
@@ -98,8 +110,9 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
         access.status.connection += 1;
         let begun = Instant::now();
         let room = MessageRoom::of(&access, &shared, sends_large);
-        let (there, external) = access.at(endpoint.borrow_and_update().as_ref());
-        let session = session(&there, external.as_ref(), &shared, &heard, &mut talk, room);
+        let (there, external, is_encrypted) = access.at(endpoint.borrow_and_update().as_ref());
+        let way = access.ways.next(&there.host, there.port, is_encrypted, external.is_some());
+        let session = session(&there, external.as_ref(), way, &shared, &heard, &mut talk, room);
         let ended = tokio::select! {
             // Cancel-safe: nothing follows. The broker notices that the session is gone.
             ended = session => ended,
@@ -110,6 +123,9 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
         shared.mqtt_tried.send_replace(true);
         if !was_up {
             shared.find.notify_one();
+            if matches!(ended, Ended::Lost(_) | Ended::Unreachable(_)) {
+                access.ways.turn();
+            }
         }
         // Whoever waits for parts need not give up if the next session comes at once.
         shared.listening.session(matches!(ended, Ended::TooNarrow));
@@ -121,6 +137,7 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
                 continue;
             }
             Ended::Moved => {
+                access.ways.begin_anew();
                 failures = 0;
                 continue;
             }
@@ -129,6 +146,10 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
                 // Whether the robot was removed is asked over HTTP, whose answer is the server's own.
                 shared.poll.notify_one();
                 MAX_REFUSED_BACKOFF_MS
+            }
+            Ended::Unreachable(error) => {
+                tracing::info!(error = %chain(&error), "no MQTT session");
+                MAX_BACKOFF_MS
             }
             Ended::Lost(error) => {
                 tracing::info!(%error, "no MQTT session");
@@ -151,44 +172,13 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
 }
 
 impl MqttAccess {
-    /// What holds at `endpoint`, and what is otherwise there than at the server's own broker.
-    fn at(&self, endpoint: Option<&MqttEndpoint>) -> (Self, Option<ExternalBroker>) {
-        let Some(MqttEndpoint { host, port, prefix, external }) = endpoint.cloned() else {
-            return (self.clone(), None);
+    /// What holds at `endpoint`, what is otherwise there than at the server's own broker, and whether it speaks TLS.
+    fn at(&self, endpoint: Option<&MqttEndpoint>) -> (Self, Option<ExternalBroker>, bool) {
+        let Some(MqttEndpoint { host, port, prefix, tls, external }) = endpoint.cloned() else {
+            return (self.clone(), None, false);
         };
         let host = host.unwrap_or_else(|| self.host.clone());
-        (Self { host, port, prefix, ..self.clone() }, external)
-    }
-}
-
-/// How large a message a session reads. It can't change while the session lasts.
-#[derive(Clone, Copy)]
-struct MessageRoom {
-    bytes: usize,
-    /// Whether it has to hold whole packages.
-    holds_packages: bool,
-}
-
-impl MessageRoom {
-    fn of(access: &MqttAccess, shared: &Shared, holds_packages: bool) -> Self {
-        let wanted = if holds_packages { Self::for_wanted(shared) } else { 0 };
-        Self { bytes: wanted.max(access.message_bytes), holds_packages }
-    }
-
-    /// What the largest wanted package takes as one message.
-    fn for_wanted(shared: &Shared) -> usize {
-        let message = shared.listening.largest_bytes().saturating_add(AROUND_MESSAGE_BYTES as u64);
-        usize::try_from(message.min(MAX_MESSAGE_BYTES)).unwrap_or(usize::MAX)
-    }
-
-    /// Whether a message of a wanted package does not fit.
-    fn is_too_narrow(&self, shared: &Shared) -> bool {
-        self.holds_packages && Self::for_wanted(shared) > self.bytes
-    }
-
-    /// Whether a message of `bytes` did not fit, and may be one of a wanted package.
-    fn was_too_narrow(&self, bytes: usize, shared: &Shared) -> bool {
-        bytes > self.bytes && bytes <= Self::for_wanted(shared)
+        (Self { host, port, prefix, ..self.clone() }, external, tls)
     }
 }
 
@@ -204,14 +194,20 @@ enum Published {
 async fn session(
     access: &MqttAccess,
     external: Option<&ExternalBroker>,
+    way: Option<Route>,
     shared: &Shared,
     heard: &mpsc::Sender<Heard>,
     talk: &mut Talk,
     room: MessageRoom,
 ) -> Ended {
     let Talk { requests, messages, lines } = talk;
-    let (client, mut event_loop) = AsyncClient::new(options(access, external, room), QUEUED_REQUESTS);
-    event_loop.network_options.set_connection_timeout(CONNECT_TIMEOUT_S);
+    let line = match open(way.as_ref()).await {
+        Ok(line) => line,
+        Err(error) => return Ended::Unreachable(error),
+    };
+    let options = options(access, external, line.as_ref(), room);
+    let (client, mut event_loop) = AsyncClient::new(options, QUEUED_REQUESTS);
+    event_loop.network_options.set_connection_timeout(CONNECT_TIMEOUT.as_secs());
     // An acknowledgement that waits for another packet to be answered would hold the sender up.
     event_loop.network_options.set_tcp_nodelay(true);
     let (events_in, mut events) = mpsc::channel(QUEUED_EVENTS);
@@ -219,7 +215,8 @@ async fn session(
     let (mut reports, mut wishes) = (shared.reports.subscribe(), shared.listening.changes());
     let (pump, acknowledgements) =
         (pump(&mut event_loop, events_in, room, shared), acknowledge_all(client.clone(), due));
-    tokio::pin!(pump, acknowledgements);
+    let carrying = carry(line);
+    tokio::pin!(pump, acknowledgements, carrying);
     let mut session = Session {
         access,
         is_external: external.is_some(),
@@ -243,8 +240,9 @@ async fn session(
         tokio::select! {
             // Cancel-safe: the future is pinned outside of the loop and goes on where it was.
             ended = &mut pump => return ended,
-            // Cancel-safe, likewise. It does not end before the session does.
+            // Cancel-safe, likewise. Neither ends before the session does.
             () = &mut acknowledgements => {}
+            () = &mut carrying => {}
             // Cancel-safe: a message stays in the channel until it is received.
             Some(event) = events.recv(), if session.parked.is_none() => session.take(event).await,
             // Cancel-safe: a place that was not taken stays free.
@@ -291,6 +289,22 @@ async fn pump(event_loop: &mut EventLoop, events: mpsc::Sender<Event>, room: Mes
             Err(error) => return Ended::Lost(error),
         }
     }
+}
+
+/// The line for a way that rumqttc can't take itself.
+async fn open(way: Option<&Route>) -> Result<Option<Line>, LineError> {
+    match way {
+        Some(way) => Line::open(way, CONNECT_TIMEOUT).await.map(Some),
+        None => Ok(None),
+    }
+}
+
+/// Carries what rumqttc says and hears, if it can't do that itself. That the line is through it sees by itself.
+async fn carry(line: Option<Line>) {
+    if let Some(line) = line {
+        line.carry().await;
+    }
+    std::future::pending().await
 }
 
 /// Acknowledges what is due, until nobody can say any more what is.
@@ -494,8 +508,19 @@ impl Session<'_> {
     }
 }
 
-fn options(access: &MqttAccess, external: Option<&ExternalBroker>, room: MessageRoom) -> MqttOptions {
-    let mut options = MqttOptions::new(access.robot.as_str(), &access.host, access.port);
+fn options(
+    access: &MqttAccess,
+    external: Option<&ExternalBroker>,
+    line: Option<&Line>,
+    room: MessageRoom,
+) -> MqttOptions {
+    let mut options = match line {
+        Some(line) => MqttOptions::new(access.robot.as_str(), line.name(), 0),
+        None => MqttOptions::new(access.robot.as_str(), &access.host, access.port),
+    };
+    if line.is_some() {
+        options.set_transport(Transport::Unix);
+    }
     let password = external.map_or_else(|| access.token.current(), |external| external.password.clone());
     options.set_credentials(access.robot.as_str(), password);
     options.set_clean_session(true);

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use reqwest::header::{ETAG, HeaderMap, HeaderValue, IF_NONE_MATCH, RETRY_AFTER};
 use reqwest::{Method, StatusCode, Url};
+use rustls::ClientConfig;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use task_proto::RobotId;
@@ -72,11 +73,10 @@ pub struct Sent {
     pub tag: Option<HeaderValue>,
 }
 
-/// The one HTTP client of the agent.
-pub fn client() -> Result<reqwest::Client, reqwest::Error> {
-    // The second call in a process finds it installed: that is fine.
-    let _ = rustls::crypto::ring::default_provider().install_default();
+/// The one HTTP client of the agent, which speaks TLS like this.
+pub fn client(tls: ClientConfig) -> Result<reqwest::Client, reqwest::Error> {
     reqwest::Client::builder()
+        .tls_backend_preconfigured(tls)
         .connect_timeout(CONNECT_TIMEOUT)
         .timeout(REQUEST_TIMEOUT)
         .pool_idle_timeout(KEPT_CONNECTION)

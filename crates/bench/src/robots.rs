@@ -20,7 +20,7 @@ use task_agent::fetch::{FetchSettings, Fetcher};
 use task_agent::layout::DataDir;
 use task_agent::ledger::Ledger;
 use task_agent::link::{self, Heard, Intervals, Shared, Talk};
-use task_agent::mqtt::{self, MqttAccess};
+use task_agent::mqtt::{self, MqttAccess, Ways};
 use task_agent::outputs::Registry;
 use task_agent::server;
 use task_proto::report::{HostFacts, Phase, Report, Status, TaskReport};
@@ -139,6 +139,7 @@ async fn assemble(crew: &Crew, number: usize, member: &Member) -> anyhow::Result
         token: credential,
         status,
         message_bytes: mqtt::MESSAGE_BYTES,
+        ways: Ways::plain(),
     };
     Ok(Assembled { driver, shared, access, server })
 }

@@ -22,7 +22,7 @@ use crate::manifest::{TaskKind, TaskManifest};
 use crate::output::OutputSet;
 use crate::report::{ActiveVersion, Condition, Failure, HostFacts, LinkFacts, Phase, Progress};
 use crate::selector::Selector;
-use crate::{DeploymentId, Digest, Generation, MacAddress, RobotId, RobotName, TaskName, Version};
+use crate::{CaPin, DeploymentId, Digest, Generation, MacAddress, RobotId, RobotName, TaskName, Version};
 
 /// Where the API begins.
 pub const BASE: &str = "/api/v1";
@@ -52,6 +52,9 @@ pub struct ServerInfo {
     pub version: String,
     /// The key that signs desired states.
     pub key: PublicKey,
+    /// The pin of the authority that made its certificate, if that is its own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ca_pin: Option<CaPin>,
     /// Where MQTT is: the listener's address, `host:port`, as bound, or the external broker's.
     pub mqtt: String,
     /// The server's clock.

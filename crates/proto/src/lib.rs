@@ -13,6 +13,7 @@ pub mod oci;
 pub mod output;
 pub mod part;
 pub mod person;
+pub mod pin;
 pub mod report;
 pub mod request;
 pub mod ros;
@@ -26,3 +27,4 @@ pub use id::{
     DeploymentId, Generation, InstanceId, MacAddress, RepositoryName, RobotId, RobotName, Tag, TaskName, TokenId,
     UserName, Version,
 };
+pub use pin::CaPin;

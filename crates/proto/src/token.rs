@@ -1,13 +1,14 @@
 //! Bearer tokens: `tsko_`, `tske_`, `tskr_` (operator, enrolment, robot), an id, 256 random bits and a CRC-32, so that a
-//! mistyped token is refused before anything is looked up. An enrolment token also carries the server's public key.
+//! mistyped token is refused before anything is looked up. An enrolment token also carries the server's public key and,
+//! where the server has a private certificate authority, the pin of that.
 //! Only the SHA-256 of a secret is ever stored; tokens never appear in `Debug` output.
 
 use std::fmt;
 use std::str::FromStr;
 
-use crate::Digest;
 use crate::digest::{hex, unhex};
 use crate::envelope::PublicKey;
+use crate::{CaPin, Digest};
 
 /// Whose token it is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -37,6 +38,7 @@ pub struct Token {
     id: [u8; 6],
     secret: [u8; 32],
     server_key: Option<PublicKey>,
+    ca_pin: Option<CaPin>,
 }
 
 /// A text that is not a token.
@@ -47,12 +49,12 @@ pub struct InvalidToken;
 impl Token {
     /// A fresh operator's or robot's token.
     pub fn random(kind: TokenKind) -> Self {
-        Self { kind, id: rand::random(), secret: rand::random(), server_key: None }
+        Self { kind, id: rand::random(), secret: rand::random(), server_key: None, ca_pin: None }
     }
 
-    /// A fresh enrolment token that pins `server_key`.
-    pub fn random_enrolment(server_key: PublicKey) -> Self {
-        Self { server_key: Some(server_key), ..Self::random(TokenKind::Enrolment) }
+    /// A fresh enrolment token that pins `server_key` and, if there is one, the server's certificate authority.
+    pub fn random_enrolment(server_key: PublicKey, ca_pin: Option<CaPin>) -> Self {
+        Self { server_key: Some(server_key), ca_pin, ..Self::random(TokenKind::Enrolment) }
     }
 
     /// Whose token it is.
@@ -75,6 +77,11 @@ impl Token {
         self.server_key.as_ref()
     }
 
+    /// The pinned certificate authority of an enrolment token.
+    pub fn ca_pin(&self) -> Option<CaPin> {
+        self.ca_pin
+    }
+
     /// The token's full text, secret included.
     pub fn reveal(&self) -> String {
         let body = self.body();
@@ -88,6 +95,10 @@ impl Token {
             body.push('_');
             body.push_str(&hex(&key.to_bytes()));
         }
+        if let Some(pin) = &self.ca_pin {
+            body.push('_');
+            body.push_str(&pin.to_string());
+        }
         body
     }
 }
@@ -100,18 +111,19 @@ impl FromStr for Token {
             return Err(InvalidToken);
         }
         let fields: Vec<&str> = body.split('_').collect();
-        let (kind, server_key) = match fields[..] {
-            ["tsko", _, _] => (TokenKind::Operator, None),
-            ["tskr", _, _] => (TokenKind::Robot, None),
-            ["tske", _, _, key] => {
+        let (kind, server_key, ca_pin) = match fields[..] {
+            ["tsko", _, _] => (TokenKind::Operator, None, None),
+            ["tskr", _, _] => (TokenKind::Robot, None, None),
+            ["tske", _, _, key, ref pin @ ..] if pin.len() <= 1 => {
                 let key = unhex(key).and_then(PublicKey::from_bytes).ok_or(InvalidToken)?;
-                (TokenKind::Enrolment, Some(key))
+                let pin = pin.first().map(|pin| pin.parse().map_err(|_| InvalidToken)).transpose()?;
+                (TokenKind::Enrolment, Some(key), pin)
             }
             _ => return Err(InvalidToken),
         };
         let id = unhex(fields[1]).ok_or(InvalidToken)?;
         let secret = unhex(fields[2]).ok_or(InvalidToken)?;
-        Ok(Self { kind, id, secret, server_key })
+        Ok(Self { kind, id, secret, server_key, ca_pin })
     }
 }
 
@@ -129,11 +141,31 @@ mod tests {
     #[test]
     fn tokens_parse_back_and_hide_their_secret() {
         let key = SigningKey::random().public_key();
-        for token in [Token::random(TokenKind::Operator), Token::random(TokenKind::Robot), Token::random_enrolment(key)]
-        {
+        let pin = Some(CaPin::of(b"an authority's key"));
+        for token in [
+            Token::random(TokenKind::Operator),
+            Token::random(TokenKind::Robot),
+            Token::random_enrolment(key.clone(), None),
+            Token::random_enrolment(key, pin),
+        ] {
             let text = token.reveal();
             assert_eq!(text.parse(), Ok(token.clone()));
             assert!(!format!("{token:?}").contains(&text[18..40]));
+        }
+    }
+
+    #[test]
+    fn what_a_token_pins_is_in_its_text() {
+        let (key, pin) = (SigningKey::random().public_key(), CaPin::of(b"an authority's key"));
+        let token = Token::random_enrolment(key.clone(), Some(pin));
+        let read: Token = token.reveal().parse().expect("a token");
+        assert_eq!((read.server_key(), read.ca_pin()), (Some(&key), Some(pin)));
+        assert!(token.reveal().contains(&format!("_{pin}_")));
+        let with_checksum = |body: String| format!("{body}_{:08x}", crc32fast::hash(body.as_bytes()));
+        let body = token.body();
+        assert!(with_checksum(body.clone()).parse::<Token>().is_ok());
+        for wrong in [format!("{body}_{pin}"), body.replace(&pin.to_string(), "ab")] {
+            assert_eq!(with_checksum(wrong).parse::<Token>(), Err(InvalidToken));
         }
     }
 

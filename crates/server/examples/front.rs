@@ -55,6 +55,7 @@ fn main() -> anyhow::Result<()> {
     let connected = Arc::new(Connected::default());
     let config = BrokerConfig {
         listen: ([127, 0, 0, 1], 0).into(),
+        tls: None,
         prefix: TopicPrefix::default(),
         limits: Limits { max_silent_per_address: 20_000, ..Limits::default() },
     };

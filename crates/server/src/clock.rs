@@ -21,6 +21,11 @@ impl Clock {
         Self(Source::System)
     }
 
+    /// The machine's clock as certificates are judged by it.
+    pub fn for_certificates() -> task_transport::Clock {
+        task_transport::Clock::new(|| Self::system().now_ms())
+    }
+
     /// A clock that stands at `now_ms` until it is moved with [`Clock::advance_ms`].
     pub fn fixed(now_ms: u64) -> Self {
         Self(Source::Fixed(Arc::new(AtomicU64::new(now_ms))))

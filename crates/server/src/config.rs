@@ -4,6 +4,7 @@
 
 mod settings;
 mod tables;
+mod tls;
 
 use std::ffi::OsString;
 use std::net::{IpAddr, SocketAddr};
@@ -17,6 +18,7 @@ use task_proto::topic::TopicPrefix;
 
 use self::settings::{SETTINGS, Setting};
 pub use self::tables::{SiteLimits, TransferLimits};
+pub use self::tls::TlsSettings;
 use crate::broker_url::BrokerUrl;
 use crate::delivery::{Rule, Rules};
 
@@ -37,6 +39,8 @@ pub struct Config {
     pub topic_prefix: TopicPrefix,
     /// Whether unencrypted listeners may be reached from other machines.
     pub allow_plaintext: bool,
+    /// Whether and how the listeners encrypt.
+    pub tls: TlsSettings,
     /// How long an assignment may stay undone.
     pub assignment_expiry: Duration,
     /// How long a signed desired state allows new work to be begun.
@@ -189,10 +193,18 @@ pub enum ConfigError {
         /// Where the broker is.
         address: String,
     },
+    /// A certificate without its key, or the other way round.
+    #[error("{given}: {missing} is missing")]
+    HalfACertificate {
+        /// The setting there is.
+        given: &'static str,
+        /// The one there is not.
+        missing: &'static str,
+    },
     /// An unencrypted listener would be reachable from other machines.
     #[error(
-        "{key} = {address}: unencrypted connections from other machines are refused; bind a loopback address or \
-         give --allow-plaintext"
+        "{key} = {address}: unencrypted connections from other machines are refused; leave out --tls-private-ca=false, \
+         bind a loopback address or give --allow-plaintext"
     )]
     Plaintext {
         /// Which listener.
@@ -203,7 +215,7 @@ pub enum ConfigError {
 }
 
 /// Variables that other commands and tasks use; `serve` is not confused by finding them.
-const FOREIGN_VARIABLES: [&str; 4] = ["TASKD_SERVER", "TASKD_TOKEN", "TASKD_ASSIGNMENT", "TASKD_LOG"];
+const FOREIGN_VARIABLES: [&str; 5] = ["TASKD_SERVER", "TASKD_TOKEN", "TASKD_PIN", "TASKD_ASSIGNMENT", "TASKD_LOG"];
 /// What the test suite's own variables start with.
 const TEST_VARIABLES: &str = "TASKD_TEST_";
 /// The largest configuration file that is read.
@@ -221,6 +233,7 @@ impl Config {
             database: None,
             topic_prefix: TopicPrefix::default(),
             allow_plaintext: false,
+            tls: TlsSettings::default(),
             assignment_expiry: 7 * DAY,
             desired_lifetime: 30 * DAY,
             public_mqtt_host: None,
@@ -263,14 +276,29 @@ impl Config {
         if let Some(broker) = config.broker.as_ref().filter(|broker| !broker.is_loopback() && !config.allow_plaintext) {
             return Err(ConfigError::PlaintextBroker { address: broker.address() });
         }
-        // Nothing listens for MQTT beside an external broker.
-        let mqtt = config.broker.is_none().then_some(("mqtt", config.mqtt));
-        for (key, address) in [("http", config.http)].into_iter().chain(mqtt) {
-            if !address.ip().is_loopback() && !config.allow_plaintext {
-                return Err(ConfigError::Plaintext { key, address });
+        match (&config.tls.certificate, &config.tls.key) {
+            (Some(_), None) => Err(ConfigError::HalfACertificate { given: "tls.certificate", missing: "tls.key" }),
+            (None, Some(_)) => Err(ConfigError::HalfACertificate { given: "tls.key", missing: "tls.certificate" }),
+            _ => Ok(()),
+        }?;
+        match config.reached_from_elsewhere() {
+            Some((key, address)) if !config.encrypts() && !config.allow_plaintext => {
+                Err(ConfigError::Plaintext { key, address })
             }
+            _ => Ok(config),
         }
-        Ok(config)
+    }
+
+    /// Whether both listeners speak TLS.
+    pub fn encrypts(&self) -> bool {
+        self.tls.encrypts(self.reached_from_elsewhere().is_some(), self.allow_plaintext)
+    }
+
+    /// A listener that is reached from other machines.
+    fn reached_from_elsewhere(&self) -> Option<(&'static str, SocketAddr)> {
+        // Nothing listens for MQTT beside an external broker.
+        let mqtt = self.broker.is_none().then_some(("mqtt", self.mqtt));
+        [("http", self.http)].into_iter().chain(mqtt).find(|(_, address)| !address.ip().is_loopback())
     }
 
     fn apply(&mut self, key: &str, text: &str, origin: Origin) -> Result<(), ConfigError> {
@@ -485,10 +513,38 @@ mod tests {
 
     #[test]
     fn plain_text_beyond_loopback_must_be_allowed() {
-        let message = load(&[("mqtt", "0.0.0.0:1883")], &[], None).expect_err("refused");
+        let elsewhere = ("mqtt", "0.0.0.0:1883");
+        let message = load(&[elsewhere, ("tls-private-ca", "false")], &[], None).expect_err("refused");
         assert!(message.starts_with("mqtt = 0.0.0.0:1883: unencrypted"), "{message}");
-        let flags = [("mqtt", "0.0.0.0:1883"), ("allow-plaintext", "true")];
-        assert!(load(&flags, &[], None).expect("allowed").allow_plaintext);
+        let encrypts = |flags: &[_], file| load(flags, &[], file).expect("allowed").encrypts();
+        let own = Some("[tls]\ncertificate = \"/etc/c.pem\"\nkey = \"/etc/k.pem\"");
+        assert!(!encrypts(&[], None));
+        assert!(encrypts(&[elsewhere], None));
+        assert!(!encrypts(&[elsewhere, ("allow-plaintext", "true")], None));
+        assert!(!encrypts(&[elsewhere, ("broker", "embedded"), ("allow-plaintext", "true")], None));
+        assert!(encrypts(&[("tls-private-ca", "true")], None));
+        assert!(encrypts(&[("allow-plaintext", "true")], own));
+        assert!(encrypts(&[("tls-private-ca", "false")], own));
+    }
+
+    #[test]
+    fn robots_are_told_the_pin_unless_there_is_an_own_certificate() {
+        let tells_pin = |file: &str| load(&[], &[], Some(file)).expect("loads").tls.tells_pin();
+        let own = "[tls]\ncertificate = \"/etc/c.pem\"\nkey = \"/etc/k.pem\"\n";
+        assert!(tells_pin("http = \"0.0.0.0:8080\""));
+        assert!(!tells_pin(own));
+        assert!(tells_pin(&format!("{own}private_ca = true")));
+        for (file, expected) in [
+            ("[tls]\ncertificate = \"c.pem\"", "tls.certificate: tls.key is missing"),
+            ("[tls]\nkey = \"k.pem\"", "tls.key: tls.certificate is missing"),
+            ("[tls]\nnames = \"a b\"", "tls.names in taskd.toml: \"a b\" is neither a host name nor an address"),
+            ("[tls]\ncert = \"c.pem\"", "tls.cert in taskd.toml: there is no such setting"),
+        ] {
+            let message = load(&[], &[], Some(file)).expect_err(expected);
+            assert!(message.starts_with(expected), "{message}");
+        }
+        let names = load(&[("tls-names", "fleet.lab, 10.0.0.7")], &[], None).expect("loads").tls.names;
+        assert_eq!(names, ["fleet.lab", "10.0.0.7"]);
     }
 
     #[test]

@@ -1,6 +1,6 @@
-//! The server's directory: made on the first start, locked while a server runs, home of the signing key, the secret
-//! behind robots' passwords at an external broker, the first operator's token and the addresses that are bound. It never
-//! touches the database or the blobs in it.
+//! The server's directory: made on the first start, locked while a server runs, home of the signing key, the private
+//! certificate authority, the secret behind robots' passwords at an external broker, the first operator's token and the
+//! addresses that are bound. It never touches the database or the blobs in it.
 
 use std::fs::{DirBuilder, File, OpenOptions, TryLockError};
 use std::io::{self, Write as _};
@@ -8,14 +8,16 @@ use std::os::unix::fs::{DirBuilderExt as _, OpenOptionsExt as _};
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use task_proto::Digest;
 use task_proto::envelope::SigningKey;
 use task_proto::token::{Token, TokenKind};
+use task_proto::{CaPin, Digest};
 
 const LOCK: &str = "taskd.lock";
 const SIGNING_KEY: &str = "signing.key";
 const BROKER_SECRET: &str = "broker.secret";
 const OPERATOR_TOKEN: &str = "operator.token";
+const AUTHORITY_KEY: &str = "ca.key";
+const AUTHORITY_CERTIFICATE: &str = "ca.pem";
 const ADDRESSES: &str = "addresses.json";
 
 /// A directory that is ours until this is dropped.
@@ -32,6 +34,17 @@ pub struct Addresses {
     pub http: String,
     /// Where MQTT is reached, `host:port`.
     pub mqtt: String,
+    /// The pin of the authority behind the certificates of both, which speak TLS if there is one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ca_pin: Option<CaPin>,
+}
+
+impl Addresses {
+    /// The server's URL.
+    pub fn url(&self) -> String {
+        let scheme = if self.ca_pin.is_some() { "https" } else { "http" };
+        format!("{scheme}://{}", self.http)
+    }
 }
 
 /// Why the directory can't be used.
@@ -98,6 +111,25 @@ impl DataDirectory {
         self.secret(BROKER_SECRET, "a secret of 64 hex digits", rand::random)
     }
 
+    /// The key of the private certificate authority, as PEM; `fresh` on the first start. Robots pin it.
+    pub fn authority_key(&self, fresh: String) -> Result<String, DataError> {
+        self.read_or_make(&self.path.join(AUTHORITY_KEY), || fresh)
+    }
+
+    /// The authority's own certificate, as PEM, for those who import it; `fresh` on the first start.
+    pub fn authority_certificate(&self, fresh: String) -> Result<String, DataError> {
+        self.read_or_make(&self.path.join(AUTHORITY_CERTIFICATE), || fresh)
+    }
+
+    /// That one of these two files is of no use.
+    pub fn authority_is_wrong(&self, is_key: bool) -> DataError {
+        let (name, expected) = match is_key {
+            true => (AUTHORITY_KEY, "a certificate authority's key"),
+            false => (AUTHORITY_CERTIFICATE, "the certificate of the key in ca.key"),
+        };
+        DataError::Content { path: self.path.join(name), expected }
+    }
+
     /// The token of the first operator, made on the first start.
     pub fn operator_token(&self) -> Result<Token, DataError> {
         let path = self.operator_token_path();
@@ -136,6 +168,7 @@ impl DataDirectory {
         match std::fs::read_to_string(path) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => {
                 let text = make();
+                let text = text.trim_end().to_owned();
                 self.write_new(path, &format!("{text}\n")).map_err(io_error)?;
                 Ok(text)
             }

@@ -33,6 +33,7 @@ pub mod rollout;
 pub mod serve;
 pub mod sign_ins;
 pub mod store;
+pub mod tls;
 pub mod transfers;
 pub mod uplink;
 pub mod web;

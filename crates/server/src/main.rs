@@ -79,19 +79,30 @@ async fn serve(flags: &ServeFlags) -> anyhow::Result<ExitCode> {
     }
     // Installed before anything is started, so that an early signal stops it softly as well.
     let mut signals = Signals::install().context("signals can't be caught")?;
+    let mut hangup = signal(SignalKind::hangup()).context("signals can't be caught")?;
     let server = Server::start(config, Clock::system()).await?;
     say_what_next(&server);
-    let code = tokio::select! {
-        () = signals.next() => ExitCode::SUCCESS,
-        seen = server.broken() => {
-            tracing::error!(seen, "MQTT can't be served any more, so the server ends; start it again");
-            ExitCode::FAILURE
+    let code = loop {
+        tokio::select! {
+            () = signals.next() => break ExitCode::SUCCESS,
+            _ = hangup.recv() => reload(&server),
+            seen = server.broken() => {
+                tracing::error!(seen, "MQTT can't be served any more, so the server ends; start it again");
+                break ExitCode::FAILURE;
+            }
         }
     };
     tracing::info!("stopping; a second signal ends it at once");
     tokio::select! {
         () = server.stop() => Ok(code),
         () = signals.next() => Ok(ExitCode::FAILURE),
+    }
+}
+
+/// SIGHUP: looks for a new certificate now. The server looks by itself every few seconds.
+fn reload(server: &Server) {
+    if let Err(error) = server.reload_certificate() {
+        tracing::warn!(error = &error as &dyn std::error::Error, "the certificate stays what it was");
     }
 }
 
@@ -119,7 +130,7 @@ fn fit_to(config: &mut Config, files: usize) {
 /// On stdout: where the server is, and the first three things to do with it.
 fn say_what_next(server: &Server) {
     let addresses = server.addresses();
-    let url = format!("http://{}", addresses.http);
+    let url = addresses.url();
     let data = server.data().path().display();
     let token = server.data().operator_token_path();
     let text = format!(
@@ -128,8 +139,13 @@ fn say_what_next(server: &Server) {
          The page:        {url}/   (sign in with the token in {token})\n\
          A robot:         taskd enroll-token create --data {data}\n\
          \x20                task-agent enroll --server {url} --token TOKEN\n\
-         A first package: taskd push DIR --to '*' --wait --data {data}\n",
+         A first package: taskd push DIR --to '*' --wait --data {data}\n\
+         {elsewhere}",
         mqtt = addresses.mqtt,
+        elsewhere = addresses
+            .ca_pin
+            .map(|pin| format!("Commands from elsewhere: taskd --pin {pin} --server …\n"))
+            .unwrap_or_default(),
         token = token.display(),
     );
     // Nobody may be reading; the server serves all the same.

@@ -33,9 +33,9 @@ struct External {
 }
 
 impl MqttAccess {
-    /// Robots come to the server's own broker, with their tokens.
-    pub fn embedded(host: Option<String>, port: u16, prefix: TopicPrefix) -> Self {
-        Self { endpoint: MqttEndpoint { host, port, prefix, external: None }, external: None }
+    /// Robots come to the server's own broker, with their tokens. `tls`: it speaks that.
+    pub fn embedded(host: Option<String>, port: u16, prefix: TopicPrefix, tls: bool) -> Self {
+        Self { endpoint: MqttEndpoint { host, port, prefix, tls, external: None }, external: None }
     }
 
     /// Robots go to the broker at `url`, at `host` and `port` if these are given.
@@ -48,7 +48,7 @@ impl MqttAccess {
     ) -> Self {
         // What is loopback here is this machine for robots elsewhere: the host they know the server by.
         let host = host.or_else(|| (!url.is_loopback()).then(|| url.host.clone()));
-        let endpoint = MqttEndpoint { host, port: port.unwrap_or(url.port), prefix, external: None };
+        let endpoint = MqttEndpoint { host, port: port.unwrap_or(url.port), prefix, tls: false, external: None };
         let external = External { secret, user_name: url.user_name.clone(), password: url.password.clone() };
         Self { endpoint, external: Some(external) }
     }
@@ -189,7 +189,7 @@ mod tests {
         assert_ne!(changed[2], lines[2]);
         assert!(!files.passwd.contains("hunter2"));
         assert!(files.acl.contains("\npattern write taskd/v1/r/%u/status\n"), "{}", files.acl);
-        assert!(MqttAccess::embedded(None, 1, TopicPrefix::default()).files(&robots).is_none());
+        assert!(MqttAccess::embedded(None, 1, TopicPrefix::default(), false).files(&robots).is_none());
     }
 
     #[test]

@@ -19,7 +19,7 @@ use crate::changes::{Change, Changes};
 use crate::chooser::{Chooser, ServerLoad};
 use crate::clock::Clock;
 use crate::collector;
-use crate::config::Config;
+use crate::config::{Config, TlsSettings};
 use crate::data_directory::{Addresses, DataDirectory, DataError};
 use crate::downlink::Downlink;
 use crate::fan_out::FanOutWorker;
@@ -33,6 +33,7 @@ use crate::report_writer::ReportWriter;
 use crate::requests::Requests;
 use crate::robot_logs::RobotLogs;
 use crate::store::{Store, StoreError, sqlite_url};
+use crate::tls::{Tls, TlsError};
 use crate::transfers::Transfers;
 use crate::uplink::Uplink;
 
@@ -44,6 +45,8 @@ const SESSION_PATIENCE: Duration = Duration::from_secs(5);
 const WRITER_PATIENCE: Duration = Duration::from_secs(3);
 /// And last the database's connections.
 const DATABASE_PATIENCE: Duration = Duration::from_secs(1);
+/// How long a TLS handshake may take before an HTTP request.
+const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
 /// How often the server looks for assignments that have expired.
 const EXPIRY_INTERVAL: Duration = Duration::from_secs(30);
 /// How often it looks for robots that have fallen silent.
@@ -60,6 +63,9 @@ pub enum ServeError {
     /// The database can't be used.
     #[error(transparent)]
     Store(#[from] StoreError),
+    /// There is no certificate to encrypt with.
+    #[error(transparent)]
+    Tls(#[from] TlsError),
     /// The blob store can't be used.
     #[error("the blob store can't be opened")]
     Blobs(#[from] BlobError),
@@ -82,6 +88,7 @@ pub struct Server {
     addresses: Addresses,
     store: Store,
     broker: Broker,
+    tls: Option<Tls>,
     stop: CancellationToken,
     tasks: TaskTracker,
     http: JoinHandle<()>,
@@ -94,6 +101,7 @@ impl Server {
         let data = DataDirectory::open(&config.data)?;
         let key = data.signing_key()?;
         let public_key = key.public_key();
+        let tls = config.encrypts().then(|| Tls::open(tls_settings(&config), &data, clock.clone())).transpose()?;
         let store =
             Store::open(&config.database.clone().unwrap_or_else(|| sqlite_url(&data.path().join("taskd.sqlite"))))
                 .await?;
@@ -106,14 +114,15 @@ impl Server {
         let presence = Arc::new(Presence::new(milliseconds(config.presence_timeout)));
         let load = Arc::new(ServerLoad::default());
         let chooser = Chooser::new(&config.delivery, presence.clone(), load.clone());
-        let settings = action_settings(&config);
+        let settings = action_settings(&config, tls.as_ref());
         let actions = Actions::new(store.clone(), clock.clone(), changes.clone(), key, settings, chooser.clone());
         let (writer, reports) = ReportWriter::start(store.clone(), clock.clone(), changes.clone(), chooser);
         let (requests, logs) = (Requests::default(), RobotLogs::new());
         let (heard, said) = (requests.clone(), logs.clone());
         let uplink = Uplink::new(writer.clone(), heard, said, presence.clone(), changes.clone(), clock.clone());
         let gatekeeper = StoreGatekeeper { store: store.clone(), clock: clock.clone() };
-        let (broker, mqtt) = start_broker(&config, &data, &public_key, Arc::new(gatekeeper), Arc::new(uplink)).await?;
+        let (broker, mqtt) =
+            start_broker(&config, &data, &public_key, tls.clone(), Arc::new(gatekeeper), Arc::new(uplink)).await?;
 
         let transfers = Transfers::new(&config.transfers, config.delivery.site_label.clone());
         let (stop, tasks) = (CancellationToken::new(), TaskTracker::new());
@@ -134,6 +143,7 @@ impl Server {
             attempts: Arc::default(),
             events: EventFeed::new(),
             key: public_key,
+            ca_pin: tls.as_ref().map(Tls::pin),
             mqtt: Arc::new(mqtt),
             trusted_proxies: config.trusted_proxies.clone().into(),
             http_traffic: http_traffic.clone(),
@@ -141,16 +151,21 @@ impl Server {
             stop: stop.clone(),
         });
         start_tasks(&tasks, &app, &config);
+        if let Some(tls) = tls.clone() {
+            tasks.spawn(tls.keep_current(stop.clone()));
+        }
         tasks.spawn(watch_load(app.clone(), load));
         let router = crate::http::router(app);
-        let http = listener::serve(http, router, http_limits(&config), http_traffic, stop.clone(), REQUEST_PATIENCE);
+        let limits = http_limits(&config);
+        let http = listener::serve(http, router, tls.clone(), limits, http_traffic, stop.clone(), REQUEST_PATIENCE);
         let mqtt_address = broker.local_addr().map(|bound| reachable(bound).to_string());
         let addresses = Addresses {
             http: reachable(http_address).to_string(),
             mqtt: mqtt_address.unwrap_or_else(|| broker.address()),
+            ca_pin: tls.as_ref().map(Tls::pin),
         };
         data.publish(&addresses)?;
-        Ok(Self { data, addresses, store, broker, stop, tasks, http: tokio::spawn(http), reports })
+        Ok(Self { data, addresses, store, broker, tls, stop, tasks, http: tokio::spawn(http), reports })
     }
 
     /// Where it listens.
@@ -161,6 +176,11 @@ impl Server {
     /// Its directory.
     pub fn data(&self) -> &DataDirectory {
         &self.data
+    }
+
+    /// Takes a certificate that was put in the place of the one in use, if there is one that can be used.
+    pub fn reload_certificate(&self) -> Result<(), TlsError> {
+        self.tls.as_ref().map_or(Ok(()), Tls::reload)
     }
 
     /// Waits until the broker can't be helped any more; says what was seen.
@@ -294,12 +314,20 @@ fn milliseconds(time: Duration) -> u64 {
     u64::try_from(time.as_millis()).unwrap_or(u64::MAX)
 }
 
-fn action_settings(config: &Config) -> ActionSettings {
+fn action_settings(config: &Config, tls: Option<&Tls>) -> ActionSettings {
     ActionSettings {
+        ca_pin: tls.and_then(Tls::told_pin),
         assignment_lifetime_ms: milliseconds(config.assignment_expiry),
         desired_lifetime_ms: milliseconds(config.desired_lifetime),
         ..ActionSettings::default()
     }
+}
+
+/// With the host that robots are told among the certificate's names.
+fn tls_settings(config: &Config) -> TlsSettings {
+    let mut settings = config.tls.clone();
+    settings.names.extend(config.public_mqtt_host.clone());
+    settings
 }
 
 fn blob_settings(config: &Config) -> BlobSettings {
@@ -310,6 +338,7 @@ fn http_limits(config: &Config) -> listener::Limits {
     listener::Limits {
         max_connections: config.max_http_connections,
         max_silent_per_address: config.max_silent_per_address,
+        handshake_timeout: HANDSHAKE_TIMEOUT,
     }
 }
 
@@ -318,14 +347,17 @@ async fn start_broker(
     config: &Config,
     data: &DataDirectory,
     key: &PublicKey,
+    tls: Option<Tls>,
     gatekeeper: Arc<dyn Gatekeeper>,
     inbox: Arc<dyn Inbox>,
 ) -> Result<(Broker, MqttAccess), ServeError> {
     let (host, prefix) = (config.public_mqtt_host.clone(), config.topic_prefix.clone());
     let Some(url) = &config.broker else {
-        let broker = Broker::start(broker_config(config), gatekeeper, inbox).await?;
+        let encrypts = tls.is_some();
+        let broker = Broker::start(broker_config(config, tls), gatekeeper, inbox).await?;
         let bound = broker.local_addr().map_or(0, |bound| bound.port());
-        return Ok((broker, MqttAccess::embedded(host, config.public_mqtt_port.unwrap_or(bound), prefix)));
+        let port = config.public_mqtt_port.unwrap_or(bound);
+        return Ok((broker, MqttAccess::embedded(host, port, prefix, encrypts)));
     };
     let access = MqttAccess::external(url, host, config.public_mqtt_port, prefix.clone(), data.broker_secret()?);
     // The same over restarts, so that a session which the network forgot ends when the next begins.
@@ -333,13 +365,13 @@ async fn start_broker(
     Ok((Broker::connect(ExternalConfig { url: url.clone(), client_id, prefix }, inbox), access))
 }
 
-fn broker_config(config: &Config) -> BrokerConfig {
+fn broker_config(config: &Config, tls: Option<Tls>) -> BrokerConfig {
     let limits = Limits {
         max_connections: config.max_mqtt_connections,
         max_silent_per_address: config.max_silent_per_address,
         ..Limits::default()
     };
-    BrokerConfig { listen: config.mqtt, prefix: config.topic_prefix.clone(), limits }
+    BrokerConfig { listen: config.mqtt, tls, prefix: config.topic_prefix.clone(), limits }
 }
 
 /// An address that works from this machine: "all interfaces" is none that one could connect to.

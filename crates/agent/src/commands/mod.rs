@@ -3,6 +3,9 @@
 
 use std::path::PathBuf;
 
+use anyhow::ensure;
+use task_proto::CaPin;
+
 pub mod configure;
 pub mod enroll;
 pub mod hold;
@@ -19,6 +22,17 @@ pub struct DataDir {
     /// Directory of the robot's identity, settings, ledger and tasks
     #[arg(long, env = "TASK_AGENT_DATA", value_name = "DIR", default_value = DEFAULT_DATA_DIR)]
     pub data: PathBuf,
+}
+
+/// Whoever knows the server by a pin says nothing to it in plain text. `setting` is what gave the server's address.
+fn refuse_plain_text(pin: Option<CaPin>, server: &reqwest::Url, setting: &str) -> anyhow::Result<()> {
+    let is_plain = pin.is_some() && server.scheme() != "https";
+    ensure!(
+        !is_plain,
+        "{setting}: the token is for a server that encrypts: https:// instead of {}://",
+        server.scheme()
+    );
+    Ok(())
 }
 
 /// Prints an error and its whole chain of causes on stderr.

@@ -13,7 +13,7 @@ use task_proto::report::Status;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
-use super::DataDir;
+use super::{DataDir, refuse_plain_text};
 use crate::answers::Answers;
 use crate::config::{Config, parse_server};
 use crate::credential::Credential;
@@ -27,7 +27,7 @@ use crate::ledger::{Found, Ledger};
 use crate::link::{self, Heard, Intervals, Shared, Talk};
 use crate::logs::Logs;
 use crate::logs::forwarder::Forwarder;
-use crate::mqtt::{self, MqttAccess};
+use crate::mqtt::{self, MqttAccess, Ways};
 use crate::outputs::Registry;
 use crate::rotation::Rotation;
 use crate::server::{self, Server};
@@ -69,7 +69,9 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
         Some(server) => server.clone(),
         None => parse_server(&identity.server)?,
     };
-    let client = server::client().context("cannot make an HTTP client")?;
+    refuse_plain_text(identity.ca_pin, &base, "server")?;
+    let tls = identity.trust().client_config(clock::for_certificates());
+    let client = server::client(tls.clone()).context("cannot make an HTTP client")?;
     let credential = Credential::from(identity.token.clone());
     let shutdown = CancellationToken::new();
     let shared = Shared::new(shutdown.clone());
@@ -109,7 +111,8 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
         shared.endpoint.send_replace(Some(identity.mqtt));
         tokio::spawn(endpoint::follow(server, shared.clone(), config.poll_interval));
         let (robot_id, message_bytes) = (identity.robot_id, mqtt::MESSAGE_BYTES);
-        let access = MqttAccess { host, port, prefix, robot: robot_id, token: credential, status, message_bytes };
+        let ways = Ways::new(&base, Arc::new(tls), config.mqtt_transport);
+        let access = MqttAccess { host, port, prefix, robot: robot_id, token: credential, status, message_bytes, ways };
         converse(access, shared, heard, data, &config, robot);
     } else {
         // Nobody is to wait for a session, or for parts.

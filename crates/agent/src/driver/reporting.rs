@@ -7,12 +7,12 @@ use task_proto::{Generation, TaskName};
 use tokio::time::Instant;
 
 use super::{Driver, View};
-use crate::admission;
 use crate::effects::Effects;
 use crate::ledger::{LostFiles, TaskRecord};
 use crate::link_meter;
 use crate::observed::{Health, ProcessState};
 use crate::plan::Lane;
+use crate::{admission, clock};
 
 /// A battery that has lost less is no news.
 const BATTERY_STEP_PERCENT: u8 = 5;
@@ -65,6 +65,13 @@ impl<E: Effects> Driver<E> {
         let wall_ms = self.effects.now().wall_ms;
         if self.desired.as_ref().is_some_and(|state| admission::is_expired(state, wall_ms)) {
             conditions.push(condition("state_expired", "the desired state has expired: nothing new is begun"));
+        }
+        if wall_ms < clock::PROGRAM_EXISTS_SINCE_MS {
+            let text = format!(
+                "this robot's clock is wrong: it shows {}, when this agent did not exist yet",
+                &task_proto::time::timestamp(wall_ms)[..10]
+            );
+            conditions.push(condition("clock_wrong", &text));
         }
         conditions.extend(self.withheld.clone());
         conditions

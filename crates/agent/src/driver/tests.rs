@@ -347,6 +347,19 @@ async fn nothing_is_begun_until_the_ledger_can_be_written() {
 }
 
 #[tokio::test]
+async fn a_robot_whose_clock_starts_in_1970_says_so_and_works() {
+    let bench = Bench::new().await;
+    bench.fake.state(|state| state.wall_ms = Some(5_000));
+    bench.order(1, vec![order("1.0")]).await;
+    let report = bench.phase(Phase::Running).await;
+    let condition = report.conditions.iter().find(|condition| condition.code == "clock_wrong").expect("it says so");
+    assert!(condition.text.contains("it shows 1970-01-01,"), "{}", condition.text);
+    bench.fake.state(|state| state.wall_ms = None);
+    bench.order(2, vec![order("2.0")]).await;
+    bench.report(|report| !has(report, "clock_wrong")).await;
+}
+
+#[tokio::test]
 async fn hold_keeps_a_staged_version_from_starting() {
     let bench = Bench::new().await;
     bench.fake.state(|state| state.held = true);

@@ -19,6 +19,7 @@ use task_proto::desired::DesiredState;
 use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
 use task_proto::report::{HostFacts, Report};
 use task_proto::{Generation, InstanceId, RobotId};
+use task_transport::Trust;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
@@ -64,8 +65,13 @@ async fn answer_canned(State(fake): State<Arc<Fake>>, headers: HeaderMap) -> Res
     (StatusCode::from_u16(status).unwrap(), headers, body).into_response()
 }
 
+/// A client that never meets a certificate.
+fn plain_client() -> reqwest::Client {
+    server::client(Trust::System.client_config(task_agent::clock::for_certificates())).unwrap()
+}
+
 fn server(url: &reqwest::Url, robot: &RobotId) -> Server {
-    Server::new(server::client().unwrap(), url.clone(), robot.clone(), "tskr_secret".to_owned())
+    Server::new(plain_client(), url.clone(), robot.clone(), "tskr_secret".to_owned())
 }
 
 fn state(robot: &RobotId, generation: u64) -> DesiredState {
@@ -115,12 +121,19 @@ async fn a_new_token_is_on_the_disk_before_it_is_used_and_the_old_one_until_it_w
         token_since_ms: 1_000,
         server: url.to_string(),
         server_key: SigningKey::random().public_key(),
-        mqtt: task_proto::api::MqttEndpoint { host: None, port: 1, prefix: Default::default(), external: None },
+        ca_pin: None,
+        mqtt: task_proto::api::MqttEndpoint {
+            host: None,
+            port: 1,
+            prefix: Default::default(),
+            tls: false,
+            external: None,
+        },
         mac: "02:00:00:00:00:01".parse().unwrap(),
     };
     identity.write(&path).unwrap();
     let credential = Credential::from("old".to_owned());
-    let server = Server::new(server::client().unwrap(), url.clone(), robot, credential.clone());
+    let server = Server::new(plain_client(), url.clone(), robot, credential.clone());
     let lifetime = Duration::from_secs(3600);
     let mut rotation = Rotation { server, credential: credential.clone(), identity, path: path.clone(), lifetime };
     let tokens = || {

@@ -7,7 +7,7 @@ use std::time::Duration;
 use task_agent::credential::Credential;
 use task_agent::fetch::{Asks, FetchError, FetchSettings, PartPatience};
 use task_agent::link::{Shared, Talk};
-use task_agent::mqtt::{self, MqttAccess};
+use task_agent::mqtt::{self, MqttAccess, Ways};
 use task_proto::part::{Cut, Part, PartRange};
 use task_proto::report::{Progress, Status};
 use task_proto::topic::{Topic, TopicPrefix};
@@ -58,6 +58,7 @@ impl Rig {
             token: Credential::from("token".to_owned()),
             status: Status { online: true, start: 1, instance: InstanceId::random(), connection: 0 },
             message_bytes: mqtt::MESSAGE_BYTES,
+            ways: Ways::plain(),
         };
         let (heard, _) = mpsc::channel(1);
         let (requests, _) = mpsc::channel(1);

@@ -16,9 +16,10 @@ use nix::poll::{PollFd, PollFlags};
 use nix::sys::signal::Signal;
 use rand::{RngExt as _, SeedableRng as _};
 use serde_json::Value;
-use task_proto::RobotId;
 use task_proto::api::{DeploymentView, RobotView};
 use task_proto::report::Phase;
+use task_proto::{CaPin, RobotId};
+use task_transport::Trust;
 use tempfile::TempDir;
 
 /// How long anything that should happen may take on a busy machine.
@@ -57,6 +58,15 @@ pub async fn eventually_within<T>(patience: Duration, what: &str, mut ask: impl 
         }
         assert!(start.elapsed() < patience, "after {patience:?} still waiting for {what}");
     }
+}
+
+/// A client that trusts the authority with this pin, where there is one.
+fn client(pin: Option<CaPin>) -> reqwest::Client {
+    // For clients that a test makes itself. A second install is refused because the first is in place.
+    let _ = rustls::crypto::ring::default_provider().install_default();
+    let tls = Trust::by(pin).client_config(task_agent::clock::for_certificates());
+    let client = reqwest::Client::builder().timeout(Duration::from_secs(20)).tls_backend_preconfigured(tls);
+    client.build().expect("client")
 }
 
 /// A child process that is killed when the test ends.
@@ -100,6 +110,8 @@ pub struct Server {
     settings: Vec<(String, String)>,
     pub http: SocketAddr,
     pub mqtt: SocketAddr,
+    /// Of its certificate authority, if it encrypts.
+    pub pin: Option<CaPin>,
     client: reqwest::Client,
 }
 
@@ -115,20 +127,32 @@ impl Server {
         server
     }
 
+    /// Starts one at these addresses, which another has left.
+    pub async fn start_at(data: &Path, settings: &[(&str, &str)], http: SocketAddr, mqtt: SocketAddr) -> Self {
+        let mut server = Self::new(data, settings);
+        (server.http, server.mqtt) = (http, mqtt);
+        server.restart().await;
+        server
+    }
+
     /// Starts though something is missing that it would need to be ready.
     pub async fn start_unready(data: &Path, settings: &[(&str, &str)]) -> Self {
-        let _ = rustls::crypto::ring::default_provider().install_default();
+        let mut server = Self::new(data, settings);
+        server.launch().await;
+        server
+    }
+
+    fn new(data: &Path, settings: &[(&str, &str)]) -> Self {
         let any: SocketAddr = ([127, 0, 0, 1], 0).into();
-        let mut server = Self {
+        Self {
             process: None,
             data: data.to_owned(),
             settings: settings.iter().map(|(k, v)| ((*k).to_owned(), (*v).to_owned())).collect(),
             http: any,
             mqtt: any,
-            client: reqwest::Client::builder().timeout(Duration::from_secs(20)).build().expect("client"),
-        };
-        server.launch().await;
-        server
+            pin: None,
+            client: client(None),
+        }
     }
 
     async fn launch(&mut self) {
@@ -147,6 +171,8 @@ impl Server {
         .await;
         let address = |key: &str| found[key].as_str().and_then(|a| a.parse().ok()).unwrap_or_else(|| panic!("{found}"));
         (self.http, self.mqtt) = (address("http"), address("mqtt"));
+        self.pin = found["ca_pin"].as_str().map(|pin| pin.parse().expect("a pin"));
+        self.client = client(self.pin);
     }
 
     pub async fn wait_ready(&self) {
@@ -184,6 +210,10 @@ impl Server {
         self.process.take().expect("server runs").terminate()
     }
 
+    pub fn signal(&self, signal: Signal) {
+        self.process.as_ref().expect("server runs").signal(signal);
+    }
+
     /// Starts it again on the same data and ports.
     pub async fn restart(&mut self) {
         self.launch().await;
@@ -191,7 +221,8 @@ impl Server {
     }
 
     pub fn url(&self, path: &str) -> String {
-        format!("http://{}{path}", self.http)
+        let scheme = if self.pin.is_some() { "https" } else { "http" };
+        format!("{scheme}://{}{path}", self.http)
     }
 
     pub fn operator_token(&self) -> String {
@@ -227,6 +258,7 @@ impl Server {
         let mut command = Command::new(program("taskd"));
         command.args(args);
         command.env("TASKD_SERVER", self.url("")).env("TASKD_TOKEN", self.operator_token());
+        command.envs(self.pin.map(|pin| ("TASKD_PIN", pin.to_string())));
         command.stdin(Stdio::null());
         command
     }
@@ -293,6 +325,7 @@ impl Robot {
         let mut enroll = Command::new(program("task-agent"));
         enroll.args(["enroll", "--server", url, "--token", &token, "--name", name]);
         enroll.args(["--mac", &format!("02:00:00:00:00:{number:02x}")]).arg("--data").arg(&data);
+        enroll.envs(environment.iter().copied());
         let output =
             tokio::task::spawn_blocking(move || enroll.output().expect("task-agent runs")).await.expect("no panic");
         assert!(output.status.success(), "enroll: {}", String::from_utf8_lossy(&output.stderr));

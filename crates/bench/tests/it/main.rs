@@ -20,3 +20,4 @@ mod ros1;
 mod scenarios;
 mod talker;
 mod tidy;
+mod tls;

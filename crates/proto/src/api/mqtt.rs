@@ -16,6 +16,9 @@ pub struct MqttEndpoint {
     pub port: u16,
     /// What all topics start with.
     pub prefix: TopicPrefix,
+    /// Whether the port speaks TLS.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub tls: bool,
     /// The broker there is not the server's own. Absent: it is, and the password is the robot's token.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub external: Option<ExternalBroker>,

@@ -347,13 +347,19 @@ fn documents_of_the_api() {
             robot_id: robot(),
             name: parsed("atlas"),
             token: "tskr_…".to_owned(),
-            mqtt: MqttEndpoint { host: None, port: 1883, prefix: TopicPrefix::default(), external: None },
+            mqtt: MqttEndpoint { host: None, port: 1883, prefix: TopicPrefix::default(), tls: true, external: None },
         },
     );
     let external = Some(ExternalBroker { password: "…".to_owned() });
     check(
         "mqtt_endpoint.json",
-        &MqttEndpoint { host: Some("broker.lab".to_owned()), port: 1884, prefix: TopicPrefix::default(), external },
+        &MqttEndpoint {
+            host: Some("broker.lab".to_owned()),
+            port: 1884,
+            prefix: TopicPrefix::default(),
+            tls: false,
+            external,
+        },
     );
     check_text("robot_token.json", &RobotToken { token: "tskr_…".to_owned() });
     check_text(
@@ -451,6 +457,7 @@ fn documents_about_the_traffic() {
     let info = ServerInfo {
         version: "0.1.0".to_owned(),
         key: SigningKey::from_bytes([7; 32]).public_key(),
+        ca_pin: Some(task_proto::CaPin::of(b"authority")),
         mqtt: "127.0.0.1:1883".to_owned(),
         now_ms: 1_800_000_000_000,
         traffic: MqttTraffic {

@@ -16,7 +16,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use task_proto::envelope::SigningKey;
 use task_proto::selector::Selector;
-use task_proto::{DeploymentId, Digest, MacAddress, RobotId, RobotName, TokenId, UserName};
+use task_proto::{CaPin, DeploymentId, Digest, MacAddress, RobotId, RobotName, TokenId, UserName};
 
 use crate::changes::Changes;
 use crate::chooser::Chooser;
@@ -53,6 +53,8 @@ pub struct ActionSettings {
     pub desired_lifetime_ms: u64,
     /// How long an enrolment token is good for when its maker does not say.
     pub enrolment_token_lifetime_ms: u64,
+    /// The certificate authority that robots are told to trust, if they are to trust the server's own.
+    pub ca_pin: Option<CaPin>,
 }
 
 const DAY_MS: u64 = 24 * 60 * 60 * 1000;
@@ -65,6 +67,7 @@ impl Default for ActionSettings {
             assignment_lifetime_ms: 7 * DAY_MS,
             desired_lifetime_ms: 30 * DAY_MS,
             enrolment_token_lifetime_ms: DAY_MS,
+            ca_pin: None,
         }
     }
 }

@@ -108,7 +108,7 @@ impl Actions {
         };
         let expires_at_ms = now_ms + lifetime_ms;
         let terms = EnrolmentTerms { robot, labels: order.labels.clone(), uses_left: order.uses, expires_at_ms };
-        let token = Token::random_enrolment(self.key.public_key());
+        let token = Token::random_enrolment(self.key.public_key(), self.settings.ca_pin);
         write.create_enrolment_token(&token, &terms, now_ms).await?;
         let deed = Deed::by(by, Act::EnrolmentCreate, token.id())
             .with_some("robot", terms.robot.as_ref())

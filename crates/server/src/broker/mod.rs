@@ -10,6 +10,7 @@ mod router;
 mod watchdog;
 
 use std::fmt;
+use std::io;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
@@ -19,8 +20,10 @@ use futures_util::future::BoxFuture;
 use task_proto::api::{MqttTraffic, Traffic};
 use task_proto::topic::{RobotTopic, TopicPrefix};
 use task_proto::{Digest, RobotId, UserName};
+use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::watch;
 
+use crate::tls::Tls;
 pub use external::{CANARY_LEVEL, ExternalConfig};
 use external::{Crowd, External};
 pub use fan_out::{FanOut, FanOutError, FanOutSettings, MAX_PART_BYTES, Part, PartQos};
@@ -121,8 +124,10 @@ pub trait Inbox: Send + Sync + 'static {
 /// Where the broker listens and what bounds it.
 #[derive(Debug, Clone)]
 pub struct BrokerConfig {
-    /// The plain TCP listener's address; port 0 picks a free one.
+    /// The listener's address; port 0 picks a free one.
     pub listen: SocketAddr,
+    /// What it speaks, if it encrypts.
+    pub tls: Option<Tls>,
     /// What all topics start with.
     pub prefix: TopicPrefix,
     /// The bounds.
@@ -322,6 +327,18 @@ impl Broker {
         match &self.kind {
             Kind::Embedded(front) => front.disconnect(robot),
             Kind::External(external) => external.disconnect(robot),
+        }
+    }
+
+    /// Serves a client whose connection somebody else has accepted, once `handshake` ends. False: the broker is another
+    /// one, or has no room.
+    pub fn take_in<S>(&self, peer: SocketAddr, handshake: impl Future<Output = io::Result<S>> + Send + 'static) -> bool
+    where
+        S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
+    {
+        match &self.kind {
+            Kind::Embedded(front) => front.take_in(peer, handshake),
+            Kind::External(_) => false,
         }
     }
 

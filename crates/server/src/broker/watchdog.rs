@@ -9,14 +9,15 @@ use rumqttd::protocol::{
     Connect, ConnectReturnCode, Error, Filter, Login, Packet, Protocol, Publish, QoS, RetainForwardRule, Subscribe,
     v4::V4,
 };
+use task_transport::{DialError, Duplex, Route, dial};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::TcpStream;
 use tokio::sync::watch;
 use tokio::time::timeout;
 
 use super::front::{CANARY_ID, CanaryPass, Front};
 use super::router::{CANARY_TOPIC, Router};
 use super::{Health, Limits};
+use crate::tls::Tls;
 
 /// Remedies tried in a row before the watchdog gives up.
 const MAX_REMEDIES: u32 = 3;
@@ -27,7 +28,7 @@ const MAX_PACKET_BYTES: usize = 1024;
 pub(super) fn start(front: &Front, router: Arc<Router>, limits: &Limits) -> watch::Receiver<Health> {
     let (sender, receiver) = watch::channel(Health::Serving);
     let watchdog = Watchdog {
-        address: reachable(front.local_addr()),
+        route: route(front),
         pass: front.canary_pass(),
         router,
         limits: limits.clone(),
@@ -40,7 +41,7 @@ pub(super) fn start(front: &Front, router: Arc<Router>, limits: &Limits) -> watc
 }
 
 struct Watchdog {
-    address: SocketAddr,
+    route: Route,
     pass: Arc<CanaryPass>,
     router: Arc<Router>,
     limits: Limits,
@@ -53,7 +54,7 @@ struct Watchdog {
 enum Lost {
     /// Nothing helps, if it lasts.
     #[error("the MQTT listener does not accept connections")]
-    Listener(#[source] std::io::Error),
+    Listener(#[source] DialError),
     /// Time helps: too many connections, too much to do. A new router would only make it worse.
     #[error("the MQTT front did not let the watchdog in: {0}")]
     Front(&'static str),
@@ -104,7 +105,7 @@ impl Watchdog {
     async fn fly(&mut self) -> Result<(), Lost> {
         self.flights += 1;
         let patience = self.limits.canary_timeout;
-        let entering = timeout(patience, Bird::enter(self.address, self.pass.renew())).await;
+        let entering = timeout(patience, Bird::enter(&self.route, self.pass.renew())).await;
         let mut bird = entering.unwrap_or(Err(Lost::Front("no answer in time")))?;
         let singing = timeout(patience, bird.sing(self.flights.to_string())).await;
         singing.unwrap_or(Err(Lost::Router("the watchdog did not hear itself in time")))
@@ -113,13 +114,17 @@ impl Watchdog {
 
 /// The smallest MQTT client that can sing.
 struct Bird {
-    stream: TcpStream,
+    stream: Box<dyn Duplex>,
     input: BytesMut,
 }
 
 impl Bird {
-    async fn enter(address: SocketAddr, password: String) -> Result<Self, Lost> {
-        let stream = TcpStream::connect(address).await.map_err(Lost::Listener)?;
+    async fn enter(route: &Route, password: String) -> Result<Self, Lost> {
+        let stream = dial(route).await.map_err(|error| match error {
+            // As when the front closes a connection that it has no place for.
+            DialError::Tls { .. } => Lost::Front("the connection broke"),
+            error => Lost::Listener(error),
+        })?;
         let mut bird = Self { stream, input: BytesMut::new() };
         let connect = Connect { keep_alive: 30, client_id: CANARY_ID.to_owned(), clean_session: true };
         let login = Login { username: CANARY_ID.to_owned(), password };
@@ -158,6 +163,7 @@ impl Bird {
         let mut output = BytesMut::new();
         V4.write(packet, &mut output).ok()?;
         self.stream.write_all(&output).await.ok()?;
+        self.stream.flush().await.ok()?;
         loop {
             match V4.read_mut(&mut self.input, MAX_PACKET_BYTES) {
                 Ok(packet) => return Some(packet),
@@ -169,6 +175,12 @@ impl Bird {
             }
         }
     }
+}
+
+fn route(front: &Front) -> Route {
+    let address = reachable(front.local_addr());
+    let tls = front.tls().map(Tls::client_config);
+    Route { host: address.ip().to_string(), port: address.port(), tls, websocket: None }
 }
 
 /// Where a listener on `bound` is reached from this machine.
@@ -188,6 +200,7 @@ mod tests {
     use futures_util::future::BoxFuture;
     use task_proto::RobotId;
     use task_proto::topic::TopicPrefix;
+    use tokio::net::TcpStream;
 
     use super::super::{BrokerConfig, Gatekeeper, Inbox, NotStored, Principal, Refusal, RobotMessage};
     use super::*;
@@ -215,7 +228,7 @@ mod tests {
         let mut limits = Limits { canary_interval: Duration::from_millis(20), ..Limits::default() };
         change(&mut limits);
         let listen = "127.0.0.1:0".parse().expect("an address");
-        let config = BrokerConfig { listen, prefix: TopicPrefix::default(), limits: limits.clone() };
+        let config = BrokerConfig { listen, tls: None, prefix: TopicPrefix::default(), limits: limits.clone() };
         let router = Router::start(&config.prefix, 4).await.expect("a router");
         let front =
             Front::start(config, Arc::new(Nobody), Arc::new(Nobody), router.clone()).await.expect("a free port");
@@ -275,8 +288,8 @@ mod tests {
         let (sender, mut health) = watch::channel(Health::Serving);
         let limits = Limits { canary_interval: Duration::from_millis(1), ..Limits::default() };
         let router = Router::start(&TopicPrefix::default(), 1).await.expect("a router");
-        let watchdog =
-            Watchdog { address: dead, pass: front.canary_pass(), router, limits, health: sender, flights: 0 };
+        let route = Route { host: dead.ip().to_string(), port: dead.port(), tls: None, websocket: None };
+        let watchdog = Watchdog { route, pass: front.canary_pass(), router, limits, health: sender, flights: 0 };
         watchdog.run().await;
         until(&mut health, |health| matches!(health, Health::Failed(_))).await;
     }

@@ -8,14 +8,17 @@ use reqwest::header::RETRY_AFTER;
 use reqwest::{Method, RequestBuilder, Response, StatusCode};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
-use task_proto::RobotName;
 use task_proto::api::{BASE, ErrorBody, IDEMPOTENCY_KEY};
 use task_proto::request::{Answer, Ask};
 use task_proto::token::{InvalidToken, Token};
+use task_proto::{CaPin, RobotName};
+use task_transport::Trust;
 
 use super::login::kept_token;
 use super::output::printable;
 use super::{CommandError, Connection, Outcome};
+use crate::clock::Clock;
+use crate::data_directory::Addresses;
 
 /// How often a request is tried.
 const TRIES: u32 = 6;
@@ -78,7 +81,7 @@ pub enum ClientError {
         source: InvalidToken,
     },
     /// The URL is none.
-    #[error("--server: {url:?} is not an http:// URL")]
+    #[error("--server: {url:?} is not an http:// or https:// URL")]
     Url {
         /// What was given.
         url: String,
@@ -126,18 +129,18 @@ impl Client {
     /// The same without a token, to ask for one.
     pub(crate) fn anonymous(connection: &Connection) -> Result<Self, CommandError> {
         let data = data_directory(connection);
-        let base = match &connection.server {
-            Some(url) => url.trim_end_matches('/').to_owned(),
-            None => local_server(data.as_deref()).unwrap_or_else(|| "http://127.0.0.1:8080".to_owned()),
+        let (base, known_pin) = match &connection.server {
+            Some(url) => (url.trim_end_matches('/').to_owned(), None),
+            None => local_server(data.as_deref()).unwrap_or_else(|| ("http://127.0.0.1:8080".to_owned(), None)),
         };
         let is_http = reqwest::Url::parse(&base)
             .is_ok_and(|url| matches!(url.scheme(), "http" | "https") && url.has_host() && url.query().is_none());
         if !is_http {
             return Err(ClientError::Url { url: base }.into());
         }
-        // A second install is refused because the first is in place, which is all that matters.
-        let _ = rustls::crypto::ring::default_provider().install_default();
+        let trust = Trust::by(connection.pin.or(known_pin));
         let http = reqwest::Client::builder()
+            .tls_backend_preconfigured(trust.client_config(Clock::for_certificates()))
             .connect_timeout(Duration::from_secs(10))
             .redirect(reqwest::redirect::Policy::none())
             .user_agent(concat!("taskd/", env!("CARGO_PKG_VERSION")))
@@ -345,16 +348,11 @@ fn retry_after(response: &Response) -> Option<Duration> {
     Some(Duration::from_secs(seconds).min(MAX_PAUSE))
 }
 
-/// The addresses that `taskd serve` writes into its data directory.
-#[derive(serde::Deserialize)]
-struct Addresses {
-    http: String,
-}
-
-fn local_server(data: Option<&Path>) -> Option<String> {
+/// URL and pin of the server that serves from the directory, as it wrote them into there.
+fn local_server(data: Option<&Path>) -> Option<(String, Option<CaPin>)> {
     let text = std::fs::read(data?.join("addresses.json")).ok()?;
-    let Addresses { http } = serde_json::from_slice(&text).ok()?;
-    Some(if http.contains("://") { http.trim_end_matches('/').to_owned() } else { format!("http://{http}") })
+    let addresses: Addresses = serde_json::from_slice(&text).ok()?;
+    Some((addresses.url(), addresses.ca_pin))
 }
 
 fn data_directory(connection: &Connection) -> Option<PathBuf> {
@@ -450,6 +448,7 @@ mod tests {
         let connection = Connection {
             server: Some(format!("http://{address}/")),
             token: Some(token),
+            pin: None,
             token_file: None,
             data: None,
             output: super::super::Format::Json,
@@ -484,6 +483,10 @@ mod tests {
         assert_eq!(local_server(Some(dir.path())), None);
         std::fs::write(dir.path().join("addresses.json"), r#"{"http":"127.0.0.1:8081","mqtt":"127.0.0.1:1884"}"#)
             .unwrap();
-        assert_eq!(local_server(Some(dir.path())).as_deref(), Some("http://127.0.0.1:8081"));
+        assert_eq!(local_server(Some(dir.path())), Some(("http://127.0.0.1:8081".to_owned(), None)));
+        let pin = CaPin::of(b"an authority's key");
+        let addresses = format!(r#"{{"http":"127.0.0.1:8081","mqtt":"127.0.0.1:1884","ca_pin":"{pin}"}}"#);
+        std::fs::write(dir.path().join("addresses.json"), addresses).unwrap();
+        assert_eq!(local_server(Some(dir.path())), Some(("https://127.0.0.1:8081".to_owned(), Some(pin))));
     }
 }

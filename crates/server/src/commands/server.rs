@@ -29,6 +29,7 @@ fn describe(info: &ServerInfo) -> String {
         ("version", info.version.clone()),
         ("time", time(info.now_ms)),
         ("mqtt", info.mqtt.clone()),
+        ("tls", info.ca_pin.map_or_else(|| "off".to_owned(), |pin| format!("pin {pin}"))),
         ("robots", format!("{} connected", traffic.robots_connected)),
         ("connections", format!("{} accepted, {} refused", traffic.connections_accepted, traffic.connections_refused)),
         ("messages", format!("{} refused, {} dropped", traffic.messages_refused, traffic.messages_dropped)),

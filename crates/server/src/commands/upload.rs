@@ -207,6 +207,7 @@ mod tests {
         let connection = Connection {
             server: Some(format!("http://{address}")),
             token: Some(Token::random(TokenKind::Operator).reveal()),
+            pin: None,
             token_file: None,
             data: None,
             output: Format::Json,

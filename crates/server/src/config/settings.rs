@@ -77,6 +77,37 @@ pub(super) const SETTINGS: &[Setting] = &[
         set: |config, text| boolean(text).map(|allow| config.allow_plaintext = allow),
     },
     Setting {
+        name: "tls-certificate",
+        value_name: "FILE",
+        help: "Own certificate chain (PEM), for HTTP and MQTT; a file that changes is read again",
+        set: |config, text| {
+            config.tls.certificate = Some(PathBuf::from(non_empty(text)?));
+            Ok(())
+        },
+    },
+    Setting {
+        name: "tls-key",
+        value_name: "FILE",
+        help: "Its private key (PEM)",
+        set: |config, text| {
+            config.tls.key = Some(PathBuf::from(non_empty(text)?));
+            Ok(())
+        },
+    },
+    Setting {
+        name: "tls-private-ca",
+        value_name: "BOOL",
+        help: "Encrypt with a certificate by an authority of the server's own, which enrolment tokens tell robots to trust \
+               [default: where other machines reach a listener, without --tls-certificate or --allow-plaintext]",
+        set: |config, text| boolean(text).map(|private| config.tls.private_ca = Some(private)),
+    },
+    Setting {
+        name: "tls-names",
+        value_name: "NAME,…",
+        help: "Host names and addresses that its certificate is also good for, beside the machine's own",
+        set: |config, text| host_names(text).map(|names| config.tls.names = names),
+    },
+    Setting {
         name: "assignment-expiry",
         value_name: "TIME",
         help: "How long an assignment may stay undone [default: 7d]",
@@ -249,6 +280,18 @@ fn boolean(text: &str) -> Result<bool, String> {
 fn address(text: &str) -> Result<SocketAddr, String> {
     let expected = || format!("{text:?} is not an address: expected host:port, for example 127.0.0.1:8080");
     text.to_socket_addrs().ok().and_then(|mut found| found.next()).ok_or_else(expected)
+}
+
+fn host_names(text: &str) -> Result<Vec<String>, String> {
+    let is_name = |name: &str| {
+        let is_word = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '-' | '_' | ':');
+        (1..=253).contains(&name.len()) && name.chars().all(is_word)
+    };
+    let names: Vec<String> = text.split(',').map(|name| name.trim().to_owned()).collect();
+    match names.iter().find(|name| !is_name(name)) {
+        Some(wrong) => Err(format!("{wrong:?} is neither a host name nor an address")),
+        None => Ok(names),
+    }
 }
 
 fn database_url(text: &str) -> Result<String, String> {

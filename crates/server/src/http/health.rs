@@ -60,6 +60,7 @@ pub(super) async fn server(State(app): State<App>) -> Json<ServerInfo> {
     Json(ServerInfo {
         version: env!("CARGO_PKG_VERSION").to_owned(),
         key: app.key.clone(),
+        ca_pin: app.ca_pin,
         mqtt: app.broker.address(),
         now_ms: app.clock.now_ms(),
         traffic: app.broker.traffic(),

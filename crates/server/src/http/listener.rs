@@ -1,4 +1,5 @@
-//! The accept loop: how many connections there are, how long a client may dawdle, and how they end. It knows no routes.
+//! The accept loop: how many connections there are, how long a client may dawdle, also in its TLS handshake, and how they
+//! end. It knows no routes.
 
 use std::convert::Infallible;
 use std::io;
@@ -21,13 +22,14 @@ use hyper_util::rt::{TokioIo, TokioTimer};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
-use tokio::time::Sleep;
+use tokio::time::{Sleep, timeout};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 use tower::ServiceExt as _;
 
 use super::traffic::HttpTotals;
 use crate::anteroom::{Anteroom, Place};
+use crate::tls::Tls;
 
 /// How long a request's head may take, also the first one of a connection, and how long one is kept without a request.
 const HEAD_TIMEOUT: Duration = Duration::from_secs(20);
@@ -47,12 +49,35 @@ pub struct Limits {
     pub max_connections: usize,
     /// Those of one address that have not sent a request yet; a further one takes the place of the oldest.
     pub max_silent_per_address: usize,
+    /// How long a TLS handshake may take.
+    pub handshake_timeout: Duration,
+}
+
+/// What all connections share.
+struct Site {
+    router: Router,
+    /// What they speak, if they are encrypted.
+    tls: Option<Tls>,
+    handshake_timeout: Duration,
+    traffic: Arc<HttpTotals>,
+    stop: CancellationToken,
+    /// Ends what `stop` did not end in time.
+    abort: CancellationToken,
+}
+
+/// A client that has just come.
+struct Guest {
+    peer: SocketAddr,
+    silent: Place,
+    /// Whether its place is needed.
+    crowded: watch::Receiver<bool>,
 }
 
 /// Serves until `stop`, then lets requests under way end, for at most `patience`.
 pub async fn serve(
     listener: TcpListener,
     router: Router,
+    tls: Option<Tls>,
     limits: Limits,
     traffic: Arc<HttpTotals>,
     stop: CancellationToken,
@@ -62,42 +87,82 @@ pub async fn serve(
     let anteroom = Anteroom::new(limits.max_silent_per_address);
     let connections = TaskTracker::new();
     let abort = CancellationToken::new();
+    let handshake_timeout = limits.handshake_timeout;
+    let site = Arc::new(Site { router, tls, handshake_timeout, traffic, stop, abort: abort.clone() });
     loop {
         let (stream, peer, place) = tokio::select! {
-            () = stop.cancelled() => break,
+            () = site.stop.cancelled() => break,
             accepted = accept(&listener, &places) => accepted,
         };
         let silent = anteroom.enter(peer.ip(), Instant::now());
-        let leave = silent.leave().clone();
-        let spoken = CancellationToken::new();
-        let stream = PatientStream { stream, stalled: None, traffic: traffic.clone() };
-        let connection = connection(stream, peer, silent, spoken.clone(), router.clone());
-        let asked_to_end = asked_to_end(stop.clone(), spoken, places.crowded.subscribe());
-        let abort = abort.clone();
-        connections.spawn(async move {
-            let ended = async {
-                let mut connection = pin!(connection);
-                tokio::select! {
-                    ended = connection.as_mut() => return ended,
-                    () = asked_to_end => connection.as_mut().graceful_shutdown(),
-                }
-                connection.await
-            };
-            // A client that breaks off or dawdles is no event worth a line in the log.
-            let _ = tokio::select! {
-                ended = ended => ended,
-                () = leave.cancelled() => Ok(()),
-                () = abort.cancelled() => Ok(()),
-            };
-            drop(place);
-        });
+        let guest = Guest { peer, silent, crowded: places.crowded.subscribe() };
+        let site = site.clone();
+        // Two kinds of task, so that a plain connection's does not need the room of an encrypted one's.
+        if site.tls.is_some() {
+            connections.spawn(async move {
+                site.attend_encrypted(stream, guest).await;
+                drop(place);
+            });
+        } else {
+            connections.spawn(async move {
+                site.attend(site.patient(stream), guest).await;
+                drop(place);
+            });
+        }
     }
     drop(listener);
     connections.close();
-    if tokio::time::timeout(patience, connections.wait()).await.is_err() {
+    if timeout(patience, connections.wait()).await.is_err() {
         tracing::warn!("requests did not end in time and are cut off");
     }
     abort.cancel();
+}
+
+impl Site {
+    fn patient(&self, stream: TcpStream) -> PatientStream {
+        // Answers are small and wanted at once; a failure here costs only latency.
+        let _ = stream.set_nodelay(true);
+        self.traffic.connection();
+        PatientStream { stream, stalled: None, traffic: self.traffic.clone() }
+    }
+
+    /// Shakes hands, then serves the connection to its end.
+    async fn attend_encrypted(&self, stream: TcpStream, guest: Guest) {
+        let Some(tls) = &self.tls else { return };
+        let shaken = tokio::select! {
+            shaken = timeout(self.handshake_timeout, tls.accept(self.patient(stream))) => shaken,
+            () = guest.silent.leave().cancelled() => return,
+            () = self.stop.cancelled() => return,
+        };
+        // Whoever speaks no TLS, or none that counts, is no event worth a line in the log.
+        if let Ok(Ok(stream)) = shaken {
+            self.attend(stream, guest).await;
+        }
+    }
+
+    /// Serves one connection to its end.
+    async fn attend<S>(&self, stream: S, guest: Guest)
+    where
+        S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
+    {
+        let Guest { peer, silent, crowded } = guest;
+        let (leave, spoken) = (silent.leave().clone(), CancellationToken::new());
+        let (router, traffic) = (self.router.clone(), self.traffic.clone());
+        let mut connection = pin!(connection(stream, peer, silent, spoken.clone(), router, traffic));
+        let ended = async {
+            tokio::select! {
+                _ = connection.as_mut() => return,
+                () = asked_to_end(&self.stop, spoken, crowded) => connection.as_mut().graceful_shutdown(),
+            }
+            // A client that breaks off or dawdles is no event worth a line in the log.
+            let _ = connection.await;
+        };
+        tokio::select! {
+            () = ended => {}
+            () = leave.cancelled() => {}
+            () = self.abort.cancelled() => {}
+        }
+    }
 }
 
 /// The connections there may be.
@@ -128,7 +193,7 @@ impl Places {
 
 /// Resolves when a connection has to end as soon as it has no request: the server stops, or the places are needed and this
 /// one has had its turn.
-async fn asked_to_end(stop: CancellationToken, spoken: CancellationToken, mut crowded: watch::Receiver<bool>) {
+async fn asked_to_end(stop: &CancellationToken, spoken: CancellationToken, mut crowded: watch::Receiver<bool>) {
     let needed = async {
         spoken.cancelled().await;
         if crowded.wait_for(|crowded| *crowded).await.is_err() {
@@ -161,20 +226,20 @@ fn is_the_clients_fault(error: &io::Error) -> bool {
     matches!(error.kind(), ConnectionAborted | ConnectionRefused | ConnectionReset)
 }
 
-fn connection(
-    stream: PatientStream,
+fn connection<S>(
+    stream: S,
     peer: SocketAddr,
     silent: Place,
     spoken: CancellationToken,
     router: Router,
-) -> http1::Connection<
-    TokioIo<PatientStream>,
+    traffic: Arc<HttpTotals>,
+) -> http1::UpgradeableConnection<
+    TokioIo<S>,
     impl hyper::service::Service<Request<Incoming>, Response = http::Response<Body>, Error = Infallible, Future: Send>,
-> {
-    // Answers are small and wanted at once; a failure here costs only latency.
-    let _ = stream.stream.set_nodelay(true);
-    let traffic = stream.traffic.clone();
-    traffic.connection();
+>
+where
+    S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
+{
     let silent = Mutex::new(Some(silent));
     let service = hyper::service::service_fn(move |request: Request<Incoming>| {
         spoken.cancel();
@@ -189,6 +254,7 @@ fn connection(
         .header_read_timeout(HEAD_TIMEOUT)
         .max_buf_size(MOST_HEAD_BYTES)
         .serve_connection(TokioIo::new(stream), service)
+        .with_upgrades()
 }
 
 /// A socket whose writes fail once the other side has read nothing for [`WRITE_PAUSE`], and whose bytes are counted.

@@ -14,6 +14,7 @@ pub mod extract;
 mod health;
 pub mod listener;
 mod logs;
+mod mqtt;
 pub mod oci;
 mod outputs;
 mod packages;
@@ -38,6 +39,7 @@ use axum::middleware;
 use axum::response::{IntoResponse, Response};
 use axum::routing::{MethodFilter, MethodRouter, any, on};
 use http::{HeaderValue, Method, StatusCode, header};
+use task_proto::CaPin;
 use task_proto::envelope::PublicKey;
 use task_proto::person::Permission;
 use tokio_util::sync::CancellationToken;
@@ -94,6 +96,8 @@ pub struct AppParts {
     pub events: events::EventFeed,
     /// The key that verifies desired states.
     pub key: PublicKey,
+    /// The pin of the private authority, if the listeners encrypt.
+    pub ca_pin: Option<CaPin>,
     /// Where robots reach MQTT, and with which password.
     pub mqtt: Arc<MqttAccess>,
     /// The addresses of reverse proxies that are believed about where a request came from.
@@ -239,6 +243,7 @@ pub fn routes() -> Vec<Route> {
             .body_bytes(ORDER_BODY_BYTES),
         Route::new(post, "/api/v1/tasks/{task}/remove", Person(Operate), tasks::remove).body_bytes(ORDER_BODY_BYTES),
         Route::new(get.clone(), "/api/v1/events", Person(Read), events::stream).streaming(),
+        Route::new(get.clone(), "/mqtt", Anyone, mqtt::upgrade),
         Route::new(get.clone(), "/", Anyone, web::index),
         Route::new(get, "/ui/{*file}", Anyone, web::file),
         Route::any("/v2", PersonOrRobot, oci::version),

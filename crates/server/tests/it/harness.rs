@@ -14,6 +14,7 @@ use task_proto::oci::{ImageManifest, MANIFEST_TYPE};
 use task_proto::report::{HostFacts, Phase, Report, TaskReport};
 use task_proto::token::Token;
 use task_proto::{Digest, InstanceId, RobotId};
+use task_transport::Trust;
 use taskd::clock::Clock;
 use taskd::config::Config;
 use taskd::serve::Server;
@@ -52,9 +53,8 @@ impl TestServer {
         let clock = Clock::fixed(NOW_MS);
         let server = Server::start(config, clock.clone()).await.expect("the server starts");
         let operator = server.data().operator_token().expect("a token");
-        // A second install is refused because the first is in place.
-        let _ = rustls::crypto::ring::default_provider().install_default();
-        Self { directory, server, clock, operator, client: Client::new() }
+        let client = client(Trust::by(server.addresses().ca_pin));
+        Self { directory, server, clock, operator, client }
     }
 
     /// Stops it and starts another on the same directory.
@@ -74,7 +74,7 @@ impl TestServer {
     }
 
     pub fn url(&self, path: &str) -> String {
-        format!("http://{}{path}", self.server.addresses().http)
+        format!("{}{path}", self.server.addresses().url())
     }
 
     /// A request by nobody.
@@ -200,6 +200,14 @@ impl TestRobot {
             tasks: state.tasks.iter().map(|task| in_phase(task, phase)).collect(),
         }
     }
+}
+
+/// An HTTP client that trusts them.
+pub fn client(trust: Trust) -> Client {
+    // For clients that a test makes itself. A second install is refused because the first is in place.
+    let _ = rustls::crypto::ring::default_provider().install_default();
+    let tls = trust.client_config(Clock::for_certificates());
+    Client::builder().tls_backend_preconfigured(tls).build().expect("a client")
 }
 
 /// What an envelope holds, its signature verified.

@@ -27,6 +27,7 @@ mod registry;
 mod scope;
 mod serve;
 mod story;
+mod tls;
 mod tokens;
 mod transfers;
 mod uplink;

@@ -12,7 +12,11 @@ use task_proto::topic::{RobotTopic, Topic, TopicPrefix};
 use taskd::broker::{
     Broker, BrokerConfig, Gatekeeper, Inbox, Limits, Login, NotStored, Principal, Refusal, RobotMessage,
 };
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use taskd::clock::Clock;
+use taskd::config::TlsSettings;
+use taskd::data_directory::DataDirectory;
+use taskd::tls::Tls;
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::sync::{Mutex, mpsc};
 use tokio::time::timeout;
@@ -89,9 +93,22 @@ impl TestBroker {
     }
 
     pub async fn with(change: impl FnOnce(&mut Limits)) -> Self {
+        Self::start_with(None, change).await
+    }
+
+    /// One that speaks TLS, by an authority of its own.
+    pub async fn encrypted(change: impl FnOnce(&mut Limits)) -> Self {
+        let directory = tempfile::TempDir::new().unwrap();
+        let data = DataDirectory::open(directory.path()).unwrap();
+        let tls = Tls::open(TlsSettings::default(), &data, Clock::system()).unwrap();
+        Self::start_with(Some(tls), change).await
+    }
+
+    async fn start_with(tls: Option<Tls>, change: impl FnOnce(&mut Limits)) -> Self {
         let mut limits = Limits { canary_interval: Duration::from_secs(3600), ..Limits::default() };
         change(&mut limits);
-        let config = BrokerConfig { listen: "127.0.0.1:0".parse().unwrap(), prefix: TopicPrefix::default(), limits };
+        let config =
+            BrokerConfig { listen: "127.0.0.1:0".parse().unwrap(), tls, prefix: TopicPrefix::default(), limits };
         let (sender, receiver) = mpsc::unbounded_channel();
         let refuses = Arc::new(AtomicBool::new(false));
         let inbox = Letterbox { seen: sender, refuses: refuses.clone() };
@@ -274,14 +291,18 @@ pub fn binary(bytes: &[u8]) -> Vec<u8> {
 }
 
 /// A client that knows no MQTT.
-pub struct Raw {
-    pub stream: TcpStream,
+pub struct Raw<S = TcpStream> {
+    pub stream: S,
 }
 
-impl Raw {
+impl<S: AsyncRead + AsyncWrite + Unpin> Raw<S> {
     /// Sends; that the other side has closed already is not this end's business.
     pub async fn send(&mut self, bytes: &[u8]) {
-        let _ = timeout(PATIENCE, self.stream.write_all(bytes)).await.expect("the broker should read");
+        let sending = async {
+            self.stream.write_all(bytes).await?;
+            self.stream.flush().await
+        };
+        let _ = timeout(PATIENCE, sending).await.expect("the broker should read");
     }
 
     /// The next packet must be this.

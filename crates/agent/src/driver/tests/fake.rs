@@ -44,6 +44,8 @@ pub(super) struct State {
     pub(super) kept_parts: Vec<Vec<Digest>>,
     pub(super) ledgers: Vec<Ledger>,
     pub(super) held: bool,
+    /// What the robot's clock shows, if it is wrong.
+    pub(super) wall_ms: Option<u64>,
     pub(super) disk_full: bool,
     /// What packages say they need, what the robot has, and what of it was seen.
     pub(super) exec_depends: Vec<String>,
@@ -86,7 +88,8 @@ impl Fake {
 
 impl Effects for Fake {
     fn now(&self) -> Now {
-        Now { boot_ms: crate::clock::boot_ms(), wall_ms: crate::clock::wall_ms() }
+        let wall_ms = self.state(|state| state.wall_ms).unwrap_or_else(crate::clock::wall_ms);
+        Now { boot_ms: crate::clock::boot_ms(), wall_ms }
     }
 
     fn write_ledger(&self, ledger: &Ledger) -> Result<(), LedgerError> {

@@ -1,6 +1,7 @@
-//! Lets a client in: one CONNECT, checked, admitted or refused with the right CONNACK. Until then a client gets little
-//! memory and little time. It never builds a session.
+//! Lets a client in: the TLS handshake where there is one, then one CONNECT, checked, admitted or refused with the right
+//! CONNACK. Until then a client gets little memory and little time. It never builds a session.
 
+use std::io;
 use std::net::SocketAddr;
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -9,12 +10,13 @@ use bytes::BytesMut;
 use rumqttd::protocol::{ConnAck, ConnectReturnCode, Packet};
 use subtle::ConstantTimeEq;
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
-use tokio::time::timeout;
+use tokio::time::{timeout, timeout_at};
 
 use super::Context;
 use super::access::{Visitor, may_publish};
 use super::codec::{Connect, DecodeError, Received, Will, decode, encode};
 use super::takeover::SeatName;
+use crate::anteroom::Place;
 use crate::broker::{Login, Principal, Refusal};
 
 /// The largest CONNECT, in bytes after the fixed header.
@@ -48,6 +50,14 @@ impl Guest {
     }
 }
 
+/// A connection whose client has not said who it is.
+pub(super) struct Arrival {
+    pub(super) peer: SocketAddr,
+    /// By when it must have.
+    deadline: tokio::time::Instant,
+    place: Place,
+}
+
 /// Why a client does not come in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub(super) enum Rejection {
@@ -59,6 +69,31 @@ pub(super) enum Rejection {
     /// Answered with a CONNACK.
     #[error("{reason}")]
     Answered { code: ConnectReturnCode, reason: &'static str },
+}
+
+impl Arrival {
+    pub(super) fn new(context: &Context, peer: SocketAddr) -> Self {
+        let deadline = tokio::time::Instant::now() + context.limits.connect_timeout;
+        Self { peer, deadline, place: context.anteroom.enter(peer.ip(), Instant::now()) }
+    }
+
+    /// Waits for the client to take the next step, for as long as it has.
+    pub(super) async fn step<T>(
+        &self,
+        late: &'static str,
+        step: impl Future<Output = Result<T, Rejection>>,
+    ) -> Result<T, Rejection> {
+        tokio::select! {
+            done = timeout_at(self.deadline, step) => done.unwrap_or(Err(Rejection::Silent(late))),
+            () = self.place.leave().cancelled() => Err(Rejection::Silent("gives way to a newcomer from its address")),
+        }
+    }
+
+    /// The handshake of a client that has to speak TLS.
+    pub(super) async fn shake_hands<S>(&self, handshake: impl Future<Output = io::Result<S>>) -> Result<S, Rejection> {
+        let handshake = async { handshake.await.map_err(|_| Rejection::Silent("does not finish the TLS handshake")) };
+        self.step("does not finish the TLS handshake in time", handshake).await
+    }
 }
 
 /// The watchdog's password: good for one entry, then made anew.
@@ -85,19 +120,14 @@ impl CanaryPass {
 }
 
 /// Reads CONNECT and finds out who it is.
-pub(super) async fn welcome<S>(context: &Context, stream: &mut S, peer: SocketAddr) -> Result<Guest, Rejection>
+pub(super) async fn welcome<S>(context: &Context, stream: &mut S, arrival: Arrival) -> Result<Guest, Rejection>
 where
     S: AsyncRead + AsyncWrite + Unpin,
 {
     let mut input = BytesMut::new();
-    let place = context.anteroom.enter(peer.ip(), Instant::now());
-    let connect = tokio::select! {
-        connect = timeout(context.limits.connect_timeout, read_connect(stream, &mut input)) => {
-            connect.unwrap_or(Err(Rejection::Silent("sends no CONNECT in time")))?
-        }
-        () = place.leave().cancelled() => return Err(Rejection::Silent("gives way to a newcomer from its address")),
-    };
-    drop(place);
+    let connect = arrival.step("sends no CONNECT in time", read_connect(stream, &mut input)).await?;
+    let peer = arrival.peer;
+    drop(arrival);
     if connect.client_id.is_empty() && !connect.clean_session {
         return Err(answer(ConnectReturnCode::ClientIdentifierNotValid, "an empty client id without a clean session"));
     }

@@ -1,12 +1,12 @@
-//! Accepts connections and gives each a task of its own, so that no client waits for another. It reads no byte.
-//! A TLS listener would do its handshake inside that task too, with a timeout, and hand the stream to the same session.
+//! Accepts connections and gives each a task of its own, so that no client waits for another: a TLS handshake is done in
+//! there too. It reads no byte.
 
 use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::net::TcpListener;
-use tokio::sync::Semaphore;
 
+use super::entrance::Arrival;
 use super::{Front, session};
 
 /// For the system to have file descriptors again.
@@ -14,7 +14,6 @@ const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
 /// Accepts until the front stops.
 pub(super) async fn run(front: Arc<Front>, listener: TcpListener) {
-    let places = Arc::new(Semaphore::new(front.context.limits.max_connections));
     loop {
         let accepted = tokio::select! {
             accepted = listener.accept() => accepted,
@@ -28,17 +27,23 @@ pub(super) async fn run(front: Arc<Front>, listener: TcpListener) {
                 continue;
             }
         };
-        let Ok(place) = places.clone().try_acquire_owned() else {
+        let Ok(place) = front.context.places.clone().try_acquire_owned() else {
             tracing::debug!(%peer, "as many MQTT connections as there may be, one more is closed");
             front.context.totals.refuse(None);
             continue;
         };
         // Small packets, each of which somebody waits for. If it can't be set, they come a little later.
         let _ = stream.set_nodelay(true);
-        let context = front.context.clone();
-        front.sessions.spawn(async move {
-            session::serve(context, stream, peer).await;
-            drop(place);
-        });
+        match front.context.tls.clone() {
+            None => {
+                let context = front.context.clone();
+                let arrival = Arrival::new(&context, peer);
+                front.sessions.spawn(async move {
+                    session::serve(context, stream, arrival).await;
+                    drop(place);
+                });
+            }
+            Some(tls) => front.attend(peer, place, async move { tls.accept(stream).await }),
+        }
     }
 }

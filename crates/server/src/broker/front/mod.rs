@@ -16,6 +16,7 @@ mod session;
 mod takeover;
 mod traffic;
 
+use std::io;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
@@ -24,6 +25,8 @@ use bytes::Bytes;
 use task_proto::api::{MqttTraffic, Traffic};
 use task_proto::topic::TopicPrefix;
 use task_proto::{RobotId, UserName};
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
@@ -31,6 +34,8 @@ use super::router::Router;
 use super::{BrokerConfig, BrokerError, Gatekeeper, Inbox, Limits, NotAsked, NotConnected};
 use crate::anteroom::Anteroom;
 use crate::backlog::listen;
+use crate::tls::Tls;
+use entrance::Arrival;
 pub(super) use entrance::{CANARY_ID, CanaryPass};
 use parts::Grants;
 pub(super) use parts::{Grant, NotGranted};
@@ -57,6 +62,10 @@ struct Context {
     canary_pass: Arc<CanaryPass>,
     /// Who has not sent CONNECT yet.
     anteroom: Arc<Anteroom>,
+    /// How many connections there may be.
+    places: Arc<Semaphore>,
+    /// What the listener speaks, if it encrypts.
+    tls: Option<Tls>,
     stop: CancellationToken,
 }
 
@@ -74,7 +83,9 @@ impl Front {
         let anteroom = Anteroom::new(config.limits.max_silent_per_address);
         let context = Arc::new(Context {
             prefix: config.prefix,
+            places: Arc::new(Semaphore::new(config.limits.max_connections)),
             limits: config.limits,
+            tls: config.tls,
             gatekeeper,
             inbox,
             router,
@@ -138,6 +149,53 @@ impl Front {
 
     pub(super) fn canary_pass(&self) -> Arc<CanaryPass> {
         self.context.canary_pass.clone()
+    }
+
+    /// Serves the connection that `handshake` ends in, if it does in time. False: there are too many connections.
+    pub(super) fn take_in<S>(
+        &self,
+        peer: SocketAddr,
+        handshake: impl Future<Output = io::Result<S>> + Send + 'static,
+    ) -> bool
+    where
+        S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
+    {
+        let Ok(place) = self.context.places.clone().try_acquire_owned() else {
+            self.context.totals.refuse(None);
+            return false;
+        };
+        self.attend(peer, place, handshake);
+        true
+    }
+
+    fn attend<S>(
+        &self,
+        peer: SocketAddr,
+        place: OwnedSemaphorePermit,
+        handshake: impl Future<Output = io::Result<S>> + Send + 'static,
+    ) where
+        S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
+    {
+        let context = self.context.clone();
+        let arrival = Arrival::new(&context, peer);
+        self.sessions.spawn(async move {
+            let shaken = tokio::select! {
+                shaken = arrival.shake_hands(handshake) => shaken,
+                () = context.stop.cancelled() => return,
+            };
+            match shaken {
+                Ok(stream) => session::serve(context, stream, arrival).await,
+                Err(rejection) => {
+                    tracing::debug!(%peer, "MQTT client turned away: {rejection}");
+                    context.totals.refuse(None);
+                }
+            }
+            drop(place);
+        });
+    }
+
+    pub(super) fn tls(&self) -> Option<&Tls> {
+        self.context.tls.as_ref()
     }
 
     pub(super) fn stop(&self) -> CancellationToken {

@@ -2,6 +2,7 @@
 //! Everything it holds is bounded; it stops reading while a message is being stored or answers are not read.
 
 use std::collections::{HashMap, HashSet};
+use std::io;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
@@ -20,7 +21,7 @@ use tokio::time::{Instant, sleep_until, timeout};
 use super::Context;
 use super::access::{Hearing, Route, Visitor, may_publish};
 use super::codec::{DecodeError, Publish, Received, Will, decode, encode, encode_publish};
-use super::entrance::{Guest, Rejection, connack, reject, welcome};
+use super::entrance::{Arrival, Guest, Rejection, connack, reject, welcome};
 use super::outgoing::Outgoing;
 use super::output::{Output, give_back};
 use super::parts::Due;
@@ -71,14 +72,15 @@ enum End {
 }
 
 /// Serves one connection to its end. For TLS, `stream` is what the handshake returns.
-pub(super) async fn serve<S>(context: Arc<Context>, stream: S, peer: SocketAddr)
+pub(super) async fn serve<S>(context: Arc<Context>, stream: S, arrival: Arrival)
 where
     S: AsyncRead + AsyncWrite + Send + Unpin,
 {
+    let peer = arrival.peer;
     let meter = Arc::new(Meter::default());
     let mut stream = Metered { stream, meter: meter.clone() };
     let entered = tokio::select! {
-        entered = enter(&context, &mut stream, peer, &meter) => entered,
+        entered = enter(&context, &mut stream, arrival, &meter) => entered,
         () = context.stop.cancelled() => return,
     };
     match entered {
@@ -102,13 +104,13 @@ where
 async fn enter<S>(
     context: &Context,
     stream: &mut S,
-    peer: SocketAddr,
+    arrival: Arrival,
     meter: &Arc<Meter>,
 ) -> Result<(Guest, Seat, Option<Listener>), Rejection>
 where
     S: AsyncRead + AsyncWrite + Unpin,
 {
-    let guest = welcome(context, stream, peer).await?;
+    let guest = welcome(context, stream, arrival).await?;
     let seat = context.seats.take(guest.seat_name.clone(), meter.clone()).await;
     guest.check_again(context).await?;
     let listening = match guest.visitor {
@@ -156,6 +158,7 @@ where
         writer,
         input: guest.input,
         output,
+        is_flushed: true,
         listener,
         hearing: HashMap::new(),
         parts: Parts::default(),
@@ -182,7 +185,7 @@ async fn linger<S: AsyncRead + AsyncWrite + Unpin>(stream: &mut S) {
         stream.shutdown().await?;
         let mut scrap = [0; 1024];
         while stream.read(&mut scrap).await? > 0 {}
-        std::io::Result::Ok(())
+        io::Result::Ok(())
     };
     // Whatever went wrong, the connection is over.
     let _ = timeout(LINGER, read_out).await;
@@ -218,6 +221,8 @@ struct Session<'a, S> {
     writer: WriteHalf<&'a mut S>,
     input: BytesMut,
     output: Output,
+    /// Whether all that left `output` has left the stream's own buffers as well.
+    is_flushed: bool,
     listener: Option<Listener>,
     hearing: HashMap<String, (Hearing, QoS)>,
     parts: Parts,
@@ -239,8 +244,8 @@ struct Storing<'a> {
 
 /// What a session wakes up for.
 enum Woken {
-    Read(std::io::Result<usize>),
-    Wrote(std::io::Result<usize>),
+    Read(io::Result<usize>),
+    Wrote(io::Result<()>),
     Stored(Result<(), NotStored>),
     Rung(Bytes),
     Asked(Bytes),
@@ -277,7 +282,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
     async fn wait(&mut self) -> Woken {
         let (deadline, lateness) = self.deadline();
         let may_read = self.may_read();
-        let may_send = self.output.is_empty() && self.outgoing.has_room();
+        let may_write = !self.output.is_empty() || !self.is_flushed;
+        let may_send = self.caught_up();
         let may_send_part = may_send && self.outgoing.has_room_for_part();
         let hears_desired = self.qos_of(Hearing::Desired).is_some();
         let hears_request = self.qos_of(Hearing::Request).is_some();
@@ -286,7 +292,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         }
         let woken = tokio::select! {
             stored = stored(&mut self.storing) => Woken::Stored(stored),
-            wrote = self.writer.write_buf(&mut self.output), if !self.output.is_empty() => Woken::Wrote(wrote),
+            wrote = write(&mut self.writer, &mut self.output, &mut self.is_flushed), if may_write => Woken::Wrote(wrote),
             read = self.reader.read_buf(&mut self.input), if may_read => Woken::Read(read),
             payload = self.seat.doorbell().answer(), if may_send && hears_desired => Woken::Rung(payload),
             payload = self.seat.doorbell().question(), if may_send && hears_request => Woken::Asked(payload),
@@ -303,7 +309,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
 
     /// By when something must happen, and what it means if it does not.
     fn deadline(&mut self) -> (Instant, End) {
-        if self.output.is_empty() && self.outgoing.has_room() {
+        if self.caught_up() {
             self.progress_at = Instant::now();
         }
         let unread_until = self.progress_at + self.context.limits.write_timeout;
@@ -318,7 +324,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
 
     /// Whether the client has taken all it was sent.
     fn caught_up(&self) -> bool {
-        self.output.is_empty() && self.outgoing.has_room()
+        self.output.is_empty() && self.is_flushed && self.outgoing.has_room()
     }
 
     fn may_read(&self) -> bool {
@@ -332,9 +338,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
 
     fn act_on(&mut self, woken: Woken) -> Result<(), End> {
         match woken {
-            Woken::Read(Ok(0) | Err(_)) | Woken::Wrote(Ok(0) | Err(_)) => return Err(End::Gone),
+            Woken::Read(Ok(0) | Err(_)) | Woken::Wrote(Err(_)) => return Err(End::Gone),
             Woken::Read(Ok(_)) => {}
-            Woken::Wrote(Ok(_)) => {
+            Woken::Wrote(Ok(())) => {
                 self.progress_at = Instant::now();
                 self.output.give_back();
                 if self.output.is_empty() {
@@ -503,6 +509,20 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
 /// Hands a message to the inbox, within the time it has.
 async fn store(context: &Context, message: RobotMessage) -> Result<(), NotStored> {
     timeout(context.limits.inbox_timeout, context.inbox.receive(message)).await.unwrap_or(Err(NotStored))
+}
+
+/// Writes some of what is there, and waits until the stream holds none of it back. What a call that is dropped has written
+/// is gone from `output`, and `is_flushed` says whether more is to be done.
+async fn write<W: AsyncWrite + Unpin>(writer: &mut W, output: &mut Output, is_flushed: &mut bool) -> io::Result<()> {
+    if !output.is_empty() {
+        *is_flushed = false;
+        if writer.write_buf(output).await? == 0 {
+            return Err(io::ErrorKind::WriteZero.into());
+        }
+    }
+    writer.flush().await?;
+    *is_flushed = true;
+    Ok(())
 }
 
 /// When the message on its way has arrived; never if there is none.

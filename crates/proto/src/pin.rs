@@ -1,0 +1,63 @@
+//! The pin of a server's private certificate authority: what an enrolment token says of it, so that a robot knows its
+//! server without asking anybody else.
+
+use std::fmt;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+use crate::Digest;
+use crate::digest::{hex, unhex};
+
+/// What a client asks for by ALPN (RFC 7301) if it trusts a pinned authority: a server that has both shows it the
+/// certificate which that authority made, and everybody else its own.
+pub const PINNED_PROTOCOL: &[u8] = b"taskd-pinned";
+
+/// The SHA-256 of an authority's SubjectPublicKeyInfo (DER), 64 hex digits. Its certificate may be made anew.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub struct CaPin([u8; 32]);
+
+/// A text that is not 64 lower-case hex digits.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("not a pin: expected 64 lower-case hex digits")]
+pub struct InvalidPin;
+
+impl CaPin {
+    /// The pin of the authority with this SubjectPublicKeyInfo.
+    pub fn of(public_key_info: &[u8]) -> Self {
+        Self(Digest::of(public_key_info).to_bytes())
+    }
+}
+
+impl FromStr for CaPin {
+    type Err = InvalidPin;
+    fn from_str(text: &str) -> Result<Self, InvalidPin> {
+        unhex(text).map(Self).ok_or(InvalidPin)
+    }
+}
+
+impl TryFrom<String> for CaPin {
+    type Error = InvalidPin;
+    fn try_from(text: String) -> Result<Self, InvalidPin> {
+        text.parse()
+    }
+}
+
+impl From<CaPin> for String {
+    fn from(pin: CaPin) -> String {
+        pin.to_string()
+    }
+}
+
+impl fmt::Display for CaPin {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&hex(&self.0))
+    }
+}
+
+impl fmt::Debug for CaPin {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Display::fmt(self, f)
+    }
+}

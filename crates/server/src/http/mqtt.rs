@@ -1,0 +1,37 @@
+//! The way to MQTT over the HTTP port: a WebSocket, for robots that reach nothing else. Who comes in is the broker's own
+//! affair, as at its own port.
+
+use std::io;
+use std::net::SocketAddr;
+
+use axum::body::Body;
+use axum::extract::{ConnectInfo, Request, State};
+use axum::response::Response;
+use http::StatusCode;
+use hyper_util::rt::TokioIo;
+use task_transport::websocket::{WebSocket, grant};
+
+use super::App;
+use super::error::ApiError;
+
+/// `GET /mqtt`: goes over to MQTT.
+pub(super) async fn upgrade(
+    State(app): State<App>,
+    ConnectInfo(peer): ConnectInfo<SocketAddr>,
+    mut request: Request,
+) -> Result<Response, ApiError> {
+    let headers = grant(request.headers())
+        .map_err(|error| ApiError::new(StatusCode::UPGRADE_REQUIRED, "upgrade_required", error.to_string()))?;
+    let upgrade = hyper::upgrade::on(&mut request);
+    let handshake = async move {
+        let stream = upgrade.await.map_err(io::Error::other)?;
+        Ok(WebSocket::server(TokioIo::new(stream)))
+    };
+    if !app.broker.take_in(peer, handshake) {
+        return Err(ApiError::unavailable("MQTT is served elsewhere, or to as many as there may be"));
+    }
+    let mut response = Response::new(Body::empty());
+    *response.status_mut() = StatusCode::SWITCHING_PROTOCOLS;
+    response.headers_mut().extend(headers);
+    Ok(response)
+}

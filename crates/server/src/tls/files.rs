@@ -1,0 +1,64 @@
+//! The operator's own certificate: a chain and its key in two PEM files, which somebody else replaces when they like. It
+//! takes what fits together and nothing else.
+
+use std::fs::File;
+use std::io::{self, Read as _};
+use std::path::{Path, PathBuf};
+
+use rustls::crypto::ring;
+use rustls::pki_types::pem::{self, PemObject as _};
+use rustls::pki_types::{CertificateDer, PrivateKeyDer};
+use rustls::sign::CertifiedKey;
+use task_proto::Digest;
+
+use super::TlsError;
+
+/// A longer file holds something else.
+const MAX_FILE_BYTES: u64 = 1024 * 1024;
+
+/// Where the two files are, and what was in them when they were last looked at.
+#[derive(Debug)]
+pub(super) struct Files {
+    certificate: PathBuf,
+    key: PathBuf,
+    seen: Option<Digest>,
+}
+
+impl Files {
+    pub(super) fn new(certificate: PathBuf, key: PathBuf) -> Self {
+        Self { certificate, key, seen: None }
+    }
+
+    /// What is in the files; `None` if it is what was there the last time. What can't be used is said once.
+    pub(super) fn read_news(&mut self) -> Result<Option<CertifiedKey>, TlsError> {
+        let (certificate, key) = (read(&self.certificate)?, read(&self.key)?);
+        let content = Digest::of(&[Digest::of(&certificate).to_bytes(), Digest::of(&key).to_bytes()].concat());
+        if self.seen.replace(content) == Some(content) {
+            return Ok(None);
+        }
+        self.parse(&certificate, &key).map(Some)
+    }
+
+    fn parse(&self, certificate: &[u8], key: &[u8]) -> Result<CertifiedKey, TlsError> {
+        let wrong = |path: &Path, expected| TlsError::Content { path: path.to_owned(), expected };
+        let chain: Result<Vec<CertificateDer<'static>>, pem::Error> =
+            CertificateDer::pem_slice_iter(certificate).collect();
+        let chain = chain.ok().filter(|chain| !chain.is_empty());
+        let chain = chain.ok_or_else(|| wrong(&self.certificate, "a chain of certificates"))?;
+        let key = PrivateKeyDer::from_pem_slice(key).map_err(|_| wrong(&self.key, "an unencrypted private key"))?;
+        CertifiedKey::from_der(chain, key, &ring::default_provider()).map_err(|source| TlsError::Unfit {
+            certificate: self.certificate.clone(),
+            key: self.key.clone(),
+            source,
+        })
+    }
+}
+
+fn read(path: &Path) -> Result<Vec<u8>, TlsError> {
+    let read = || -> io::Result<Vec<u8>> {
+        let mut bytes = Vec::new();
+        File::open(path)?.take(MAX_FILE_BYTES).read_to_end(&mut bytes)?;
+        Ok(bytes)
+    };
+    read().map_err(|source| TlsError::Unreadable { path: path.to_owned(), source })
+}

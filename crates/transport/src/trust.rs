@@ -1,0 +1,349 @@
+//! Whom a client takes for the server: the one whose private authority an enrolment token pinned, or whoever the system's
+//! root certificates vouch for under the name that was asked for. A clock that can't be right does not keep a client out.
+
+use std::fmt;
+use std::sync::Arc;
+use std::time::Duration;
+
+use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
+use rustls::client::{verify_server_cert_signed_by_trust_anchor, verify_server_name};
+use rustls::crypto::{WebPkiSupportedAlgorithms, ring, verify_tls12_signature, verify_tls13_signature};
+use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
+use rustls::server::ParsedCertificate;
+use rustls::time_provider::TimeProvider;
+use rustls::{
+    CertificateError, ClientConfig, DigitallySignedStruct, Error, OtherError, RootCertStore, SignatureScheme,
+};
+use task_proto::CaPin;
+use task_proto::pin::PINNED_PROTOCOL;
+
+/// Certificates whose beginnings a wrong clock may be moved to: more than any chain has.
+const MAX_CHAIN: usize = 8;
+
+/// Whom a client trusts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Trust {
+    /// The authority with this pin and nobody else. It vouches for one server only, so its name does not matter.
+    Pinned(CaPin),
+    /// Whom the system's root certificates vouch for, by name. `SSL_CERT_FILE` and `SSL_CERT_DIR` name others.
+    System,
+}
+
+/// When this program was made, in milliseconds since the Unix epoch, at the earliest: a clock that shows less is wrong. A
+/// build that says its time as reproducible builds do, in `SOURCE_DATE_EPOCH`, is held to that.
+pub const BUILT_MS: u64 = built_ms(option_env!("SOURCE_DATE_EPOCH"));
+/// 2026-01-01: there was no such program before.
+const BEGINNING_MS: u64 = 1_767_225_600_000;
+
+/// A machine's clock, which may be wrong.
+#[derive(Debug, Clone, Copy)]
+pub struct Clock {
+    /// What it shows: milliseconds since the Unix epoch.
+    pub now_ms: fn() -> u64,
+    /// What it shows at least if it is right.
+    pub earliest_ms: u64,
+}
+
+/// What answered has no certificate by the authority that was pinned.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct WrongServer;
+
+impl fmt::Display for WrongServer {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("this is not the server whose certificate authority was pinned")
+    }
+}
+
+impl std::error::Error for WrongServer {}
+
+impl Trust {
+    /// In the authority that was pinned, or in the system's roots where none was.
+    pub fn by(pin: Option<CaPin>) -> Self {
+        pin.map_or(Self::System, Self::Pinned)
+    }
+
+    /// How a client with this trust connects by TLS. Reads the system's certificates where they count.
+    pub fn client_config(self, clock: Clock) -> ClientConfig {
+        let provider = Arc::new(ring::default_provider());
+        let algorithms = provider.signature_verification_algorithms;
+        let anchor = match self {
+            Self::Pinned(pin) => Anchor::Pin(pin),
+            Self::System => Anchor::Roots(system_roots()),
+        };
+        let verifier = Verifier { anchor, algorithms, earliest: at(clock.earliest_ms) };
+        let builder = ClientConfig::builder_with_details(provider, Arc::new(clock));
+        let builder = builder.with_safe_default_protocol_versions().expect("the provider has suites for them");
+        let builder = builder.dangerous().with_custom_certificate_verifier(Arc::new(verifier));
+        let mut config = builder.with_no_client_auth();
+        if let Self::Pinned(_) = self {
+            config.alpn_protocols = vec![b"http/1.1".to_vec(), PINNED_PROTOCOL.to_vec()];
+        }
+        config
+    }
+}
+
+impl Clock {
+    /// A clock that can't be right before [`BUILT_MS`].
+    pub fn new(now_ms: fn() -> u64) -> Self {
+        Self { now_ms, earliest_ms: BUILT_MS }
+    }
+}
+
+impl TimeProvider for Clock {
+    fn current_time(&self) -> Option<UnixTime> {
+        Some(at((self.now_ms)()))
+    }
+}
+
+/// Whole seconds since the Unix epoch, as text, in milliseconds. What is none says nothing.
+const fn built_ms(seconds: Option<&str>) -> u64 {
+    let Some(text) = seconds else { return BEGINNING_MS };
+    let (digits, mut at, mut read) = (text.as_bytes(), 0, 0u64);
+    while at < digits.len() {
+        if !digits[at].is_ascii_digit() || at > 11 {
+            return BEGINNING_MS;
+        }
+        read = read * 10 + (digits[at] - b'0') as u64;
+        at += 1;
+    }
+    if read * 1000 > BEGINNING_MS { read * 1000 } else { BEGINNING_MS }
+}
+
+fn at(unix_ms: u64) -> UnixTime {
+    UnixTime::since_unix_epoch(Duration::from_millis(unix_ms))
+}
+
+/// The pin of an authority by its certificate; `None` if that is none.
+pub fn pin_of(certificate: &CertificateDer<'_>) -> Option<CaPin> {
+    let parsed = ParsedCertificate::try_from(certificate).ok()?;
+    Some(CaPin::of(&parsed.subject_public_key_info()))
+}
+
+/// A machine without root certificates trusts nobody; plain text and pins need none.
+fn system_roots() -> RootCertStore {
+    let mut roots = RootCertStore::empty();
+    roots.add_parsable_certificates(rustls_native_certs::load_native_certs().certs);
+    roots
+}
+
+#[derive(Debug)]
+enum Anchor {
+    Pin(CaPin),
+    Roots(RootCertStore),
+}
+
+#[derive(Debug)]
+struct Verifier {
+    anchor: Anchor,
+    algorithms: WebPkiSupportedAlgorithms,
+    earliest: UnixTime,
+}
+
+impl Verifier {
+    fn verify(
+        &self,
+        certificate: &CertificateDer<'_>,
+        chain: &[CertificateDer<'_>],
+        name: &ServerName<'_>,
+        now: UnixTime,
+    ) -> Result<(), Error> {
+        let server = ParsedCertificate::try_from(certificate)?;
+        let by = |roots: &RootCertStore| {
+            self.at_a_possible_time(now, |time| {
+                verify_server_cert_signed_by_trust_anchor(&server, roots, chain, time, self.algorithms.all)
+            })
+        };
+        match &self.anchor {
+            Anchor::Roots(roots) => {
+                by(roots)?;
+                verify_server_name(&server, name)
+            }
+            Anchor::Pin(pin) => {
+                let authority = chain.iter().find(|certificate| pin_of(certificate) == Some(*pin));
+                let authority = authority.ok_or_else(|| Error::Other(OtherError(Arc::new(WrongServer))))?;
+                let mut roots = RootCertStore::empty();
+                roots.add(authority.clone())?;
+                by(&roots)
+            }
+        }
+    }
+
+    /// Checks at `now`. If that can't be right, a certificate's beginning is not held against the server: the earliest
+    /// moment counts at which all of them had begun, and what ended before that stays ended.
+    fn at_a_possible_time(&self, now: UnixTime, check: impl Fn(UnixTime) -> Result<(), Error>) -> Result<(), Error> {
+        if now >= self.earliest {
+            return check(now);
+        }
+        let mut time = self.earliest;
+        for _ in 0..MAX_CHAIN {
+            match check(time) {
+                Err(Error::InvalidCertificate(CertificateError::NotValidYetContext { not_before, .. }))
+                    if not_before > time =>
+                {
+                    time = not_before;
+                }
+                outcome => return outcome,
+            }
+        }
+        check(time)
+    }
+}
+
+impl ServerCertVerifier for Verifier {
+    fn verify_server_cert(
+        &self,
+        end_entity: &CertificateDer<'_>,
+        intermediates: &[CertificateDer<'_>],
+        server_name: &ServerName<'_>,
+        _ocsp_response: &[u8],
+        now: UnixTime,
+    ) -> Result<ServerCertVerified, Error> {
+        self.verify(end_entity, intermediates, server_name, now).map(|()| ServerCertVerified::assertion())
+    }
+
+    fn verify_tls12_signature(
+        &self,
+        message: &[u8],
+        certificate: &CertificateDer<'_>,
+        signature: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        verify_tls12_signature(message, certificate, signature, &self.algorithms)
+    }
+
+    fn verify_tls13_signature(
+        &self,
+        message: &[u8],
+        certificate: &CertificateDer<'_>,
+        signature: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        verify_tls13_signature(message, certificate, signature, &self.algorithms)
+    }
+
+    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
+        self.algorithms.supported_schemes()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rcgen::{
+        BasicConstraints, CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair, date_time_ymd,
+    };
+
+    use super::*;
+
+    const BUILT_MS: u64 = BEGINNING_MS;
+    const DAY_MS: u64 = 86_400_000;
+
+    struct Authority {
+        issuer: Issuer<'static, KeyPair>,
+        certificate: CertificateDer<'static>,
+    }
+
+    impl Authority {
+        fn new(name: &str) -> Self {
+            let mut params = CertificateParams::new(Vec::new()).expect("no names");
+            params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
+            params.distinguished_name.push(DnType::CommonName, name);
+            let key = KeyPair::generate().expect("a key");
+            let certificate = params.self_signed(&key).expect("signed").der().clone();
+            Self { issuer: Issuer::new(params, key), certificate }
+        }
+
+        fn pin(&self) -> CaPin {
+            pin_of(&self.certificate).expect("a certificate")
+        }
+
+        /// For `server.lab`, good from the first day of `from` until that of `until`.
+        fn server(&self, from: i32, until: i32, purpose: ExtendedKeyUsagePurpose) -> CertificateDer<'static> {
+            let mut params = CertificateParams::new(vec!["server.lab".to_owned()]).expect("a name");
+            params.extended_key_usages = vec![purpose];
+            (params.not_before, params.not_after) = (date_time_ymd(from, 1, 1), date_time_ymd(until, 1, 1));
+            let key = KeyPair::generate().expect("a key");
+            params.signed_by(&key, &self.issuer).expect("signed").der().clone()
+        }
+    }
+
+    fn verifier(anchor: Anchor) -> Verifier {
+        let algorithms = ring::default_provider().signature_verification_algorithms;
+        Verifier { anchor, algorithms, earliest: at(BUILT_MS) }
+    }
+
+    fn check(
+        verifier: &Verifier,
+        server: &CertificateDer<'_>,
+        chain: &[CertificateDer<'_>],
+        name: &str,
+        now_ms: u64,
+    ) -> Result<(), Error> {
+        verifier.verify(server, chain, &name.to_owned().try_into().expect("a name"), at(now_ms))
+    }
+
+    #[test]
+    fn a_pinned_authority_is_believed_under_any_name_and_no_other_is() {
+        let (own, other) = (Authority::new("own"), Authority::new("other"));
+        let pinned = verifier(Anchor::Pin(own.pin()));
+        let good = own.server(2025, 2100, ExtendedKeyUsagePurpose::ServerAuth);
+        let chain = [own.certificate.clone()];
+        assert_eq!(check(&pinned, &good, &chain, "10.0.0.1", BUILT_MS), Ok(()));
+        let foreign = other.server(2025, 2100, ExtendedKeyUsagePurpose::ServerAuth);
+        let refused = check(&pinned, &foreign, std::slice::from_ref(&other.certificate), "server.lab", BUILT_MS);
+        assert!(matches!(refused, Err(Error::Other(_))), "{refused:?}");
+        // The pinned certificate beside another's server proves nothing.
+        let both = [other.certificate.clone(), own.certificate.clone()];
+        assert!(check(&pinned, &foreign, &both, "server.lab", BUILT_MS).is_err());
+        // Nor does a certificate that was made for something else.
+        let client = own.server(2025, 2100, ExtendedKeyUsagePurpose::ClientAuth);
+        assert!(check(&pinned, &client, &chain, "server.lab", BUILT_MS).is_err());
+    }
+
+    #[test]
+    fn roots_vouch_for_a_name() {
+        let own = Authority::new("own");
+        let mut roots = RootCertStore::empty();
+        roots.add(own.certificate.clone()).expect("an authority");
+        let by_roots = verifier(Anchor::Roots(roots));
+        let server = own.server(2025, 2100, ExtendedKeyUsagePurpose::ServerAuth);
+        assert_eq!(check(&by_roots, &server, &[], "server.lab", BUILT_MS), Ok(()));
+        assert!(check(&by_roots, &server, &[], "other.lab", BUILT_MS).is_err());
+        assert!(check(&verifier(Anchor::Roots(RootCertStore::empty())), &server, &[], "server.lab", BUILT_MS).is_err());
+    }
+
+    #[test]
+    fn a_clock_before_the_programs_own_time_is_not_held_against_a_beginning() {
+        let own = Authority::new("own");
+        let pinned = verifier(Anchor::Pin(own.pin()));
+        let chain = [own.certificate.clone()];
+        let later = own.server(2030, 2031, ExtendedKeyUsagePurpose::ServerAuth);
+        for impossible_ms in [0, BUILT_MS - 1] {
+            assert_eq!(check(&pinned, &later, &chain, "server.lab", impossible_ms), Ok(()));
+        }
+        // A clock that may be right is believed, both ways.
+        let year_2040_ms = BUILT_MS + 14 * 366 * DAY_MS;
+        for possible_ms in [BUILT_MS, year_2040_ms] {
+            assert!(check(&pinned, &later, &chain, "server.lab", possible_ms).is_err());
+        }
+        // What had ended before the program existed has ended, whatever the clock shows.
+        let past = own.server(2020, 2025, ExtendedKeyUsagePurpose::ServerAuth);
+        for now_ms in [0, BUILT_MS] {
+            assert!(check(&pinned, &past, &chain, "server.lab", now_ms).is_err());
+        }
+    }
+
+    #[test]
+    fn the_time_of_the_build_is_what_it_says() {
+        assert_eq!(built_ms(None), BEGINNING_MS);
+        assert_eq!(built_ms(Some("1800000000")), 1_800_000_000_000);
+        for nothing in ["", "0", "-5", "1800000000x", "99999999999999999999"] {
+            assert_eq!(built_ms(Some(nothing)), BEGINNING_MS, "{nothing}");
+        }
+    }
+
+    #[test]
+    fn only_who_trusts_a_pin_asks_for_its_certificate() {
+        let clock = Clock { now_ms: || BUILT_MS, earliest_ms: BUILT_MS };
+        let pinned = Trust::Pinned(Authority::new("own").pin()).client_config(clock);
+        assert!(pinned.alpn_protocols.iter().any(|protocol| protocol == PINNED_PROTOCOL));
+        assert!(Trust::System.client_config(clock).alpn_protocols.is_empty());
+    }
+}

@@ -1,0 +1,392 @@
+//! MQTT over WebSocket (MQTT 3.1.1, section 6): a stream of bytes in binary frames, as either end. It begins as an HTTP
+//! request, so it passes what lets nothing but HTTP pass.
+
+pub mod frame;
+
+use std::io;
+use std::pin::Pin;
+use std::task::{Context, Poll, ready};
+
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use bytes::{Buf as _, BytesMut};
+use http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
+use sha1::{Digest as _, Sha1};
+use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _, ReadBuf};
+
+use self::frame::{Decoder, Opcode, Piece, Role, encode};
+
+/// The subprotocol's name.
+pub const MQTT: &str = "mqtt";
+/// What both ends hash behind the client's key (RFC 6455, section 1.3).
+const KEY_SUFFIX: &str = "258EAFA5-E914-47DA-95CA-C5AB0DC85B11";
+/// The head of the answer that a client reads.
+const MAX_HEAD_BYTES: usize = 16 * 1024;
+/// The headers in it.
+const MAX_HEADERS: usize = 64;
+/// What goes into one frame.
+const FRAME_BYTES: usize = 16 * 1024;
+/// Encoded and not written yet, before nothing more is taken.
+const MAX_UNWRITTEN_BYTES: usize = 32 * 1024;
+/// What is read at once.
+const READ_BYTES: usize = 8 * 1024;
+
+/// Why there is no WebSocket.
+#[derive(Debug, thiserror::Error)]
+pub enum WebSocketError {
+    /// The connection failed.
+    #[error("the connection failed before the WebSocket was there")]
+    Io(#[from] io::Error),
+    /// An HTTP answer that grants none.
+    #[error("the server answers {0} where MQTT over WebSocket should be")]
+    Refused(StatusCode),
+    /// The request or the answer is not one for MQTT over WebSocket.
+    #[error("no MQTT over WebSocket: {0}")]
+    Malformed(&'static str),
+}
+
+/// Reads a client's request for a WebSocket and gives the headers that grant it, with status 101.
+pub fn grant(request: &HeaderMap) -> Result<HeaderMap, WebSocketError> {
+    if !has_token(request, &header::CONNECTION, "upgrade") || !has_token(request, &header::UPGRADE, "websocket") {
+        return Err(WebSocketError::Malformed("Upgrade: websocket is missing"));
+    }
+    if !has_token(request, &header::SEC_WEBSOCKET_VERSION, "13") {
+        return Err(WebSocketError::Malformed("Sec-WebSocket-Version is not 13"));
+    }
+    if !has_token(request, &header::SEC_WEBSOCKET_PROTOCOL, MQTT) {
+        return Err(WebSocketError::Malformed("Sec-WebSocket-Protocol does not offer mqtt"));
+    }
+    let key = request.get(header::SEC_WEBSOCKET_KEY).map(HeaderValue::as_bytes).unwrap_or_default();
+    if !STANDARD.decode(key).is_ok_and(|key| key.len() == 16) {
+        return Err(WebSocketError::Malformed("Sec-WebSocket-Key is not 16 bytes in base64"));
+    }
+    let accept = HeaderValue::try_from(accept_of(key)).map_err(|_| WebSocketError::Malformed("Sec-WebSocket-Key"))?;
+    Ok(HeaderMap::from_iter([
+        (header::CONNECTION, HeaderValue::from_static("Upgrade")),
+        (header::UPGRADE, HeaderValue::from_static("websocket")),
+        (header::SEC_WEBSOCKET_PROTOCOL, HeaderValue::from_static(MQTT)),
+        (header::SEC_WEBSOCKET_ACCEPT, accept),
+    ]))
+}
+
+fn accept_of(key: &[u8]) -> String {
+    let mut hash = Sha1::new();
+    hash.update(key);
+    hash.update(KEY_SUFFIX);
+    STANDARD.encode(hash.finalize())
+}
+
+/// Whether one of the comma-separated words of the header is `token`.
+fn has_token(headers: &HeaderMap, name: &HeaderName, token: &str) -> bool {
+    let lines = headers.get_all(name).iter().filter_map(|value| value.to_str().ok());
+    lines.flat_map(|line| line.split(',')).any(|word| word.trim().eq_ignore_ascii_case(token))
+}
+
+/// A WebSocket as a stream of bytes. Where its messages begin and end does not matter.
+#[derive(Debug)]
+pub struct WebSocket<S> {
+    stream: S,
+    role: Role,
+    decoder: Decoder,
+    /// Read from the stream and not taken apart yet.
+    input: BytesMut,
+    /// Taken apart and not handed out yet.
+    unread: BytesMut,
+    /// Whether the other end has said that nothing follows.
+    is_over: bool,
+    output: BytesMut,
+    /// Whether this end has said so.
+    is_closed: bool,
+}
+
+impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
+    /// The server's end, once the request was granted.
+    pub fn server(stream: S) -> Self {
+        Self::new(stream, Role::Server, BytesMut::new())
+    }
+
+    /// Asks for a WebSocket. `host` is what the server is known by, with its port.
+    pub async fn connect(mut stream: S, host: &str, path: &str) -> Result<Self, WebSocketError> {
+        let key = STANDARD.encode(rand::random::<[u8; 16]>());
+        let request = format!(
+            "GET {path} HTTP/1.1\r\nHost: {host}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
+             Sec-WebSocket-Version: 13\r\nSec-WebSocket-Protocol: {MQTT}\r\nSec-WebSocket-Key: {key}\r\n\r\n"
+        );
+        stream.write_all(request.as_bytes()).await?;
+        stream.flush().await?;
+        let mut input = BytesMut::new();
+        loop {
+            if stream.read_buf(&mut input).await? == 0 {
+                return Err(io::Error::from(io::ErrorKind::UnexpectedEof).into());
+            }
+            if let Some(length) = judge(&input, &key)? {
+                input.advance(length);
+                return Ok(Self::new(stream, Role::Client, input));
+            }
+            if input.len() > MAX_HEAD_BYTES {
+                return Err(WebSocketError::Malformed("the answer's head is too long"));
+            }
+        }
+    }
+
+    fn new(stream: S, role: Role, input: BytesMut) -> Self {
+        Self {
+            stream,
+            role,
+            decoder: Decoder::new(role),
+            input,
+            unread: BytesMut::new(),
+            is_over: false,
+            output: BytesMut::new(),
+            is_closed: false,
+        }
+    }
+
+    fn queue(&mut self, opcode: Opcode, payload: &[u8]) {
+        let mask = (self.role == Role::Client).then(rand::random);
+        encode(opcode, payload, mask, &mut self.output);
+    }
+
+    /// Writes what waits to be written.
+    fn poll_drain(&mut self, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        while !self.output.is_empty() {
+            let written = ready!(Pin::new(&mut self.stream).poll_write(context, &self.output))?;
+            if written == 0 {
+                return Poll::Ready(Err(io::ErrorKind::WriteZero.into()));
+            }
+            self.output.advance(written);
+        }
+        // An idle connection holds no memory.
+        self.output = BytesMut::new();
+        Poll::Ready(Ok(()))
+    }
+
+    /// Acts on the frames that are here; `unread` has what there is to read.
+    fn act_on_input(&mut self) -> io::Result<()> {
+        while self.unread.is_empty() && !self.is_over {
+            let piece = self.decoder.decode(&mut self.input);
+            match piece.map_err(|violation| io::Error::new(io::ErrorKind::InvalidData, violation))? {
+                Some(Piece::Data(bytes)) => self.unread = bytes,
+                // Who asks without reading the answers gets no more of them.
+                Some(Piece::Ping(bytes)) if !self.is_closed && self.output.len() < MAX_UNWRITTEN_BYTES => {
+                    self.queue(Opcode::Pong, &bytes);
+                }
+                Some(Piece::Ping(_) | Piece::Pong) => {}
+                Some(Piece::Close) => self.is_over = true,
+                None => {
+                    if self.input.is_empty() {
+                        self.input = BytesMut::new();
+                    }
+                    return Ok(());
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The length of the answer's head if it grants the WebSocket; `None` until it has come whole.
+fn judge(input: &[u8], key: &str) -> Result<Option<usize>, WebSocketError> {
+    let mut fields = [httparse::EMPTY_HEADER; MAX_HEADERS];
+    let mut answer = httparse::Response::new(&mut fields);
+    let malformed = WebSocketError::Malformed;
+    let parsed = answer.parse(input).map_err(|_| malformed("the answer is not HTTP"))?;
+    let httparse::Status::Complete(length) = parsed else { return Ok(None) };
+    let status = answer.code.and_then(|code| StatusCode::from_u16(code).ok());
+    let status = status.ok_or(malformed("the answer is not HTTP"))?;
+    if status != StatusCode::SWITCHING_PROTOCOLS {
+        return Err(WebSocketError::Refused(status));
+    }
+    let field = |name: &str| {
+        let field = answer.headers.iter().find(|field| field.name.eq_ignore_ascii_case(name));
+        field.map(|field| field.value)
+    };
+    if field("sec-websocket-accept") != Some(accept_of(key.as_bytes()).as_bytes()) {
+        return Err(malformed("the answer is one to another request"));
+    }
+    if field("sec-websocket-protocol") != Some(MQTT.as_bytes()) {
+        return Err(malformed("the server does not agree on mqtt"));
+    }
+    Ok(Some(length))
+}
+
+impl<S: AsyncRead + AsyncWrite + Unpin> AsyncRead for WebSocket<S> {
+    fn poll_read(self: Pin<&mut Self>, context: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
+        let this = self.get_mut();
+        loop {
+            this.act_on_input()?;
+            if !this.output.is_empty() {
+                // A pong. Whatever can't be written now is written later; an error is one of the next write as well.
+                let _ = this.poll_drain(context)?;
+            }
+            if !this.unread.is_empty() {
+                let count = this.unread.len().min(buffer.remaining());
+                buffer.put_slice(&this.unread.split_to(count));
+                return Poll::Ready(Ok(()));
+            }
+            if this.is_over {
+                return Poll::Ready(Ok(()));
+            }
+            let mut space = [0; READ_BYTES];
+            let mut chunk = ReadBuf::new(&mut space);
+            ready!(Pin::new(&mut this.stream).poll_read(context, &mut chunk))?;
+            if chunk.filled().is_empty() {
+                return Poll::Ready(Ok(()));
+            }
+            this.input.extend_from_slice(chunk.filled());
+        }
+    }
+}
+
+impl<S: AsyncRead + AsyncWrite + Unpin> AsyncWrite for WebSocket<S> {
+    fn poll_write(self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        let this = self.get_mut();
+        if this.is_closed {
+            return Poll::Ready(Err(io::ErrorKind::BrokenPipe.into()));
+        }
+        if this.output.len() >= FRAME_BYTES {
+            ready!(this.poll_drain(context))?;
+        }
+        let taken = &bytes[..bytes.len().min(FRAME_BYTES)];
+        this.queue(Opcode::Binary, taken);
+        // What is taken is on its way even if nobody flushes; what does not fit now goes before the next.
+        let _ = this.poll_drain(context)?;
+        Poll::Ready(Ok(taken.len()))
+    }
+
+    fn poll_flush(self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        let this = self.get_mut();
+        ready!(this.poll_drain(context))?;
+        Pin::new(&mut this.stream).poll_flush(context)
+    }
+
+    fn poll_shutdown(self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        let this = self.get_mut();
+        if !this.is_closed {
+            this.queue(Opcode::Close, &[]);
+            this.is_closed = true;
+        }
+        ready!(this.poll_drain(context))?;
+        Pin::new(&mut this.stream).poll_shutdown(context)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tokio::io::{DuplexStream, duplex};
+
+    use super::*;
+
+    /// Both ends, through the handshake that a server and a client have.
+    async fn pair(room: usize) -> (WebSocket<DuplexStream>, WebSocket<DuplexStream>) {
+        let (client, mut server) = duplex(room);
+        let granting = async move {
+            let mut request = Vec::new();
+            while !request.ends_with(b"\r\n\r\n") {
+                request.push(server.read_u8().await.expect("a request"));
+            }
+            let mut fields = [httparse::EMPTY_HEADER; 16];
+            let mut parsed = httparse::Request::new(&mut fields);
+            parsed.parse(&request).expect("HTTP");
+            assert_eq!(parsed.path, Some("/mqtt"));
+            let headers = HeaderMap::from_iter(parsed.headers.iter().map(|field| {
+                (field.name.parse::<HeaderName>().expect("a name"), HeaderValue::from_bytes(field.value).expect("one"))
+            }));
+            let mut answer = "HTTP/1.1 101 Switching Protocols\r\n".to_owned();
+            for (name, value) in &grant(&headers).expect("granted") {
+                answer.push_str(&format!("{name}: {}\r\n", value.to_str().expect("text")));
+            }
+            server.write_all(format!("{answer}\r\n").as_bytes()).await.expect("written");
+            WebSocket::server(server)
+        };
+        let (client, server) = tokio::join!(WebSocket::connect(client, "server:8080", "/mqtt"), granting);
+        (client.expect("granted"), server)
+    }
+
+    #[tokio::test]
+    async fn bytes_go_both_ways_and_end() {
+        for room in [97, 1 << 20] {
+            let (mut client, mut server) = pair(room).await;
+            let sent: Vec<u8> = (0..300_000u32).map(|n| (n * 7 % 251) as u8).collect();
+            let mut came = vec![0; sent.len()];
+            let writing = async {
+                client.write_all(&sent).await.expect("written");
+                client.flush().await.expect("flushed");
+            };
+            let ((), read) = tokio::join!(writing, server.read_exact(&mut came));
+            read.expect("read");
+            assert!(came == sent);
+            let writing = async {
+                server.write_all(&sent).await.expect("written");
+                server.shutdown().await.expect("closed");
+            };
+            let mut came = Vec::new();
+            let ((), read) = tokio::join!(writing, client.read_to_end(&mut came));
+            read.expect("read");
+            assert!(came == sent);
+            assert!(server.write_all(b"more").await.is_err());
+        }
+    }
+
+    #[tokio::test]
+    async fn a_ping_is_answered_while_nothing_is_said() {
+        let (client, mut server) = pair(1024).await;
+        let WebSocket { mut stream, .. } = client;
+        let mut ping = BytesMut::new();
+        encode(Opcode::Ping, b"there?", Some([1, 2, 3, 4]), &mut ping);
+        stream.write_all(&ping).await.expect("written");
+        let mut nothing = [0; 8];
+        let mut answer = [0; 8];
+        tokio::select! {
+            read = server.read(&mut nothing) => panic!("{read:?}"),
+            read = stream.read_exact(&mut answer) => { read.expect("a pong"); }
+        }
+        assert_eq!(&answer, b"\x8a\x06there?");
+    }
+
+    #[tokio::test]
+    async fn whoever_does_not_grant_it_is_named() {
+        for (answer, expected) in [
+            (&b"HTTP/1.1 404 Not Found\r\n\r\n"[..], "404"),
+            (b"HTTP/1.1 101 Fine\r\nSec-WebSocket-Accept: x\r\n\r\n", "another request"),
+            (b"SSH-2.0-nobody\r\n\r\n", "not HTTP"),
+            (b"HTTP/1.1 101 Fi", "failed before"),
+        ] {
+            let (client, mut server) = duplex(4096);
+            let answering = async move {
+                server.write_all(answer).await.expect("written");
+                server.shutdown().await.expect("ended");
+                server
+            };
+            let (error, _server) = tokio::join!(WebSocket::connect(client, "server", "/mqtt"), answering);
+            let error = error.expect_err("none").to_string();
+            assert!(error.contains(expected), "{error}");
+        }
+        let (client, mut server) = duplex(4096);
+        let endless = async move { while server.write_all(b"HTTP/1.1 101 OK\r\nx: y").await.is_ok() {} };
+        let (error, ()) = tokio::join!(WebSocket::connect(client, "server", "/mqtt"), endless);
+        assert!(error.is_err());
+    }
+
+    #[test]
+    fn only_a_request_for_mqtt_is_granted() {
+        let good = [
+            ("connection", "keep-alive, Upgrade"),
+            ("upgrade", "WebSocket"),
+            ("sec-websocket-version", "13"),
+            ("sec-websocket-protocol", "mqttv3.1, mqtt"),
+            ("sec-websocket-key", "dGhlIHNhbXBsZSBub25jZQ=="),
+        ];
+        let headers = |leave_out: &str| {
+            let pairs = good.iter().filter(|(name, _)| *name != leave_out);
+            HeaderMap::from_iter(
+                pairs.map(|(name, value)| (HeaderName::from_static(name), HeaderValue::from_static(value))),
+            )
+        };
+        let granted = grant(&headers("")).expect("granted");
+        assert_eq!(granted[header::SEC_WEBSOCKET_ACCEPT], "s3pPLMBiTxaQ9kYGzzhZRbK+xOo=");
+        for (name, _) in good {
+            assert!(grant(&headers(name)).is_err(), "{name}");
+        }
+    }
+}

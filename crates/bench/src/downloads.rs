@@ -1,5 +1,6 @@
 //! Many connections that fetch one path over and over, as cheaply as the kernel allows: the bytes are counted and thrown
-//! away unread, so that what is measured is the server's work. It knows neither digests nor tokens.
+//! away unread, or decrypted where they are encrypted, so that what is measured is the server's work. It knows neither
+//! digests nor tokens.
 
 use std::io;
 use std::net::SocketAddr;
@@ -10,10 +11,15 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, bail, ensure};
 use nix::sys::socket::{MsgFlags, recv};
-use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _, Interest};
+use rustls::ClientConfig;
+use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _, Interest};
 use tokio::net::TcpStream;
 use tokio::sync::Barrier;
+use tokio_rustls::TlsConnector;
+use tokio_rustls::client::TlsStream;
 
+/// What is decrypted at once.
+const DECRYPTED_BYTES: usize = 64 * 1024;
 /// The most bytes thrown away by one call.
 const DISCARD_BYTES: usize = 1024 * 1024;
 /// A longer head is not one of the servers that are measured.
@@ -28,6 +34,8 @@ const CONNECTS_AT_ONCE: usize = 64;
 pub struct Target {
     /// Where.
     pub address: SocketAddr,
+    /// How TLS is spoken there, if it is.
+    pub tls: Option<Arc<ClientConfig>>,
     /// The path with its leading slash.
     pub path: String,
     /// The bearer token, if one is needed.
@@ -105,29 +113,61 @@ pub async fn download(targets: &[Target], until: Until, started: impl FnOnce()) 
     Ok(Got { fetches, bytes, wall: begun.elapsed() })
 }
 
-async fn connect_all(targets: &[Target]) -> anyhow::Result<Vec<TcpStream>> {
+/// A connection to a server.
+enum Stream {
+    Plain(TcpStream),
+    Encrypted(Box<TlsStream<TcpStream>>),
+}
+
+async fn connect(target: &Target) -> io::Result<Stream> {
+    let stream = TcpStream::connect(target.address).await?;
+    Ok(match &target.tls {
+        None => Stream::Plain(stream),
+        Some(tls) => {
+            let name = target.address.ip().into();
+            Stream::Encrypted(Box::new(TlsConnector::from(tls.clone()).connect(name, stream).await?))
+        }
+    })
+}
+
+async fn connect_all(targets: &[Target]) -> anyhow::Result<Vec<Stream>> {
     let mut streams = Vec::with_capacity(targets.len());
     for group in targets.chunks(CONNECTS_AT_ONCE) {
-        let opening = group.iter().map(|target| TcpStream::connect(target.address));
-        for opened in futures_util::future::join_all(opening).await {
+        let opening = futures_util::future::join_all(group.iter().map(connect));
+        for opened in tokio::time::timeout(PATIENCE, opening).await.context("the server accepts no connection")? {
             streams.push(opened.context("the server does not accept a connection")?);
         }
     }
     Ok(streams)
 }
 
-async fn fetch(stream: &mut TcpStream, request: &[u8], size: u64) -> anyhow::Result<()> {
+async fn fetch(stream: &mut Stream, request: &[u8], size: u64) -> anyhow::Result<()> {
     let whole = async {
-        stream.write_all(request).await.context("the request could not be sent")?;
-        let after_head = read_head(stream, size).await?;
-        let left = size.checked_sub(after_head).context("more came than the answer's length")?;
-        discard(stream, left).await.context("the answer broke off")
+        let thrown_away = match stream {
+            Stream::Plain(stream) => {
+                let left = ask(stream, request, size).await?;
+                discard(stream, left).await
+            }
+            Stream::Encrypted(stream) => {
+                let left = ask(stream, request, size).await?;
+                decrypt(stream, left).await
+            }
+        };
+        thrown_away.context("the answer broke off")
     };
     tokio::time::timeout(PATIENCE, whole).await.context("the server does not answer")?
 }
 
+/// Gives how many bytes of the body are still to come.
+async fn ask<S: AsyncRead + AsyncWrite + Unpin>(stream: &mut S, request: &[u8], size: u64) -> anyhow::Result<u64> {
+    stream.write_all(request).await.context("the request could not be sent")?;
+    stream.flush().await.context("the request could not be sent")?;
+    let after_head = read_head(stream, size).await?;
+    size.checked_sub(after_head).context("more came than the answer's length")
+}
+
 /// Reads an answer's head; gives how many bytes of the body came with it.
-async fn read_head(stream: &mut TcpStream, size: u64) -> anyhow::Result<u64> {
+async fn read_head<S: AsyncRead + Unpin>(stream: &mut S, size: u64) -> anyhow::Result<u64> {
     let mut bytes = Vec::with_capacity(1024);
     loop {
         if stream.read_buf(&mut bytes).await.context("the answer's head broke off")? == 0 {
@@ -172,4 +212,92 @@ async fn discard(stream: &TcpStream, mut left: u64) -> io::Result<()> {
         left -= taken as u64;
     }
     Ok(())
+}
+
+/// Reads `left` bytes and throws them away.
+async fn decrypt(stream: &mut TlsStream<TcpStream>, mut left: u64) -> io::Result<()> {
+    let mut unused = vec![0_u8; DECRYPTED_BYTES];
+    while left > 0 {
+        let most = usize::try_from(left).unwrap_or(DECRYPTED_BYTES).min(DECRYPTED_BYTES);
+        let taken = stream.read(&mut unused[..most]).await?;
+        if taken == 0 {
+            return Err(io::ErrorKind::UnexpectedEof.into());
+        }
+        left -= taken as u64;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use rustls::ServerConfig;
+    use rustls::crypto::ring;
+    use rustls::pki_types::pem::PemObject as _;
+    use rustls::pki_types::{CertificateDer, PrivateKeyDer};
+    use task_proto::CaPin;
+    use tokio::net::TcpListener;
+    use tokio_rustls::TlsAcceptor;
+
+    use super::*;
+    use crate::encryption::{Certificate, client_config};
+
+    const BODY: &[u8] = &[7; 100_000];
+
+    async fn answer<S: AsyncRead + AsyncWrite + Unpin>(mut stream: S, body: &[u8]) {
+        let head = format!("HTTP/1.1 200 OK\r\nContent-Length: {}\r\n\r\n", body.len());
+        let mut request = Vec::new();
+        while stream.read_buf(&mut request).await.is_ok_and(|bytes| bytes > 0) {
+            if request.ends_with(b"\r\n\r\n") {
+                request.clear();
+                stream.write_all(head.as_bytes()).await.expect("written");
+                stream.write_all(body).await.expect("written");
+                stream.flush().await.expect("flushed");
+            }
+        }
+    }
+
+    /// A server that answers everything with the body, and what fetches that from it.
+    async fn target(certificate: Option<&Certificate>, body: &'static [u8]) -> Target {
+        let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+        let address = listener.local_addr().expect("bound");
+        let acceptor = certificate.map(|certificate| {
+            let chain = CertificateDer::pem_slice_iter(certificate.chain.as_bytes()).collect::<Result<_, _>>();
+            let key = PrivateKeyDer::from_pem_slice(certificate.key.as_bytes()).expect("a key");
+            let builder = ServerConfig::builder_with_provider(Arc::new(ring::default_provider()));
+            let builder = builder.with_safe_default_protocol_versions().expect("suites").with_no_client_auth();
+            TlsAcceptor::from(Arc::new(builder.with_single_cert(chain.expect("a chain"), key).expect("a pair")))
+        });
+        tokio::spawn(async move {
+            while let Ok((stream, _)) = listener.accept().await {
+                match acceptor.clone() {
+                    None => drop(tokio::spawn(answer(stream, body))),
+                    Some(tls) => {
+                        drop(tokio::spawn(async move { answer(tls.accept(stream).await.expect("TLS"), body).await }))
+                    }
+                }
+            }
+        });
+        let tls = certificate.map(|certificate| Arc::new(client_config(Some(certificate.pin))));
+        Target { address, tls, path: "/".to_owned(), token: None, size: BODY.len() as u64 }
+    }
+
+    #[tokio::test]
+    async fn whole_answers_are_counted_and_others_fail_the_run() {
+        let certificate = Certificate::new().expect("made");
+        for certificate in [None, Some(&certificate)] {
+            let targets = vec![target(certificate, BODY).await; 3];
+            let got = download(&targets, Until::Fetches(5), || ()).await.expect("fetched");
+            assert_eq!((got.fetches, got.bytes), (15, 15 * BODY.len() as u64));
+            let short = target(certificate, &BODY[1..]).await;
+            assert!(download(&[short], Until::Fetches(1), || ()).await.is_err());
+        }
+    }
+
+    #[tokio::test]
+    async fn a_server_that_is_another_one_is_not_measured() {
+        let certificate = Certificate::new().expect("made");
+        let mut target = target(Some(&certificate), BODY).await;
+        target.tls = Some(Arc::new(client_config(Some(CaPin::of(b"another")))));
+        assert!(download(&[target], Until::Fetches(1), || ()).await.is_err());
+    }
 }

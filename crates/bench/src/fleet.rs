@@ -26,9 +26,9 @@ use crate::taskd::Taskd;
 /// Enrolments under way at a time.
 const REQUESTS_AT_ONCE: usize = 16;
 /// Robots in one process: each takes about [`FILES_PER_ROBOT`] open files, of which systems grant 20,000 and more.
-pub const ROBOTS_PER_PROCESS: usize = 3000;
-/// Open files a robot has at most: MQTT, HTTP connections, what it writes.
-pub const FILES_PER_ROBOT: usize = 5;
+pub const ROBOTS_PER_PROCESS: usize = 2500;
+/// Open files a robot has at most: MQTT, which takes three where it is encrypted, HTTP connections, what it writes.
+pub const FILES_PER_ROBOT: usize = 7;
 /// Words from the robots' processes that were not read yet.
 const QUEUED_WORDS: usize = 1024;
 /// Where robots have their data: memory, because every real robot has a disk of its own and here they would share one.
@@ -81,7 +81,8 @@ impl Fleet {
         let mut members = members.into_iter();
         for first in (0..robots).step_by(ROBOTS_PER_PROCESS) {
             let crew = Crew {
-                server: format!("http://{}", taskd.http),
+                server: taskd.url(),
+                pin: taskd.pin,
                 mqtt_host: taskd.mqtt.ip().to_string(),
                 key: key.clone(),
                 data: fleet.dir.path().to_owned(),

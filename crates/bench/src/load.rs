@@ -78,7 +78,7 @@ impl Load {
         let text = std::fs::read_to_string(&flags.token_file);
         let text = text.with_context(|| format!("--token-file {}", flags.token_file.display()))?;
         let token: Token = text.parse().with_context(|| format!("--token-file {}", flags.token_file.display()))?;
-        let server = Server::new(flags.server.clone(), &token)?;
+        let server = Server::new(flags.server.clone(), &token, None)?;
         let info = server.info().await.with_context(|| format!("--server {}", flags.server))?;
         let facts = Facts {
             taskbench: env!("CARGO_PKG_VERSION"),

@@ -6,9 +6,11 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Context as _, bail};
+use task_proto::CaPin;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::time::Instant;
 
+use crate::encryption::Certificate;
 use crate::process::{Process, Program, Usage};
 
 /// Where programs lie that are not on an ordinary user's `PATH`.
@@ -23,18 +25,29 @@ pub struct Peer {
     process: Process,
     /// Where it listens.
     pub address: SocketAddr,
+    /// Of its certificate's authority, if it encrypts.
+    pub pin: Option<CaPin>,
     /// What it says of its version.
     pub version: String,
 }
 
 impl Peer {
-    /// nginx, which serves the files in `root`. `None` if it is not installed.
-    pub async fn nginx(dir: &Path, root: &Path) -> anyhow::Result<Option<Self>> {
+    /// nginx, which serves the files in `root`, with OpenSSL if it gets a certificate. `None` if it is not installed.
+    pub async fn nginx(dir: &Path, root: &Path, certificate: Option<&Certificate>) -> anyhow::Result<Option<Self>> {
         let Some(path) = find("nginx") else { return Ok(None) };
         let address = free_address().await?;
         let workers = std::thread::available_parallelism().map_or(1, usize::from);
         let prefix = dir.join("nginx");
         std::fs::create_dir_all(&prefix).context("nginx's directory")?;
+        let tls = match certificate {
+            Some(certificate) => {
+                std::fs::write(prefix.join("nginx.pem"), &certificate.chain).context("nginx's certificate")?;
+                std::fs::write(prefix.join("nginx.key"), &certificate.key).context("nginx's key")?;
+                "ssl_certificate nginx.pem; ssl_certificate_key nginx.key; ssl_protocols TLSv1.3;"
+            }
+            None => "",
+        };
+        let ssl = if certificate.is_some() { "ssl" } else { "" };
         let configuration = format!(
             "daemon off; user root; worker_processes {workers}; pid nginx.pid; error_log error.log crit;
              worker_rlimit_nofile 20000;
@@ -44,7 +57,7 @@ impl Peer {
                  keepalive_requests 1000000000; open_file_cache max=1000 inactive=600s; open_file_cache_valid 600s;
                  default_type application/octet-stream;
                  client_body_temp_path .; proxy_temp_path .; fastcgi_temp_path .; uwsgi_temp_path .; scgi_temp_path .;
-                 server {{ listen {address} backlog=4096; root {}; }}
+                 server {{ listen {address} {ssl} backlog=4096; {tls} root {}; }}
              }}\n",
             root.display()
         );
@@ -52,7 +65,8 @@ impl Peer {
         std::fs::write(&file, configuration).context("nginx's configuration")?;
         let program = Program::named(path).args([Path::new("-p"), &prefix, Path::new("-c"), &file]);
         // It says its version on stderr; what matters is which Debian or upstream release it is.
-        Self::start(program, &dir.join("nginx.log"), address, "nginx").await.map(Some)
+        let nginx = Self::start(program, &dir.join("nginx.log"), address, "nginx").await?;
+        Ok(Some(Self { pin: certificate.map(|certificate| certificate.pin), ..nginx }))
     }
 
     /// mosquitto, which lets everybody in and bounds nobody. `None` if it is not installed.
@@ -78,7 +92,7 @@ impl Peer {
         loop {
             tick.tick().await;
             if TcpStream::connect(address).await.is_ok() {
-                return Ok(Self { process, address, version: version(name).await });
+                return Ok(Self { process, address, pin: None, version: version(name).await });
             }
             if let Some(how) = process.ended() {
                 bail!("{how}: {}", std::fs::read_to_string(log).unwrap_or_default().trim());

@@ -12,7 +12,8 @@ use std::net::IpAddr;
 use std::sync::Arc;
 
 use anyhow::{Context as _, anyhow};
-use task_agent::config::{Config, parse_server};
+use rustls::ClientConfig;
+use task_agent::config::{Config, MqttTransport, parse_server};
 use task_agent::credential::Credential;
 use task_agent::driver::{Driver, Speaker};
 use task_agent::effects::Robot;
@@ -31,6 +32,7 @@ use tokio_util::sync::CancellationToken;
 use self::body::Body;
 use self::words::{Crew, Member, Order, Word, own_address};
 use crate::clock::monotonic_ns;
+use crate::encryption::{another, client_config};
 
 /// Messages from a robot's link that its driver has not taken yet, as in the agent.
 const QUEUED_MESSAGES: usize = 16;
@@ -54,9 +56,10 @@ pub async fn run() -> anyhow::Result<()> {
     let crew: Crew = serde_json::from_str(&first).context("the first line is no crew")?;
     let (words, said) = mpsc::channel(QUEUED_WORDS);
     std::thread::spawn(move || write_words(said));
+    let tls = client_config(crew.pin);
     let mut robots = Vec::with_capacity(crew.members.len());
     for (number, member) in (crew.first..).zip(&crew.members) {
-        let robot = assemble(&crew, number, member).await.with_context(|| format!("robot {number}"))?;
+        let robot = assemble(&crew, another(&tls), number, member).await.with_context(|| format!("robot {number}"))?;
         robots.push((number, robot));
     }
     words.send(Word::Ready).await.map_err(|_| anyhow!("nobody listens"))?;
@@ -96,12 +99,12 @@ fn write_words(mut said: mpsc::Receiver<Word>) -> std::io::Result<()> {
 }
 
 /// Puts a robot together as `task-agent run` does, around another body.
-async fn assemble(crew: &Crew, number: usize, member: &Member) -> anyhow::Result<Assembled> {
+async fn assemble(crew: &Crew, tls: ClientConfig, number: usize, member: &Member) -> anyhow::Result<Assembled> {
     let data = DataDir::new(&crew.data.join(number.to_string()))?;
     std::fs::create_dir_all(data.root()).with_context(|| data.root().display().to_string())?;
     let config = Config::load(data.root(), std::iter::empty::<(OsString, OsString)>())?;
     let base = parse_server(&crew.server)?;
-    let client = http_client(crew.own_addresses.then(|| own_address(number).into()))?;
+    let client = http_client(tls.clone(), crew.own_addresses.then(|| own_address(number).into()))?;
     let enrolled = &member.enrolled;
     let credential = Credential::from(enrolled.token.clone());
     let shared = Shared::new(CancellationToken::new());
@@ -130,7 +133,8 @@ async fn assemble(crew: &Crew, number: usize, member: &Member) -> anyhow::Result
     let ledger = Ledger::new(0);
     let status = Status { online: true, start: ledger.start + 1, instance, connection: 0 };
     let driver = Driver::new(Arc::new(Body::new(robot, facts)), speaker, shared.clone(), ledger, None).await;
-    let server = server::Server::new(client, base, enrolled.robot_id.clone(), credential.clone());
+    let server = server::Server::new(client, base.clone(), enrolled.robot_id.clone(), credential.clone());
+    shared.endpoint.send_replace(Some(enrolled.mqtt.clone()));
     let access = MqttAccess {
         host: crew.mqtt_host.clone(),
         port: enrolled.mqtt.port,
@@ -139,21 +143,19 @@ async fn assemble(crew: &Crew, number: usize, member: &Member) -> anyhow::Result
         token: credential,
         status,
         message_bytes: mqtt::MESSAGE_BYTES,
-        ways: Ways::plain(),
+        ways: Ways::new(&base, Arc::new(tls), MqttTransport::Tcp),
     };
     Ok(Assembled { driver, shared, access, server })
 }
 
-/// As the agent's, without the system's certificates, which each of many clients would read; all is plain text here.
-fn http_client(from: Option<IpAddr>) -> anyhow::Result<reqwest::Client> {
-    // A second install is refused because the first is in place, which is all that matters.
-    let _ = rustls::crypto::ring::default_provider().install_default();
+/// As the agent's, from an address of its own.
+fn http_client(tls: ClientConfig, from: Option<IpAddr>) -> anyhow::Result<reqwest::Client> {
     let client = reqwest::Client::builder()
         .connect_timeout(std::time::Duration::from_secs(10))
         .timeout(std::time::Duration::from_secs(30))
         .pool_idle_timeout(server::KEPT_CONNECTION)
         .redirect(reqwest::redirect::Policy::none())
-        .tls_certs_only([])
+        .tls_backend_preconfigured(tls)
         .local_address(from);
     client.build().context("no HTTP client")
 }

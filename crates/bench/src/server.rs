@@ -12,8 +12,9 @@ use task_proto::desired::BlobRef;
 use task_proto::oci::{ImageManifest, MANIFEST_TYPE};
 use task_proto::selector::Selector;
 use task_proto::token::Token;
-use task_proto::{DeploymentId, Digest, RobotId, TaskName, Version};
+use task_proto::{CaPin, DeploymentId, Digest, RobotId, TaskName, Version};
 
+use crate::encryption::client_config;
 use crate::package::Package;
 
 /// How long one answer may take.
@@ -40,11 +41,10 @@ pub struct Server {
 }
 
 impl Server {
-    /// Nothing is sent yet.
-    pub fn new(base: Url, token: &Token) -> Result<Self, ServerError> {
-        // A second install is refused because the first is in place, which is all that matters.
-        let _ = rustls::crypto::ring::default_provider().install_default();
+    /// The one whose certificates are by the authority with this pin, if that is known. Nothing is sent yet.
+    pub fn new(base: Url, token: &Token, pin: Option<CaPin>) -> Result<Self, ServerError> {
         let http = reqwest::Client::builder().timeout(ANSWER_TIMEOUT).redirect(reqwest::redirect::Policy::none());
+        let http = http.tls_backend_preconfigured(client_config(pin));
         let http = http.build().map_err(|source| ServerError::NoAnswer("nothing", source))?;
         Ok(Self { http, base, token: token.reveal() })
     }

@@ -9,6 +9,7 @@ use anyhow::{Context as _, bail};
 use clap::Args;
 use reqwest::Url;
 use serde::Deserialize;
+use task_proto::CaPin;
 use task_proto::token::Token;
 use tempfile::TempDir;
 use tokio::time::Instant;
@@ -45,6 +46,14 @@ pub struct TaskdOrder {
     pub settings: Vec<(String, String)>,
 }
 
+impl TaskdOrder {
+    /// The same, encrypted.
+    pub fn encrypted(mut self) -> Self {
+        self.settings.push(("TASKD_TLS_PRIVATE_CA".to_owned(), "true".to_owned()));
+        self
+    }
+}
+
 impl Default for TaskdOrder {
     fn default() -> Self {
         Self { listen: Ipv4Addr::LOCALHOST.into(), configuration: String::new(), settings: Vec::new() }
@@ -60,6 +69,8 @@ pub struct Taskd {
     pub http: SocketAddr,
     /// Where MQTT listens.
     pub mqtt: SocketAddr,
+    /// Of its certificate authority, if it encrypts.
+    pub pin: Option<CaPin>,
     /// Its API, as the operator.
     pub server: Server,
     /// Its version.
@@ -70,6 +81,7 @@ pub struct Taskd {
 struct Addresses {
     http: SocketAddr,
     mqtt: SocketAddr,
+    ca_pin: Option<CaPin>,
 }
 
 impl Taskd {
@@ -106,13 +118,18 @@ impl Taskd {
         // Those of an earlier start.
         let _ = std::fs::remove_file(&addresses);
         let mut process = program.start(&log)?;
-        let addresses = wait_for_addresses(&mut process, &addresses, &log).await?;
+        let Addresses { http, mqtt, ca_pin: pin } = wait_for_addresses(&mut process, &addresses, &log).await?;
         let token = std::fs::read_to_string(data.join("operator.token")).context("the server's operator.token")?;
         let token: Token = token.trim().parse().context("the server's operator.token")?;
-        let base: Url = format!("http://{}", addresses.http).parse().context("the server's address")?;
-        let server = Server::new(base, &token)?;
+        let base: Url = url(http, pin).parse().context("the server's address")?;
+        let server = Server::new(base, &token, pin)?;
         let version = server.info().await.context("the server does not answer")?.version;
-        Ok(Self { process, program, dir, http: addresses.http, mqtt: addresses.mqtt, server, version })
+        Ok(Self { process, program, dir, http, mqtt, pin, server, version })
+    }
+
+    /// Its URL.
+    pub fn url(&self) -> String {
+        url(self.http, self.pin)
     }
 
     /// Where its blobs lie, each under the hexadecimal digits of its digest.
@@ -175,6 +192,11 @@ impl MemoryWatch {
         let _ = self.stop.send(());
         self.watching.await.unwrap_or_default()
     }
+}
+
+fn url(http: SocketAddr, pin: Option<CaPin>) -> String {
+    let scheme = if pin.is_some() { "https" } else { "http" };
+    format!("{scheme}://{http}")
 }
 
 async fn wait_for_addresses(process: &mut Process, path: &Path, log: &Path) -> anyhow::Result<Addresses> {

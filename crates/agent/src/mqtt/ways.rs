@@ -14,9 +14,9 @@ use crate::config::MqttTransport;
 pub struct Ways {
     transport: MqttTransport,
     /// How TLS is spoken, to whichever port.
-    tls: Option<Arc<ClientConfig>>,
+    tls: Arc<ClientConfig>,
     /// The WebSocket at the server.
-    websocket: Option<Route>,
+    websocket: Route,
     /// Whether the broker's own port is passed over.
     is_turned: bool,
 }
@@ -24,18 +24,13 @@ pub struct Ways {
 impl Ways {
     /// To the server at `base`.
     pub fn new(base: &Url, tls: Arc<ClientConfig>, transport: MqttTransport) -> Self {
-        let websocket = base.host_str().zip(base.port_or_known_default()).map(|(host, port)| Route {
-            host: host.to_owned(),
-            port,
+        let websocket = Route {
+            host: base.host_str().map(str::to_owned).unwrap_or_default(),
+            port: base.port_or_known_default().unwrap_or_default(),
             tls: (base.scheme() == "https").then(|| tls.clone()),
             websocket: Some(format!("{}/mqtt", base.path().trim_end_matches('/'))),
-        });
-        Self { transport, tls: Some(tls), websocket, is_turned: false }
-    }
-
-    /// Nothing but an unencrypted port.
-    pub fn plain() -> Self {
-        Self { transport: MqttTransport::Tcp, tls: None, websocket: None, is_turned: false }
+        };
+        Self { transport, tls, websocket, is_turned: false }
     }
 
     /// The next way; `None`: rumqttc's own, over a port that does not encrypt. A broker that is not the server's own has
@@ -47,10 +42,10 @@ impl Ways {
             MqttTransport::Websocket => true,
         };
         if by_websocket && !is_external {
-            return self.websocket.clone();
+            return Some(self.websocket.clone());
         }
-        let tls = self.tls.clone().filter(|_| is_encrypted)?;
-        Some(Route { host: host.to_owned(), port, tls: Some(tls), websocket: None })
+        let tls = Some(self.tls.clone());
+        is_encrypted.then(|| Route { host: host.to_owned(), port, tls, websocket: None })
     }
 
     /// No session came about.

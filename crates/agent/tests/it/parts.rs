@@ -4,6 +4,8 @@ use std::fs;
 use std::sync::Arc;
 use std::time::Duration;
 
+use task_agent::clock;
+use task_agent::config::MqttTransport;
 use task_agent::credential::Credential;
 use task_agent::fetch::{Asks, FetchError, FetchSettings, PartPatience};
 use task_agent::link::{Shared, Talk};
@@ -12,6 +14,7 @@ use task_proto::part::{Cut, Part, PartRange};
 use task_proto::report::{Progress, Status};
 use task_proto::topic::{Topic, TopicPrefix};
 use task_proto::{InstanceId, RobotId};
+use task_transport::Trust;
 use tokio::sync::{mpsc, watch};
 use tokio_util::sync::CancellationToken;
 
@@ -50,6 +53,7 @@ impl Rig {
 
     async fn of(site: Site) -> Self {
         let (peer, shared) = (Peer::start().await, Shared::new(CancellationToken::new()));
+        let tls = Trust::System.client_config(clock::for_certificates());
         let access = MqttAccess {
             host: "127.0.0.1".to_owned(),
             port: peer.port,
@@ -58,7 +62,7 @@ impl Rig {
             token: Credential::from("token".to_owned()),
             status: Status { online: true, start: 1, instance: InstanceId::random(), connection: 0 },
             message_bytes: mqtt::MESSAGE_BYTES,
-            ways: Ways::plain(),
+            ways: Ways::new(&"http://127.0.0.1".parse().unwrap(), Arc::new(tls), MqttTransport::Tcp),
         };
         let (heard, _) = mpsc::channel(1);
         let (requests, _) = mpsc::channel(1);

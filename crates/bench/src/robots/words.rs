@@ -7,13 +7,15 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 use task_proto::api::EnrollResponse;
 use task_proto::envelope::PublicKey;
-use task_proto::{DeploymentId, MacAddress};
+use task_proto::{CaPin, DeploymentId, MacAddress};
 
 /// The first line to the process: which robots there are. Every further line is an [`Order`].
 #[derive(Serialize, Deserialize)]
 pub struct Crew {
     /// The server's URL.
     pub server: String,
+    /// Of its certificate authority, if it encrypts.
+    pub pin: Option<CaPin>,
     /// The MQTT listener's host; the port is in each robot's enrolment.
     pub mqtt_host: String,
     /// The key that its states are signed with.

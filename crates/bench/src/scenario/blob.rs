@@ -1,15 +1,19 @@
 //! `taskbench blob`: how fast blobs leave the server and what that costs it, beside nginx with the same files in the same
 //! run. Every connection is another robot's, with its own token and the right to just these blobs.
 
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, ensure};
 use clap::Args;
+use rustls::ClientConfig;
+use task_proto::CaPin;
 use task_proto::api::{CreateDeployment, DeliveryChoice, EnrollResponse};
 use task_proto::desired::BlobRef;
 
 use super::cold;
 use crate::downloads::{Got, Target, Until, download};
+use crate::encryption::{ALL_IS_ENCRYPTED, Certificate, client_config};
 use crate::enrolment::enrol;
 use crate::machine::allow_files;
 use crate::package::Package;
@@ -47,6 +51,9 @@ pub struct BlobFlags {
     /// How many different large blobs are pulled from disk while the API is probed; 0: none
     #[arg(long, value_name = "N", default_value_t = 24, value_parser = clap::value_parser!(u16).range(..=200))]
     cold: u16,
+    /// Whether both encrypt: taskd with rustls, nginx with OpenSSL, both with ECDSA keys
+    #[arg(long)]
+    tls: bool,
     #[command(flatten)]
     taskd: TaskdFlags,
     #[command(flatten)]
@@ -67,9 +74,12 @@ pub async fn run(flags: BlobFlags) -> anyhow::Result<Run> {
     let mut run = Run::begin("blob", seed).await;
     let most = flags.clients.iter().copied().chain([flags.small_clients, flags.cold]).max().unwrap_or(0);
     allow_files(u64::from(most) + 200)?;
-    let taskd = Taskd::start(&flags.taskd, &TaskdOrder::default()).await?;
+    let order = if flags.tls { TaskdOrder::default().encrypted() } else { TaskdOrder::default() };
+    let taskd = Taskd::start(&flags.taskd, &order).await?;
     run.versions.insert("taskd".to_owned(), taskd.version.clone());
-    let nginx = Peer::nginx(taskd.dir(), &taskd.blobs()).await?;
+    run.notes.extend(flags.tls.then(|| ALL_IS_ENCRYPTED.to_owned()));
+    let certificate = flags.tls.then(Certificate::new).transpose()?;
+    let nginx = Peer::nginx(taskd.dir(), &taskd.blobs(), certificate.as_ref()).await?;
     match &nginx {
         Some(nginx) => drop(run.versions.insert("nginx".to_owned(), nginx.version.clone())),
         None => {
@@ -129,8 +139,10 @@ pub(crate) async fn order_blob(
 
 /// Where each of the robots fetches the blob from taskd.
 pub(crate) fn at_taskd(taskd: &Taskd, blob: BlobRef, robots: &[EnrollResponse]) -> Vec<Target> {
+    let tls = tls(taskd.pin);
     let target = |robot: &EnrollResponse| Target {
         address: taskd.http,
+        tls: tls.clone(),
         path: format!("/v2/bench/blobs/{}", blob.digest),
         token: Some(robot.token.clone()),
         size: blob.size,
@@ -141,7 +153,11 @@ pub(crate) fn at_taskd(taskd: &Taskd, blob: BlobRef, robots: &[EnrollResponse]) 
 /// Where as many fetch it from nginx.
 pub(crate) fn at_nginx(nginx: &Peer, blob: BlobRef, count: usize) -> Vec<Target> {
     let path = format!("/{}", blob.digest.hex());
-    vec![Target { address: nginx.address, path, token: None, size: blob.size }; count]
+    vec![Target { address: nginx.address, tls: tls(nginx.pin), path, token: None, size: blob.size }; count]
+}
+
+fn tls(pin: Option<CaPin>) -> Option<Arc<ClientConfig>> {
+    pin.map(|pin| Arc::new(client_config(Some(pin))))
 }
 
 async fn measure_cases(

@@ -7,6 +7,7 @@ use clap::{Args, ValueEnum};
 use task_proto::api::DeliveryChoice;
 
 use super::run_once::{OneOrder, run_once};
+use crate::encryption::ALL_IS_ENCRYPTED;
 use crate::fleet::{FILES_PER_ROBOT, Fleet, ROBOTS_PER_PROCESS};
 use crate::machine::allow_files;
 use crate::progress::{RunProgress, say};
@@ -36,6 +37,9 @@ pub struct FleetFlags {
     /// How long all robots may take to connect, and to verify the package
     #[arg(long, value_name = "S", default_value_t = 300, value_parser = clap::value_parser!(u64).range(1..=3600))]
     limit_s: u64,
+    /// Whether robots and server encrypt, each robot with a handshake of its own
+    #[arg(long)]
+    tls: bool,
     #[command(flatten)]
     taskd: TaskdFlags,
     #[command(flatten)]
@@ -80,6 +84,7 @@ pub async fn run(flags: FleetFlags) -> anyhow::Result<Run> {
          moment; connected means that the robot keeps to the server's state and the server has stored its report of it."
             .to_owned(),
     ];
+    run.notes.extend(flags.tls.then(|| ALL_IS_ENCRYPTED.to_owned()));
     let mut progress = RunProgress::new(flags.robots.len());
     for (number, robots) in flags.robots.iter().enumerate() {
         progress.says(&format!("{robots} robots"));
@@ -97,7 +102,7 @@ pub async fn run(flags: FleetFlags) -> anyhow::Result<Run> {
 }
 
 async fn measure(flags: &FleetFlags, robots: usize, seed: u64) -> anyhow::Result<(Point, String)> {
-    let mut order = TaskdOrder::default();
+    let mut order = if flags.tls { TaskdOrder::default().encrypted() } else { TaskdOrder::default() };
     // All robots' sessions come from one address, which on the road they do not.
     order.settings.push(("TASKD_MAX_SILENT_PER_ADDRESS".to_owned(), MOST_ROBOTS.to_string()));
     let taskd = Taskd::start(&flags.taskd, &order).await?;

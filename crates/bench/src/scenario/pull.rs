@@ -62,7 +62,7 @@ pub async fn run(flags: PullFlags) -> anyhow::Result<Run> {
     let (bytes, robots) = (flags.megabytes * 1_000_000, usize::from(flags.robots));
     let taskd = Taskd::start(&flags.taskd, &TaskdOrder::default()).await?;
     run.versions.insert("taskd".to_owned(), taskd.version.clone());
-    let nginx = Peer::nginx(taskd.dir(), &taskd.blobs()).await?.context("nginx is needed, and not installed")?;
+    let nginx = Peer::nginx(taskd.dir(), &taskd.blobs(), None).await?.context("nginx is needed, and not installed")?;
     run.versions.insert("nginx".to_owned(), nginx.version.clone());
     run.notes = vec![
         "Robots are the agent's own driver, link, fetch and verification; they and the scripts write to memory, the \

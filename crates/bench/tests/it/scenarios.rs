@@ -76,11 +76,14 @@ async fn every_robot_gets_the_very_bytes_by_every_mechanism_of_the_paper() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_fleet_connects_and_each_robot_of_it_gets_the_package() {
-    let dir = tempfile::tempdir().expect("temp dir");
-    let output = taskbench(dir.path(), &["fleet", "--robots", "3,20", "--payload", "5000"]).await;
-    let points = arrived(dir.path(), "fleet", &output);
-    let counts: Vec<_> = points.iter().map(|point| point["quantities"]["connected"]["count"].as_u64()).collect();
-    assert_eq!(counts, [Some(3), Some(20)]);
+    for encrypted in [None, Some("--tls")] {
+        let dir = tempfile::tempdir().expect("temp dir");
+        let arguments = ["fleet", "--robots", "3,20", "--payload", "5000"].into_iter().chain(encrypted);
+        let output = taskbench(dir.path(), &arguments.collect::<Vec<_>>()).await;
+        let points = arrived(dir.path(), "fleet", &output);
+        let counts: Vec<_> = points.iter().map(|point| point["quantities"]["connected"]["count"].as_u64()).collect();
+        assert_eq!(counts, [Some(3), Some(20)]);
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -1,0 +1,50 @@
+//! TLS of a run: how its clients connect, and a certificate for the program that taskd is measured beside.
+
+use anyhow::Context as _;
+use rcgen::{BasicConstraints, CertificateParams, IsCa, Issuer, KeyPair};
+use rustls::ClientConfig;
+use rustls::client::Resumption;
+use task_agent::clock;
+use task_proto::CaPin;
+use task_transport::{Trust, pin_of};
+
+/// Servers that a client knows again.
+const SESSIONS: usize = 2;
+/// What a result says of itself.
+pub const ALL_IS_ENCRYPTED: &str = "Every connection is TLS 1.3, each client checks the server's certificate.";
+
+/// How a client connects to a server whose authority has this pin; without one, the system's roots have to vouch for it.
+pub fn client_config(pin: Option<CaPin>) -> ClientConfig {
+    Trust::by(pin).client_config(clock::for_certificates())
+}
+
+/// The same for another client: what the server said to the one is nothing to the other.
+pub fn another(tls: &ClientConfig) -> ClientConfig {
+    let mut own = tls.clone();
+    own.resumption = Resumption::in_memory_sessions(SESSIONS);
+    own
+}
+
+/// A certificate for 127.0.0.1 by an authority that is forgotten at once.
+pub struct Certificate {
+    /// The certificate and the authority's, PEM.
+    pub chain: String,
+    /// Its key, PEM.
+    pub key: String,
+    /// The authority's pin.
+    pub pin: CaPin,
+}
+
+impl Certificate {
+    /// A new one.
+    pub fn new() -> anyhow::Result<Self> {
+        let mut params = CertificateParams::new(Vec::new())?;
+        params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
+        let (authority_key, key) = (KeyPair::generate()?, KeyPair::generate()?);
+        let authority = params.self_signed(&authority_key)?;
+        let pin = pin_of(authority.der()).context("the authority's certificate is none")?;
+        let issuer = Issuer::new(params, authority_key);
+        let own = CertificateParams::new(vec!["127.0.0.1".to_owned()])?.signed_by(&key, &issuer)?;
+        Ok(Self { chain: own.pem() + &authority.pem(), key: key.serialize_pem(), pin })
+    }
+}

@@ -341,13 +341,7 @@ fn allow_open_files() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_thousand_half_open_connections_keep_nobody_out() {
     allow_open_files();
-    let configure = |config: &mut Config| {
-        private(config);
-        // Half of them have to give way.
-        config.max_silent_per_address = 250;
-        (config.max_http_connections, config.max_mqtt_connections) = (450, 450);
-    };
-    let server = TestServer::start_in(TempDir::new().expect("a directory"), configure).await;
+    let server = encrypted().await;
     let robot = server.enroll("atlas").await;
     let tls = pinned(pin_of(&server));
     // The first bytes of a handshake record, whose rest does not come.

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use task_proto::api::MqttEndpoint;
 use task_proto::envelope::PublicKey;
 use task_proto::{CaPin, MacAddress, RobotId};
-use task_transport::Trust;
+use task_transport::ClientKey;
 
 use crate::{durable, permanent_address};
 
@@ -38,6 +38,9 @@ pub struct Identity {
     /// The certificate authority that made the server's certificate; absent: the system's roots vouch for it, if it has one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ca_pin: Option<CaPin>,
+    /// The key that it shows where clients are asked for a certificate.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub client_key: Option<ClientKey>,
     /// How to reach MQTT.
     pub mqtt: MqttEndpoint,
     /// The MAC it was registered by.
@@ -91,11 +94,6 @@ impl Identity {
             Err(error) if error.kind() == io::ErrorKind::NotFound => Err(IdentityError::Missing(path.to_owned())),
             Err(source) => Err(IdentityError::Io { path: path.to_owned(), source }),
         }
-    }
-
-    /// Whom the robot takes for its server.
-    pub fn trust(&self) -> Trust {
-        Trust::by(self.ca_pin)
     }
 
     /// Writes it, readable by its owner only.
@@ -185,6 +183,7 @@ mod tests {
             server: "http://server".to_owned(),
             server_key: task_proto::envelope::SigningKey::random().public_key(),
             ca_pin: None,
+            client_key: None,
             mqtt: MqttEndpoint { host: None, port: 1883, prefix: Default::default(), tls: false, external: None },
             mac: "02:00:00:00:00:01".parse().expect("valid"),
         };

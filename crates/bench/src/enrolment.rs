@@ -25,7 +25,7 @@ pub async fn enrol(server: &Server, count: usize) -> anyhow::Result<Vec<EnrollRe
             // Locally administered.
             let mac = MacAddress::from_octets([0x02, 0, a, b, c, d]).context("no MAC")?;
             let name = Some(format!("bench-{number:05}").parse()?);
-            let request = EnrollRequest { mac, name, labels: Labels::new() };
+            let request = EnrollRequest { mac, name, labels: Labels::new(), client_key: None };
             anyhow::Ok(server.enroll(token, &request).await?)
         }
     });

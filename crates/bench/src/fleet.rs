@@ -257,7 +257,8 @@ async fn enrol(
             let [.., a, b, c] = u64::try_from(number)?.to_be_bytes();
             let mac = MacAddress::from_octets([0x02, 0, 0, a, b, c]).context("no MAC")?;
             let name = Some(name(number).parse()?);
-            let enrolled = server.enroll(token, &EnrollRequest { mac, name, labels: Labels::new() }).await?;
+            let enrolled =
+                server.enroll(token, &EnrollRequest { mac, name, labels: Labels::new(), client_key: None }).await?;
             Ok((number, Member { mac, enrolled }, begun.elapsed()))
         }
     });

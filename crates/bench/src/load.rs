@@ -170,7 +170,8 @@ impl Load {
                 let [high, low] = number.to_be_bytes();
                 let mac = MacAddress::from_octets([0x02, a, b, 0, high, low]).context("no MAC")?;
                 let name = Some(format!("{NAME}-{run}-{number:05}").parse()?);
-                let enrolled = server.enroll(token, &EnrollRequest { mac, name, labels: Labels::new() }).await?;
+                let enrolled =
+                    server.enroll(token, &EnrollRequest { mac, name, labels: Labels::new(), client_key: None }).await?;
                 let host = enrolled.mqtt.host.clone().or_else(|| flags.server.host_str().map(str::to_owned));
                 let default = (host.context("--server names no host")?, enrolled.mqtt.port);
                 let (host, port) = flags.mqtt.clone().unwrap_or(default);

@@ -133,6 +133,9 @@ pub struct EnrollRequest {
     /// Its labels.
     #[serde(default)]
     pub labels: Labels,
+    /// The key that it can show by a client certificate.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub client_key: Option<PublicKey>,
 }
 
 /// Answer to an enrolment. The token is shown this once.

@@ -201,6 +201,11 @@ pub enum ConfigError {
         /// The one there is not.
         missing: &'static str,
     },
+    /// Keys can't be shown where nobody shakes hands.
+    #[error(
+        "tls.client_certificates: robots can't show their keys to a server that does not encrypt; set tls.private_ca"
+    )]
+    KeysInPlainText,
     /// An unencrypted listener would be reachable from other machines.
     #[error(
         "{key} = {address}: unencrypted connections from other machines are refused; leave out --tls-private-ca=false, \
@@ -273,19 +278,28 @@ impl Config {
         if config.data.as_os_str().is_empty() {
             config.data = default_data_directory(variable).ok_or(ConfigError::NoDataDirectory)?;
         }
-        if let Some(broker) = config.broker.as_ref().filter(|broker| !broker.is_loopback() && !config.allow_plaintext) {
+        config.check()?;
+        Ok(config)
+    }
+
+    /// Refuses settings that do not go together.
+    fn check(&self) -> Result<(), ConfigError> {
+        if let Some(broker) = self.broker.as_ref().filter(|broker| !broker.is_loopback() && !self.allow_plaintext) {
             return Err(ConfigError::PlaintextBroker { address: broker.address() });
         }
-        match (&config.tls.certificate, &config.tls.key) {
+        match (&self.tls.certificate, &self.tls.key) {
             (Some(_), None) => Err(ConfigError::HalfACertificate { given: "tls.certificate", missing: "tls.key" }),
             (None, Some(_)) => Err(ConfigError::HalfACertificate { given: "tls.key", missing: "tls.certificate" }),
             _ => Ok(()),
         }?;
-        match config.reached_from_elsewhere() {
-            Some((key, address)) if !config.encrypts() && !config.allow_plaintext => {
+        if self.tls.client_certificates && !self.encrypts() {
+            return Err(ConfigError::KeysInPlainText);
+        }
+        match self.reached_from_elsewhere() {
+            Some((key, address)) if !self.encrypts() && !self.allow_plaintext => {
                 Err(ConfigError::Plaintext { key, address })
             }
-            _ => Ok(config),
+            _ => Ok(()),
         }
     }
 
@@ -538,6 +552,7 @@ mod tests {
             ("[tls]\ncertificate = \"c.pem\"", "tls.certificate: tls.key is missing"),
             ("[tls]\nkey = \"k.pem\"", "tls.key: tls.certificate is missing"),
             ("[tls]\nnames = \"a b\"", "tls.names in taskd.toml: \"a b\" is neither a host name nor an address"),
+            ("[tls]\nclient_certificates = true", "tls.client_certificates: robots can't show"),
             ("[tls]\ncert = \"c.pem\"", "tls.cert in taskd.toml: there is no such setting"),
         ] {
             let message = load(&[], &[], Some(file)).expect_err(expected);

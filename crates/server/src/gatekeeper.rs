@@ -23,12 +23,12 @@ impl StoreGatekeeper {
     async fn decide(&self, login: Login) -> Result<Principal, Refusal> {
         let password = login.password.as_deref().ok_or(Refusal::BadCredentials)?;
         let token: Token = password.parse().map_err(|_| Refusal::BadCredentials)?;
-        let admitted = self.store.admit(&token, self.clock.now_ms()).await.map_err(|error| {
+        let admitted = self.store.admit(&token, &login.proof, self.clock.now_ms()).await.map_err(|error| {
             tracing::warn!(error = &error as &dyn std::error::Error, "a login over MQTT could not be checked");
             Refusal::Unavailable
         })?;
         match admitted.map(|admitted| admitted.holder) {
-            Some(TokenHolder::Robot { robot, token_number }) => {
+            Some(TokenHolder::Robot { robot, token_number, .. }) => {
                 let is_itself = login.client_id == robot.as_str() && login.user_name.as_deref() == Some(robot.as_str());
                 if is_itself { Ok(Principal::Robot { robot, token_number }) } else { Err(Refusal::NotAuthorised) }
             }

@@ -3,6 +3,7 @@
 //! It accepts no connection and keeps no time for a handshake: the listeners do.
 
 mod authority;
+mod client;
 mod files;
 
 use std::fmt;
@@ -24,6 +25,8 @@ use tokio_rustls::server::TlsStream;
 use tokio_util::sync::CancellationToken;
 
 use self::authority::{Audience, Authority};
+use self::client::AnyKey;
+pub use self::client::ClientProof;
 use self::files::Files;
 use crate::clock::Clock;
 use crate::config::TlsSettings;
@@ -121,7 +124,11 @@ impl Tls {
         let shown = Arc::new(Shown(RwLock::new(certificates)));
         let builder = ServerConfig::builder_with_provider(Arc::new(ring::default_provider()));
         let builder = builder.with_safe_default_protocol_versions().map_err(TlsError::Unusable)?;
-        let mut config = builder.with_no_client_auth().with_cert_resolver(shown.clone());
+        let builder = match settings.client_certificates {
+            true => builder.with_client_cert_verifier(AnyKey::new()),
+            false => builder.with_no_client_auth(),
+        };
+        let mut config = builder.with_cert_resolver(shown.clone());
         // Robots that come back all at once do so for half of the work, and the server remembers none of them.
         config.ticketer = ring::Ticketer::new().map_err(TlsError::Unusable)?;
         config.send_tls13_tickets = 1;
@@ -129,9 +136,17 @@ impl Tls {
         Ok(Self(Arc::new(Parts { acceptor, shown, authority, own: own.map(Mutex::new), settings, clock })))
     }
 
-    /// Shakes hands. Waits for the client for as long as it takes.
-    pub async fn accept<S: AsyncRead + AsyncWrite + Unpin>(&self, stream: S) -> io::Result<TlsStream<S>> {
-        self.0.acceptor.accept(stream).await
+    /// Shakes hands; gives what the client has proven on that occasion. Waits for it for as long as it takes.
+    pub async fn accept<S: AsyncRead + AsyncWrite + Unpin>(
+        &self,
+        stream: S,
+    ) -> io::Result<(TlsStream<S>, ClientProof)> {
+        let stream = self.0.acceptor.accept(stream).await?;
+        let proof = match self.0.settings.client_certificates {
+            true => ClientProof::of(stream.get_ref().1.peer_certificates()),
+            false => ClientProof::NotAsked,
+        };
+        Ok((stream, proof))
     }
 
     /// The private authority's pin.

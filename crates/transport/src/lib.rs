@@ -1,9 +1,11 @@
-//! What both ends of a connection to the server share: whom a client takes for the server, and MQTT over WebSocket. It knows
-//! no message, keeps no file and reads no clock: the time is handed in.
+//! What both ends of a connection to the server share: whom a client takes for the server, how it shows who it is itself,
+//! and MQTT over WebSocket. It knows no message, keeps no file and reads no clock: the time is handed in.
 
+mod client_key;
 mod dial;
 mod trust;
 pub mod websocket;
 
+pub use client_key::{CertificateError, ClientKey, InvalidKey, key_in};
 pub use dial::{DialError, Duplex, Route, dial};
 pub use trust::{BUILT_MS, Clock, Trust, WrongServer, pin_of};

@@ -9,9 +9,9 @@ use task_proto::envelope::PublicKey;
 use task_proto::id::{LabelKey, LabelValue};
 use task_proto::token::{Token, TokenKind};
 use task_proto::{MacAddress, RobotName};
-use task_transport::Trust;
+use task_transport::ClientKey;
 
-use super::{DataDir, refuse_plain_text, say};
+use super::{DataDir, refuse_plain_text, say, tls};
 use crate::admission;
 use crate::clock;
 use crate::config::{Config, Settings, parse_server};
@@ -88,10 +88,15 @@ async fn enroll(arguments: Arguments) -> anyhow::Result<ExitCode> {
 
     let mut labels = config.labels.clone().unwrap_or_default();
     labels.extend(arguments.labels.iter().cloned());
-    let request = EnrollRequest { mac, name: arguments.name.clone().or(config.name.clone()), labels: labels.clone() };
     refuse_plain_text(token.ca_pin(), &server, "--server")?;
-    let trust = Trust::by(token.ca_pin());
-    let client = server::client(trust.client_config(clock::for_certificates()))?;
+    let client_key = ClientKey::random();
+    let request = EnrollRequest {
+        mac,
+        name: arguments.name.clone().or(config.name.clone()),
+        labels: labels.clone(),
+        client_key: Some(client_key.public_key()),
+    };
+    let client = server::client(tls(token.ca_pin(), Some(&client_key))?)?;
     let response = match register(&client, &server, &arguments.token, &request).await {
         Ok(response) => response,
         Err(error) => return Err(anyhow::Error::new(error).context(format!("{server} did not register the robot"))),
@@ -105,6 +110,7 @@ async fn enroll(arguments: Arguments) -> anyhow::Result<ExitCode> {
         server: server.to_string(),
         server_key: key.clone(),
         ca_pin: token.ca_pin(),
+        client_key: Some(client_key),
         mqtt: response.mqtt.clone(),
         mac,
     };

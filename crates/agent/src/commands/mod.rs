@@ -4,7 +4,11 @@
 use std::path::PathBuf;
 
 use anyhow::ensure;
+use rustls::ClientConfig;
 use task_proto::CaPin;
+use task_transport::{ClientKey, Trust};
+
+use crate::clock;
 
 pub mod configure;
 pub mod enroll;
@@ -33,6 +37,15 @@ fn refuse_plain_text(pin: Option<CaPin>, server: &reqwest::Url, setting: &str) -
         server.scheme()
     );
     Ok(())
+}
+
+/// How the agent speaks TLS: whom it takes for the server, and the key that it shows if it is asked for one.
+fn tls(pin: Option<CaPin>, key: Option<&ClientKey>) -> anyhow::Result<ClientConfig> {
+    let mut config = Trust::by(pin).client_config(clock::for_certificates());
+    if let Some(key) = key {
+        key.show_in(&mut config)?;
+    }
+    Ok(config)
 }
 
 /// Prints an error and its whole chain of causes on stderr.

@@ -13,7 +13,7 @@ use task_proto::report::Status;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
-use super::{DataDir, refuse_plain_text};
+use super::{DataDir, refuse_plain_text, tls};
 use crate::answers::Answers;
 use crate::config::{Config, parse_server};
 use crate::credential::Credential;
@@ -70,7 +70,7 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
         None => parse_server(&identity.server)?,
     };
     refuse_plain_text(identity.ca_pin, &base, "server")?;
-    let tls = identity.trust().client_config(clock::for_certificates());
+    let tls = tls(identity.ca_pin, identity.client_key.as_ref())?;
     let client = server::client(tls.clone()).context("cannot make an HTTP client")?;
     let credential = Credential::from(identity.token.clone());
     let shutdown = CancellationToken::new();

@@ -122,6 +122,7 @@ async fn a_new_token_is_on_the_disk_before_it_is_used_and_the_old_one_until_it_w
         server: url.to_string(),
         server_key: SigningKey::random().public_key(),
         ca_pin: None,
+        client_key: None,
         mqtt: task_proto::api::MqttEndpoint {
             host: None,
             port: 1,

@@ -13,6 +13,7 @@ use task_proto::report::Phase;
 use crate::harness::{Process, Robot, Server, eventually, program, write_package};
 
 const ENCRYPTED: (&str, &str) = ("TASKD_TLS_PRIVATE_CA", "true");
+const KEYED: (&str, &str) = ("TASKD_TLS_CLIENT_CERTIFICATES", "true");
 
 /// Pushes a package to `robot-1` and waits until it runs.
 async fn run_something(server: &Server, dir: &Path, version: &str) {
@@ -31,7 +32,7 @@ async fn connected(server: &Server) {
 #[tokio::test(flavor = "multi_thread")]
 async fn one_token_is_all_a_robot_needs_and_another_server_gets_nothing() {
     let dir = tempfile::tempdir().expect("temp dir");
-    let mut server = Server::start_with(&dir.path().join("server"), &[ENCRYPTED]).await;
+    let mut server = Server::start_with(&dir.path().join("server"), &[ENCRYPTED, KEYED]).await;
     let _robot = Robot::start(&server, dir.path(), "robot-1", 1).await;
     connected(&server).await;
     run_something(&server, dir.path(), "1.0.0").await;
@@ -133,7 +134,7 @@ async fn a_setting_takes_mqtt_over_the_servers_own_http_port() {
     let dir = tempfile::tempdir().expect("temp dir");
     let closed = free_address().port().to_string();
     let server =
-        Server::start_with(&dir.path().join("server"), &[ENCRYPTED, ("TASKD_PUBLIC_MQTT_PORT", &closed)]).await;
+        Server::start_with(&dir.path().join("server"), &[ENCRYPTED, KEYED, ("TASKD_PUBLIC_MQTT_PORT", &closed)]).await;
     let only_http = [("TASK_AGENT_MQTT_TRANSPORT", "websocket")];
     let _robot = Robot::start_with(&server, dir.path(), "robot-1", 1, &server.url(""), &only_http).await;
     connected(&server).await;

@@ -339,6 +339,7 @@ fn documents_of_the_api() {
             mac: parsed("02:00:00:00:00:01"),
             name: Some(parsed("atlas")),
             labels: [(parsed("site"), parsed("lab"))].into(),
+            client_key: Some(SigningKey::from_bytes([7; 32]).public_key()),
         },
     );
     check_text(

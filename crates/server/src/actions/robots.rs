@@ -65,7 +65,8 @@ impl Actions {
             write.use_enrolment_token(token).await?;
         }
         let robot_token = Token::random(TokenKind::Robot);
-        write.offer_robot_token(&robot_token, &robot.id, Some(token), now_ms).await?;
+        let key = request.client_key.as_ref();
+        write.offer_robot_token(&robot_token, &robot.id, Some(token), key, now_ms).await?;
         let deed = Deed::new("enrolment".to_owned(), token.id().parse().ok(), address, Act::RobotEnroll, &robot.id);
         write.audit(&deed.with("name", &robot.name).with("mac", robot.mac), now_ms).await?;
         write.commit().await?;
@@ -81,7 +82,8 @@ impl Actions {
             return Err(ActionError::EnrolledAnew(robot.clone()));
         }
         let token = Token::random(TokenKind::Robot);
-        write.offer_robot_token(&token, robot, None, self.clock.now_ms()).await?;
+        let key = write.client_key(robot).await?;
+        write.offer_robot_token(&token, robot, None, key.as_ref(), self.clock.now_ms()).await?;
         write.commit().await?;
         Ok(token)
     }

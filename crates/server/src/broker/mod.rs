@@ -23,7 +23,7 @@ use task_proto::{Digest, RobotId, UserName};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::watch;
 
-use crate::tls::Tls;
+use crate::tls::{ClientProof, Tls};
 pub use external::{CANARY_LEVEL, ExternalConfig};
 use external::{Crowd, External};
 pub use fan_out::{FanOut, FanOutError, FanOutSettings, MAX_PART_BYTES, Part, PartQos};
@@ -41,6 +41,8 @@ pub struct Login {
     pub password: Option<String>,
     /// Where the connection comes from.
     pub peer: SocketAddr,
+    /// What the client has proven when it shook hands.
+    pub proof: ClientProof,
 }
 
 /// Who a client turned out to be.
@@ -332,7 +334,11 @@ impl Broker {
 
     /// Serves a client whose connection somebody else has accepted, once `handshake` ends. False: the broker is another
     /// one, or has no room.
-    pub fn take_in<S>(&self, peer: SocketAddr, handshake: impl Future<Output = io::Result<S>> + Send + 'static) -> bool
+    pub fn take_in<S>(
+        &self,
+        peer: SocketAddr,
+        handshake: impl Future<Output = io::Result<(S, ClientProof)>> + Send + 'static,
+    ) -> bool
     where
         S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
     {

@@ -14,7 +14,7 @@ use task_proto::token::{InvalidToken, Token};
 use task_proto::{CaPin, RobotName};
 use task_transport::Trust;
 
-use super::login::kept_token;
+use super::login::{kept_pin, kept_token};
 use super::output::printable;
 use super::{CommandError, Connection, Outcome};
 use crate::clock::Clock;
@@ -138,7 +138,7 @@ impl Client {
         if !is_http {
             return Err(ClientError::Url { url: base }.into());
         }
-        let trust = Trust::by(connection.pin.or(known_pin));
+        let trust = Trust::by(connection.pin.or(known_pin).or_else(|| kept_pin(&base)));
         let http = reqwest::Client::builder()
             .tls_backend_preconfigured(trust.client_config(Clock::for_certificates()))
             .connect_timeout(Duration::from_secs(10))

@@ -10,9 +10,9 @@ use std::time::Duration;
 
 use clap::Args;
 use serde::{Deserialize, Serialize};
-use task_proto::UserName;
 use task_proto::api::{AccessToken, LogIn};
 use task_proto::token::Token;
+use task_proto::{CaPin, UserName};
 
 use super::client::Client;
 use super::output::{say, time};
@@ -41,6 +41,9 @@ pub(super) async fn log_in(connection: &Connection, order: LoginOrder) -> Result
     let token: AccessToken = client.once("/login", &request).await?;
     let mut kept = Kept::read(&path)?;
     kept.servers.insert(client.base().to_owned(), token.token);
+    if let Some(pin) = connection.pin {
+        kept.pins.insert(client.base().to_owned(), pin);
+    }
     kept.write(&path)?;
     say(&format!("signed in at {} as {} until {}", client.base(), token.user, time(token.expires_at_ms)));
     Ok(Outcome::Succeeded)
@@ -69,10 +72,18 @@ pub(super) fn kept_token(base: &str) -> Option<Token> {
     Kept::read(&path()?).ok()?.servers.remove(base)?.parse().ok()
 }
 
+/// The pin that was given when somebody signed in to the server at `base`.
+pub(super) fn kept_pin(base: &str) -> Option<CaPin> {
+    Kept::read(&path()?).ok()?.pins.remove(base)
+}
+
 /// `credentials.json`: tokens by the server's URL.
 #[derive(Default, Serialize, Deserialize)]
 struct Kept {
     servers: BTreeMap<String, String>,
+    /// The pins that were given with them.
+    #[serde(default)]
+    pins: BTreeMap<String, CaPin>,
 }
 
 fn path() -> Option<PathBuf> {

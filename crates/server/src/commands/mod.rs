@@ -137,7 +137,7 @@ pub struct Connection {
     /// The server's URL [default: the server of --data, else http://127.0.0.1:8080]
     #[arg(long, env = "TASKD_SERVER", value_name = "URL", global = true)]
     pub server: Option<String>,
-    /// The pin of the server's certificate authority [default: that of the server of --data, else the system's roots]
+    /// The pin of the server's certificate authority [default: that of taskd login or of the server of --data, else the system's roots]
     #[arg(long, env = "TASKD_PIN", value_name = "PIN", global = true)]
     pub pin: Option<CaPin>,
     /// A person's token [default: that of taskd login, else operator.token in --data]

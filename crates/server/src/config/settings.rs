@@ -102,6 +102,12 @@ pub(super) const SETTINGS: &[Setting] = &[
         set: |config, text| boolean(text).map(|private| config.tls.private_ca = Some(private)),
     },
     Setting {
+        name: "tls-client-certificates",
+        value_name: "BOOL",
+        help: "Ask robots for the key that they registered: without it their tokens open nothing [default: false]",
+        set: |config, text| boolean(text).map(|asks| config.tls.client_certificates = asks),
+    },
+    Setting {
         name: "tls-names",
         value_name: "NAME,…",
         help: "Host names and addresses that its certificate is also good for, beside the machine's own",

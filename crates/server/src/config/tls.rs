@@ -15,6 +15,8 @@ pub struct TlsSettings {
     pub private_ca: Option<bool>,
     /// Names and addresses that the authority's certificates are also good for.
     pub names: Vec<String>,
+    /// Whether robots have to show the key that they registered.
+    pub client_certificates: bool,
     /// How often the operator's files are looked at.
     pub look_interval: Duration,
 }
@@ -26,6 +28,7 @@ impl Default for TlsSettings {
             key: None,
             private_ca: None,
             names: Vec::new(),
+            client_certificates: false,
             look_interval: Duration::from_secs(10),
         }
     }

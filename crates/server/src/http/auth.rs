@@ -20,6 +20,7 @@ use super::App;
 use super::error::ApiError;
 use crate::person::Person;
 use crate::store::{Admitted, TokenHolder};
+use crate::tls::ClientProof;
 
 /// Who may call a route.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -109,6 +110,14 @@ pub(super) struct Gate {
     pub(super) deadline: Option<Duration>,
 }
 
+/// By what a request shows whose it is.
+#[derive(Clone, Copy)]
+struct Shown<'a> {
+    method: &'a Method,
+    headers: &'a HeaderMap,
+    proof: &'a ClientProof,
+}
+
 /// Stands before every handler: finds the caller, refuses whoever may not, and ends what takes too long.
 pub(super) async fn guard(
     State(gate): State<Gate>,
@@ -120,7 +129,9 @@ pub(super) async fn guard(
     let is_oci = request.uri().path().starts_with("/v2");
     // A path that is no text names nobody; the handler says that there is no such thing.
     let own = params.iter().flatten().find(|(name, _)| *name == "robot").map(|(_, value)| value);
-    match admit(&gate, peer, own, request.method(), request.headers()).await {
+    let proof = request.extensions().get::<ClientProof>().cloned().unwrap_or_default();
+    let shown = Shown { method: request.method(), headers: request.headers(), proof: &proof };
+    match admit(&gate, peer, own, shown).await {
         Ok((mut caller, token_number)) => {
             if let Caller::Person(person) = &mut caller {
                 person.address = Some(peer.ip().to_canonical());
@@ -142,13 +153,12 @@ async fn admit(
     gate: &Gate,
     peer: SocketAddr,
     own: Option<&str>,
-    method: &Method,
-    headers: &HeaderMap,
+    shown: Shown<'_>,
 ) -> Result<(Caller, TokenNumber), ApiError> {
     if gate.access == Access::Anyone {
         return Ok((Caller::Anyone, TokenNumber(0)));
     }
-    match identify(&gate.app, method, headers).await {
+    match identify(&gate.app, shown).await {
         Ok((caller, token_number)) if caller.may(gate.access, own) => Ok((caller, token_number)),
         Ok((Caller::Anyone, _)) => Err(ApiError::unauthorized("a token is needed: Authorization: Bearer …")),
         Ok((Caller::Person(person), _)) if let Access::Person(permission) = gate.access => {
@@ -173,8 +183,9 @@ pub(super) fn not_permitted(person: &Person, permission: Permission) -> ApiError
     })
 }
 
-/// Who sent these headers. `Anyone` if they don't say; an error if they say it wrongly.
-async fn identify(app: &App, method: &Method, headers: &HeaderMap) -> Result<(Caller, TokenNumber), ApiError> {
+/// Who sent this request. `Anyone` if it does not say; an error if it says it wrongly.
+async fn identify(app: &App, shown: Shown<'_>) -> Result<(Caller, TokenNumber), ApiError> {
+    let Shown { method, headers, proof } = shown;
     let now_ms = app.clock.now_ms();
     let token = if let Some(value) = headers.get(header::AUTHORIZATION) {
         token_of(value)?
@@ -186,13 +197,13 @@ async fn identify(app: &App, method: &Method, headers: &HeaderMap) -> Result<(Ca
     } else {
         return Ok((Caller::Anyone, TokenNumber(0)));
     };
-    let Some(Admitted { holder, is_first_use }) = app.store.admit(&token, now_ms).await? else {
+    let Some(Admitted { holder, is_first_use }) = app.store.admit(&token, proof, now_ms).await? else {
         return Err(ApiError::unauthorized("the token is unknown, expired or revoked"));
     };
     Ok(match holder {
         TokenHolder::Person(person) => (Caller::Person(person), TokenNumber(0)),
         TokenHolder::Enrolment => (Caller::Enrolment(Box::new(token)), TokenNumber(0)),
-        TokenHolder::Robot { robot, token_number } => {
+        TokenHolder::Robot { robot, token_number, .. } => {
             if is_first_use {
                 // Whoever is connected came in by the token that has just ended.
                 app.broker.disconnect(&robot);

@@ -29,7 +29,7 @@ use tower::ServiceExt as _;
 
 use super::traffic::HttpTotals;
 use crate::anteroom::{Anteroom, Place};
-use crate::tls::Tls;
+use crate::tls::{ClientProof, Tls};
 
 /// How long a request's head may take, also the first one of a connection, and how long one is kept without a request.
 const HEAD_TIMEOUT: Duration = Duration::from_secs(20);
@@ -69,6 +69,8 @@ struct Site {
 struct Guest {
     peer: SocketAddr,
     silent: Place,
+    /// What it has proven.
+    proof: ClientProof,
     /// Whether its place is needed.
     crowded: watch::Receiver<bool>,
 }
@@ -95,7 +97,8 @@ pub async fn serve(
             accepted = accept(&listener, &places) => accepted,
         };
         let silent = anteroom.enter(peer.ip(), Instant::now());
-        let guest = Guest { peer, silent, crowded: places.crowded.subscribe() };
+        let proof = ClientProof::NotAsked;
+        let guest = Guest { peer, silent, proof, crowded: places.crowded.subscribe() };
         let site = site.clone();
         // Two kinds of task, so that a plain connection's does not need the room of an encrypted one's.
         if site.tls.is_some() {
@@ -135,8 +138,8 @@ impl Site {
             () = self.stop.cancelled() => return,
         };
         // Whoever speaks no TLS, or none that counts, is no event worth a line in the log.
-        if let Ok(Ok(stream)) = shaken {
-            self.attend(stream, guest).await;
+        if let Ok(Ok((stream, proof))) = shaken {
+            self.attend(stream, Guest { proof, ..guest }).await;
         }
     }
 
@@ -145,10 +148,10 @@ impl Site {
     where
         S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
     {
-        let Guest { peer, silent, crowded } = guest;
+        let Guest { peer, silent, proof, crowded } = guest;
         let (leave, spoken) = (silent.leave().clone(), CancellationToken::new());
         let (router, traffic) = (self.router.clone(), self.traffic.clone());
-        let mut connection = pin!(connection(stream, peer, silent, spoken.clone(), router, traffic));
+        let mut connection = pin!(connection(stream, peer, proof, silent, spoken.clone(), router, traffic));
         let ended = async {
             tokio::select! {
                 _ = connection.as_mut() => return,
@@ -229,6 +232,7 @@ fn is_the_clients_fault(error: &io::Error) -> bool {
 fn connection<S>(
     stream: S,
     peer: SocketAddr,
+    proof: ClientProof,
     silent: Place,
     spoken: CancellationToken,
     router: Router,
@@ -247,6 +251,7 @@ where
         traffic.request();
         let mut request = request.map(|body| Body::new(PatientBody::new(body)));
         request.extensions_mut().insert(ConnectInfo(peer));
+        request.extensions_mut().insert(proof.clone());
         router.clone().oneshot(request)
     });
     http1::Builder::new()

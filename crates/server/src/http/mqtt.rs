@@ -13,6 +13,7 @@ use task_transport::websocket::{WebSocket, grant};
 
 use super::App;
 use super::error::ApiError;
+use crate::tls::ClientProof;
 
 /// `GET /mqtt`: goes over to MQTT.
 pub(super) async fn upgrade(
@@ -22,10 +23,11 @@ pub(super) async fn upgrade(
 ) -> Result<Response, ApiError> {
     let headers = grant(request.headers())
         .map_err(|error| ApiError::new(StatusCode::UPGRADE_REQUIRED, "upgrade_required", error.to_string()))?;
+    let proof = request.extensions().get::<ClientProof>().cloned().unwrap_or_default();
     let upgrade = hyper::upgrade::on(&mut request);
     let handshake = async move {
         let stream = upgrade.await.map_err(io::Error::other)?;
-        Ok(WebSocket::server(TokioIo::new(stream)))
+        Ok((WebSocket::server(TokioIo::new(stream)), proof))
     };
     if !app.broker.take_in(peer, handshake) {
         return Err(ApiError::unavailable("MQTT is served elsewhere, or to as many as there may be"));

@@ -97,9 +97,11 @@ fn cookie(headers: &HeaderMap) -> Option<&str> {
     pairs.find(|(name, _)| *name == COOKIE).map(|(_, value)| value)
 }
 
-fn set_cookie(value: &str, max_age_s: u64) -> [(header::HeaderName, String); 1] {
+/// A page that came encrypted never sends it in plain text.
+fn set_cookie(app: &App, value: &str, max_age_s: u64) -> [(header::HeaderName, String); 1] {
+    let secure = if app.ca_pin.is_some() { "; Secure" } else { "" };
     let attributes = "HttpOnly; SameSite=Strict; Path=/";
-    [(header::SET_COOKIE, format!("{COOKIE}={value}; {attributes}; Max-Age={max_age_s}"))]
+    [(header::SET_COOKIE, format!("{COOKIE}={value}; {attributes}; Max-Age={max_age_s}{secure}"))]
 }
 
 /// `POST /session`: signs in.
@@ -125,7 +127,7 @@ pub(super) async fn sign_in(
     };
     let id = app.sessions.begin(token, user, now_ms);
     let view = SessionView { expires_at_ms: Some(now_ms + LIFETIME_MS) };
-    Ok((set_cookie(&id, LIFETIME_MS / 1000), Json(view)).into_response())
+    Ok((set_cookie(&app, &id, LIFETIME_MS / 1000), Json(view)).into_response())
 }
 
 async fn known_token(app: &App, text: &str, now_ms: u64) -> Result<(Token, UserName), ApiError> {
@@ -151,7 +153,7 @@ pub(super) async fn sign_out(State(app): State<App>, by: Person, headers: Header
     app.sessions.end(&headers);
     app.actions.sign_out(&by).await?;
     app.broker.disconnect_person(&by.name);
-    Ok((StatusCode::NO_CONTENT, set_cookie("", 0)).into_response())
+    Ok((StatusCode::NO_CONTENT, set_cookie(&app, "", 0)).into_response())
 }
 
 #[cfg(test)]

@@ -155,7 +155,7 @@ mod tests {
     fn an_answer_counts_until_a_write_ends_or_the_token_does() {
         let access = Access::default();
         let (token, robot, blob) = (Token::random(TokenKind::Robot), RobotId::random(), Digest::of(b"x"));
-        let holder = TokenHolder::Robot { robot: robot.clone(), token_number: 3 };
+        let holder = TokenHolder::Robot { robot: robot.clone(), token_number: 3, key: None };
         let remember = |asked| {
             access.remember_holder(asked, &token, &holder, Some(100));
             let order = FetchedBy { priority: 0, number: 1, labels: Default::default() };

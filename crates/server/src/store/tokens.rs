@@ -6,6 +6,7 @@ use std::collections::BTreeSet;
 use sqlx::Row as _;
 use subtle::ConstantTimeEq as _;
 use task_proto::api::TokenOrigin;
+use task_proto::envelope::PublicKey;
 use task_proto::id::Labels;
 use task_proto::person::Roles;
 use task_proto::selector::Selector;
@@ -15,6 +16,7 @@ use task_proto::{RobotId, UserName};
 use super::rows::{from_optional_json, from_word, id, json, number, optional, stored};
 use super::{Store, StoreError, Write};
 use crate::person::{Person, Scope};
+use crate::tls::ClientProof;
 
 /// Whom a valid token stands for.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -29,7 +31,18 @@ pub enum TokenHolder {
         robot: RobotId,
         /// The number of its token: a later one has a higher number.
         token_number: u64,
+        /// The key that it registered when it was given the token.
+        key: Option<PublicKey>,
     },
+}
+
+impl TokenHolder {
+    fn is_proven_by(&self, proof: &ClientProof) -> bool {
+        match self {
+            Self::Robot { key, .. } => proof.suffices(key.as_ref()),
+            Self::Person(_) | Self::Enrolment => true,
+        }
+    }
 }
 
 /// A token that was shown and is good.
@@ -63,6 +76,7 @@ struct TokenRow {
     is_used: bool,
     number: u64,
     user: Option<UserPart>,
+    key: Option<PublicKey>,
 }
 
 /// Of a user's token: the user as they are now, and what the token is limited to.
@@ -78,7 +92,7 @@ struct UserPart {
 /// An enrolment token without a use left is still good while a token that it made was never used: the answer with that
 /// one may have been lost.
 const VALID_TOKEN: &str = "SELECT t.digest, t.robot_id, t.labels, t.uses_left, t.expires_at_ms, t.used_at_ms, t.number,
-         t.user_name, t.roles, t.scope, t.origin, u.roles AS user_roles, u.scope AS user_scope
+         t.client_key, t.user_name, t.roles, t.scope, t.origin, u.roles AS user_roles, u.scope AS user_scope
      FROM tokens t LEFT JOIN users u ON u.name = t.user_name
      WHERE t.id = $1 AND t.kind = $2 AND t.revoked_at_ms IS NULL AND (t.expires_at_ms IS NULL OR t.expires_at_ms > $3)
        AND (t.uses_left IS NULL OR t.uses_left > 0 OR EXISTS (SELECT 1 FROM tokens made
@@ -92,18 +106,21 @@ impl Store {
     }
 
     /// The same for whoever shows the token to come in. A robot's first use of a token ends its other ones.
-    pub async fn admit(&self, token: &Token, now_ms: u64) -> Result<Option<Admitted>, StoreError> {
+    /// Who has registered a key has to have proven that it holds it, if it was asked to: else the token is as if unknown.
+    pub async fn admit(&self, token: &Token, proof: &ClientProof, now_ms: u64) -> Result<Option<Admitted>, StoreError> {
         if let Some(holder) = self.access.holder(token, now_ms) {
-            return Ok(Some(Admitted { holder, is_first_use: false }));
+            let is_proven = holder.is_proven_by(proof);
+            return Ok(is_proven.then_some(Admitted { holder, is_first_use: false }));
         }
         let asked = self.access.ask();
         let Some(row) = self.valid_token(token, now_ms).await? else { return Ok(None) };
         let is_unused = token.kind() == TokenKind::Robot && !row.is_used;
         let expires_at_ms = row.expires_at_ms;
-        let Some(holder) = row.holder(token) else { return Ok(None) };
+        let holder = row.holder(token).filter(|holder| holder.is_proven_by(proof));
+        let Some(holder) = holder else { return Ok(None) };
         if is_unused && !self.use_first(token, now_ms).await? {
             // Somebody was faster: either with this token or with a later one.
-            let holder = self.token_holder(token, now_ms).await?;
+            let holder = self.token_holder(token, now_ms).await?.filter(|holder| holder.is_proven_by(proof));
             return Ok(holder.map(|holder| Admitted { holder, is_first_use: false }));
         }
         // How often an enrolment token may be used is counted by those who use it.
@@ -180,19 +197,38 @@ impl Write {
     }
 
     /// Makes `token` the one that `robot` may go over to, in the place of another that it never used. `made_by` is the
-    /// enrolment token it came by; `None`: the robot itself asked for it.
+    /// enrolment token it came by; `None`: the robot itself asked for it. Who has to show a key with it has `key`.
     pub async fn offer_robot_token(
         &mut self,
         token: &Token,
         robot: &RobotId,
         made_by: Option<&Token>,
+        key: Option<&PublicKey>,
         now_ms: u64,
     ) -> Result<(), StoreError> {
         sqlx::query("DELETE FROM tokens WHERE robot_id = $1 AND kind = 'robot' AND used_at_ms IS NULL")
             .bind(robot.as_str())
             .execute(self.connection())
             .await?;
-        self.insert_token(token, Some(robot), made_by, now_ms).await
+        self.insert_token(token, Some(robot), made_by, now_ms).await?;
+        sqlx::query("UPDATE tokens SET client_key = $2 WHERE id = $1")
+            .bind(token.id())
+            .bind(key.map(json))
+            .execute(self.connection())
+            .await?;
+        Ok(())
+    }
+
+    /// The key that `robot` registered when it was given the token it uses.
+    pub async fn client_key(&mut self, robot: &RobotId) -> Result<Option<PublicKey>, StoreError> {
+        let row = sqlx::query(
+            "SELECT client_key FROM tokens
+             WHERE robot_id = $1 AND kind = 'robot' AND used_at_ms IS NOT NULL AND revoked_at_ms IS NULL",
+        )
+        .bind(robot.as_str())
+        .fetch_optional(self.connection())
+        .await?;
+        row.map(|row| client_key(&row)).transpose().map(Option::flatten)
     }
 
     /// Whether `robot` was given a token by an enrolment, by `made_by` or by any, that nobody has used yet.
@@ -264,7 +300,9 @@ impl TokenRow {
         match token.kind() {
             TokenKind::Operator => self.person(token).map(TokenHolder::Person),
             TokenKind::Enrolment => Some(TokenHolder::Enrolment),
-            TokenKind::Robot => self.robot.map(|robot| TokenHolder::Robot { robot, token_number: self.number }),
+            TokenKind::Robot => {
+                self.robot.map(|robot| TokenHolder::Robot { robot, token_number: self.number, key: self.key })
+            }
         }
     }
 
@@ -295,8 +333,13 @@ fn token_row(row: sqlx::any::AnyRow) -> Result<TokenRow, StoreError> {
         expires_at_ms: row.try_get::<Option<i64>, _>("expires_at_ms")?.map(number),
         is_used: row.try_get::<Option<i64>, _>("used_at_ms")?.is_some(),
         number: number(row.try_get("number")?),
+        key: client_key(&row)?,
         user: user_part(&row)?,
     })
+}
+
+fn client_key(row: &sqlx::any::AnyRow) -> Result<Option<PublicKey>, StoreError> {
+    from_optional_json("tokens.client_key", row.try_get("client_key")?)
 }
 
 fn user_part(row: &sqlx::any::AnyRow) -> Result<Option<UserPart>, StoreError> {

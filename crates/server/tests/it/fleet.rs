@@ -83,7 +83,7 @@ impl Fleet {
         name: Option<&str>,
     ) -> Result<Enrolled, ActionError> {
         let name = name.map(|name| name.parse().expect("a name"));
-        self.actions.enroll(token, &EnrollRequest { mac, name, labels: BTreeMap::new() }, None).await
+        self.actions.enroll(token, &EnrollRequest { mac, name, labels: BTreeMap::new(), client_key: None }, None).await
     }
 
     /// Registers `count` robots named `r0`, `r1`, …

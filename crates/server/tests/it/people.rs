@@ -15,6 +15,7 @@ use task_proto::{Digest, TokenId, UserName};
 use taskd::actions::{ActionError, TaskOrder};
 use taskd::person::Person;
 use taskd::store::{Store, StoreError, TokenHolder};
+use taskd::tls::ClientProof;
 
 use crate::database::{TestDatabase, on_both_databases};
 use crate::fleet::{Fleet, order_of, package, random_key};
@@ -63,7 +64,14 @@ impl Fleet {
 
     /// The person that the token stands for now.
     async fn person(&self, token: &Token) -> Option<Person> {
-        match self.database.store.admit(token, self.clock.now_ms()).await.expect("reads")?.holder {
+        match self
+            .database
+            .store
+            .admit(token, &ClientProof::NotAsked, self.clock.now_ms())
+            .await
+            .expect("reads")?
+            .holder
+        {
             TokenHolder::Person(person) => Some(Person { address: Some(HERE), ..person }),
             other => panic!("{other:?} is no person"),
         }

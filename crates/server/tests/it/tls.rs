@@ -15,9 +15,9 @@ use rustls::pki_types::pem::PemObject as _;
 use rustls::{ClientConfig, RootCertStore};
 use serde_json::json;
 use task_proto::CaPin;
-use task_proto::api::EnrollmentToken;
+use task_proto::api::{EnrollResponse, EnrollmentToken, RobotToken};
 use task_proto::token::Token;
-use task_transport::{Duplex, Route, Trust, dial};
+use task_transport::{ClientKey, Duplex, Route, Trust, dial};
 use taskd::clock::Clock;
 use taskd::config::Config;
 use tempfile::TempDir;
@@ -138,6 +138,10 @@ async fn one_token_is_enough_to_know_the_server() {
     assert!(endpoint.tls);
     let mut session = session(&route(mqtt_of(&server), Some(pinned(pin_of(&server)))), &robot).await;
     session.expect_nothing().await;
+    // Nor does the page's cookie leave in plain text.
+    let sign_in = server.bare(Method::POST, "/api/v1/session").json(&json!({ "token": server.operator.reveal() }));
+    let signed_in = sign_in.send().await.expect("an answer");
+    assert!(signed_in.headers()["set-cookie"].to_str().expect("text").ends_with("; Secure"), "{signed_in:?}");
     // Nothing is said in plain text, on neither port.
     for address in [http_of(&server), mqtt_of(&server)] {
         let mut plain = TcpStream::connect(address).await.expect("connected");
@@ -330,6 +334,69 @@ async fn a_certificate_without_its_key_is_not_shown() {
     (config.tls.certificate, config.tls.key) = (Some(certificate), Some(key));
     let refused = taskd::serve::Server::start(config, Clock::system()).await.err().expect("refused");
     assert!(refused.to_string().contains("can't be used with the key in"), "{refused}");
+}
+
+/// Registers a robot that has a key.
+async fn enroll_with_key(server: &TestServer, key: &ClientKey) -> TestRobot {
+    let token: EnrollmentToken = server.post("/api/v1/enrollment-tokens", &json!({})).await;
+    let request = json!({ "mac": "02:00:00:00:00:77", "name": "keyed", "client_key": key.public_key() });
+    let enroll = server.bare(Method::POST, "/api/v1/enroll").bearer_auth(token.token).json(&request);
+    let enrolled: EnrollResponse = crate::harness::answer(enroll).await;
+    TestRobot::new(enrolled.robot_id, enrolled.token)
+}
+
+/// With what HTTP and MQTT answer the robot's token when this key is shown with it.
+async fn answers_to(server: &TestServer, robot: &TestRobot, key: Option<&ClientKey>) -> (u16, u8) {
+    let mut tls = ClientConfig::clone(&pinned(pin_of(server)));
+    if let Some(key) = key {
+        key.show_in(&mut tls).expect("a certificate");
+    }
+    let client = reqwest::Client::builder().tls_backend_preconfigured(tls.clone()).build().expect("a client");
+    let desired = client.get(server.url(&format!("/api/v1/robots/{}/desired", robot.id))).bearer_auth(&robot.token);
+    let status = desired.send().await.expect("an answer").status().as_u16();
+    let stream = dial(&route(mqtt_of(server), Some(Arc::new(tls)))).await.expect("connected");
+    let mut raw = Raw { stream };
+    let connect = Connect { password: Some(robot.token.clone()), ..Connect::robot(&robot.id) };
+    raw.send(&connect.packet()).await;
+    let mut answer = [0; 4];
+    timeout(PATIENCE, raw.stream.read_exact(&mut answer)).await.expect("in time").expect("an answer");
+    assert_eq!(answer[..3], [0x20, 2, 0]);
+    (status, answer[3])
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_token_opens_nothing_without_the_key_that_its_robot_registered() {
+    let configure = |config: &mut Config| {
+        private(config);
+        config.tls.client_certificates = true;
+    };
+    let server = TestServer::start_in(TempDir::new().expect("a directory"), configure).await;
+    let (key, other) = (ClientKey::random(), ClientKey::random());
+    let mut robot = enroll_with_key(&server, &key).await;
+    let keyless = server.enroll("keyless").await;
+    assert_eq!(answers_to(&server, &robot, None).await, (401, 4));
+    assert_eq!(answers_to(&server, &robot, Some(&other)).await, (401, 4));
+    assert_eq!(answers_to(&server, &robot, Some(&key)).await, (200, 0));
+    // What was let in a moment ago does not let the next one in.
+    assert_eq!(answers_to(&server, &robot, None).await, (401, 4));
+    assert_eq!(answers_to(&server, &keyless, None).await, (200, 0));
+    assert_eq!(answers_to(&server, &keyless, Some(&other)).await, (200, 0));
+    // The next token is bound to the key as well; whoever else tries it does not end the one in use.
+    let mut tls = ClientConfig::clone(&pinned(pin_of(&server)));
+    key.show_in(&mut tls).expect("a certificate");
+    let client = reqwest::Client::builder().tls_backend_preconfigured(tls).build().expect("a client");
+    let next = client.post(server.url(&format!("/api/v1/robots/{}/token", robot.id))).bearer_auth(&robot.token);
+    let next: RobotToken = crate::harness::answer(next).await;
+    let renewed = TestRobot::new(robot.id.clone(), next.token);
+    assert_eq!(answers_to(&server, &renewed, None).await, (401, 4));
+    assert_eq!(answers_to(&server, &robot, Some(&key)).await, (200, 0));
+    assert_eq!(answers_to(&server, &renewed, Some(&key)).await, (200, 0));
+    assert_eq!(answers_to(&server, &robot, Some(&key)).await, (401, 4));
+    robot = renewed;
+    let removed =
+        server.request(Method::DELETE, &format!("/api/v1/robots/{}", robot.id)).send().await.expect("an answer");
+    assert!(removed.status().is_success());
+    assert_eq!(answers_to(&server, &robot, Some(&key)).await, (401, 4));
 }
 
 /// Both ends of every connection are in this process.

@@ -8,6 +8,7 @@ use taskd::actions::Enrolled;
 use taskd::person::Person;
 use taskd::report_writer::ReportError;
 use taskd::store::{Admitted, Store, TokenHolder};
+use taskd::tls::ClientProof;
 
 use crate::database::{TestDatabase, on_both_databases};
 use crate::fleet::{Fleet, Robot, mac};
@@ -29,7 +30,7 @@ async fn enrolment_gives_identities_by_mac(database: TestDatabase) {
     let one = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("enrols");
     let now_ms = fleet.clock.now_ms();
     let store = fleet.database.store.clone();
-    assert!(store.admit(&one.token, now_ms).await.expect("reads").is_some());
+    assert!(store.admit(&one.token, &ClientProof::NotAsked, now_ms).await.expect("reads").is_some());
     assert_eq!(code(fleet.try_enroll(&token, mac(1), Some("other")).await), "mac_known");
     assert_eq!(code(fleet.try_enroll(&token, mac(2), Some("atlas")).await), "name_taken");
     let two = fleet.try_enroll(&token, mac(2), None).await.expect("enrols");
@@ -98,7 +99,8 @@ async fn robot_of(store: &Store, token: &Token) -> Option<RobotId> {
 async fn a_new_token_ends_the_old_one_when_it_is_first_used(database: TestDatabase) {
     let fleet = Fleet::new(database);
     let store = fleet.database.store.clone();
-    let admit = async |token: &Token| match store.admit(token, 1_000_000).await.expect("reads") {
+    let admit = async |token: &Token| match store.admit(token, &ClientProof::NotAsked, 1_000_000).await.expect("reads")
+    {
         Some(Admitted { holder: TokenHolder::Robot { token_number, .. }, is_first_use }) => {
             Some((token_number, is_first_use))
         }
@@ -159,7 +161,9 @@ async fn a_first_use_by_two_at_once_is_one(database: TestDatabase) {
     let mut uses = tokio::task::JoinSet::new();
     for _ in 0..8 {
         let (store, token) = (fleet.database.store.clone(), robot.token.clone());
-        uses.spawn(async move { store.admit(&token, 1_000_000).await.expect("reads").expect("valid").is_first_use });
+        uses.spawn(async move {
+            store.admit(&token, &ClientProof::NotAsked, 1_000_000).await.expect("reads").expect("valid").is_first_use
+        });
     }
     let uses = uses.join_all().await;
     assert_eq!(uses.iter().filter(|is_first_use| **is_first_use).count(), 1, "{uses:?}");
@@ -174,7 +178,9 @@ async fn a_fleet_that_comes_at_once_is_let_in_whole(database: TestDatabase) {
     }
     let admit = |robot: &Enrolled| {
         let (store, token) = (fleet.database.store.clone(), robot.token.clone());
-        tokio::spawn(async move { store.admit(&token, 1_000_000).await.expect("reads").expect("valid") })
+        tokio::spawn(async move {
+            store.admit(&token, &ClientProof::NotAsked, 1_000_000).await.expect("reads").expect("valid")
+        })
     };
     let (impatient, patient): (Vec<_>, Vec<_>) = robots.iter().map(|robot| (admit(robot), admit(robot))).unzip();
     // Whoever goes away, also in the middle of writing for the others, takes nobody along.
@@ -203,7 +209,7 @@ async fn a_lost_answer_to_an_enrolment_is_mended_by_asking_again(database: TestD
     let again = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("mended");
     assert_eq!((&again.robot_id, &again.name), (&lost.robot_id, &lost.name));
     assert_eq!(robot_of(&store, &lost.token).await, None);
-    store.admit(&again.token, 1_000_000).await.expect("reads").expect("valid");
+    store.admit(&again.token, &ClientProof::NotAsked, 1_000_000).await.expect("reads").expect("valid");
     assert_eq!(code(fleet.try_enroll(&token, mac(1), Some("atlas")).await), "unauthorized");
     fleet.actions.expire().await.expect("forgets it now");
     assert_eq!(store.token_holder(&token, 0).await.expect("reads"), None);
@@ -216,7 +222,7 @@ async fn a_lost_answer_to_an_enrolment_is_mended_by_asking_again(database: TestD
     let mended = fleet.try_enroll(&bound, mac(1), None).await.expect("mended");
     assert_eq!(robot_of(&store, &lost.token).await, None);
     assert_eq!(robot_of(&store, &again.token).await, Some(again.robot_id.clone()), "until the new one is used");
-    store.admit(&mended.token, 1_000_000).await.expect("reads").expect("valid");
+    store.admit(&mended.token, &ClientProof::NotAsked, 1_000_000).await.expect("reads").expect("valid");
     assert_eq!(robot_of(&store, &again.token).await, None);
     // A token for many is spent on a robot as soon as that one is in.
     let many = fleet.enrolment_token(CreateEnrollmentToken::default()).await;

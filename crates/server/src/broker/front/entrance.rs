@@ -18,6 +18,7 @@ use super::codec::{Connect, DecodeError, Received, Will, decode, encode};
 use super::takeover::SeatName;
 use crate::anteroom::Place;
 use crate::broker::{Login, Principal, Refusal};
+use crate::tls::ClientProof;
 
 /// The largest CONNECT, in bytes after the fixed header.
 const MAX_CONNECT_BYTES: usize = 4 * 1024;
@@ -53,6 +54,8 @@ impl Guest {
 /// A connection whose client has not said who it is.
 pub(super) struct Arrival {
     pub(super) peer: SocketAddr,
+    /// What it has proven.
+    pub(super) proof: ClientProof,
     /// By when it must have.
     deadline: tokio::time::Instant,
     place: Place,
@@ -74,7 +77,7 @@ pub(super) enum Rejection {
 impl Arrival {
     pub(super) fn new(context: &Context, peer: SocketAddr) -> Self {
         let deadline = tokio::time::Instant::now() + context.limits.connect_timeout;
-        Self { peer, deadline, place: context.anteroom.enter(peer.ip(), Instant::now()) }
+        Self { peer, proof: ClientProof::NotAsked, deadline, place: context.anteroom.enter(peer.ip(), Instant::now()) }
     }
 
     /// Waits for the client to take the next step, for as long as it has.
@@ -126,7 +129,7 @@ where
 {
     let mut input = BytesMut::new();
     let connect = arrival.step("sends no CONNECT in time", read_connect(stream, &mut input)).await?;
-    let peer = arrival.peer;
+    let (peer, proof) = (arrival.peer, arrival.proof.clone());
     drop(arrival);
     if connect.client_id.is_empty() && !connect.clean_session {
         return Err(answer(ConnectReturnCode::ClientIdentifierNotValid, "an empty client id without a clean session"));
@@ -136,6 +139,7 @@ where
         user_name: connect.user_name.clone(),
         password: connect.password.clone(),
         peer,
+        proof,
     };
     let visitor = admit(context, &connect, login.clone()).await?;
     if let Some(will) = &connect.will

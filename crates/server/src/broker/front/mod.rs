@@ -34,7 +34,7 @@ use super::router::Router;
 use super::{BrokerConfig, BrokerError, Gatekeeper, Inbox, Limits, NotAsked, NotConnected};
 use crate::anteroom::Anteroom;
 use crate::backlog::listen;
-use crate::tls::Tls;
+use crate::tls::{ClientProof, Tls};
 use entrance::Arrival;
 pub(super) use entrance::{CANARY_ID, CanaryPass};
 use parts::Grants;
@@ -155,7 +155,7 @@ impl Front {
     pub(super) fn take_in<S>(
         &self,
         peer: SocketAddr,
-        handshake: impl Future<Output = io::Result<S>> + Send + 'static,
+        handshake: impl Future<Output = io::Result<(S, ClientProof)>> + Send + 'static,
     ) -> bool
     where
         S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
@@ -172,19 +172,22 @@ impl Front {
         &self,
         peer: SocketAddr,
         place: OwnedSemaphorePermit,
-        handshake: impl Future<Output = io::Result<S>> + Send + 'static,
+        handshake: impl Future<Output = io::Result<(S, ClientProof)>> + Send + 'static,
     ) where
         S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
     {
         let context = self.context.clone();
-        let arrival = Arrival::new(&context, peer);
+        let mut arrival = Arrival::new(&context, peer);
         self.sessions.spawn(async move {
             let shaken = tokio::select! {
                 shaken = arrival.shake_hands(handshake) => shaken,
                 () = context.stop.cancelled() => return,
             };
             match shaken {
-                Ok(stream) => session::serve(context, stream, arrival).await,
+                Ok((stream, proof)) => {
+                    arrival.proof = proof;
+                    session::serve(context, stream, arrival).await;
+                }
                 Err(rejection) => {
                     tracing::debug!(%peer, "MQTT client turned away: {rejection}");
                     context.totals.refuse(None);

@@ -6,7 +6,6 @@
 //! What is heard is acknowledged by hand: a part once it was written, all else at once. A part that nobody takes is all
 //! that is held here; until somebody does, nothing more is read.
 
-mod line;
 mod room;
 mod subscriptions;
 mod ways;
@@ -24,11 +23,10 @@ use task_proto::desired::{Doorbell, MAX_DOORBELL_BYTES};
 use task_proto::report::Status;
 use task_proto::request::Request;
 use task_proto::topic::{RobotTopic, Topic, TopicPrefix};
-use task_transport::Route;
+use task_transport::{Line, LineError, Route};
 use tokio::sync::mpsc;
 use tokio::time::Instant;
 
-use self::line::{Line, LineError};
 use self::room::MessageRoom;
 use self::subscriptions::Subscriptions;
 pub use self::ways::Ways;
@@ -111,7 +109,7 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
         let begun = Instant::now();
         let room = MessageRoom::of(&access, &shared, sends_large);
         let (there, external, is_encrypted) = access.at(endpoint.borrow_and_update().as_ref());
-        let way = access.ways.next(&there.host, there.port, is_encrypted, external.is_some());
+        let way = access.ways.next(&there.host, there.port, is_encrypted, external.as_ref());
         let session = session(&there, external.as_ref(), way, &shared, &heard, &mut talk, room);
         let ended = tokio::select! {
             // Cancel-safe: nothing follows. The broker notices that the session is gone.
@@ -201,11 +199,11 @@ async fn session(
     room: MessageRoom,
 ) -> Ended {
     let Talk { requests, messages, lines } = talk;
-    let line = match open(way.as_ref()).await {
+    let line = match Line::open(way.as_ref(), CONNECT_TIMEOUT).await {
         Ok(line) => line,
         Err(error) => return Ended::Unreachable(error),
     };
-    let options = options(access, external, line.as_ref(), room);
+    let options = options(access, external, &line, room);
     let (client, mut event_loop) = AsyncClient::new(options, QUEUED_REQUESTS);
     event_loop.network_options.set_connection_timeout(CONNECT_TIMEOUT.as_secs());
     // An acknowledgement that waits for another packet to be answered would hold the sender up.
@@ -215,7 +213,7 @@ async fn session(
     let (mut reports, mut wishes) = (shared.reports.subscribe(), shared.listening.changes());
     let (pump, acknowledgements) =
         (pump(&mut event_loop, events_in, room, shared), acknowledge_all(client.clone(), due));
-    let carrying = carry(line);
+    let carrying = line.carry();
     tokio::pin!(pump, acknowledgements, carrying);
     let mut session = Session {
         access,
@@ -289,22 +287,6 @@ async fn pump(event_loop: &mut EventLoop, events: mpsc::Sender<Event>, room: Mes
             Err(error) => return Ended::Lost(error),
         }
     }
-}
-
-/// The line for a way that rumqttc can't take itself.
-async fn open(way: Option<&Route>) -> Result<Option<Line>, LineError> {
-    match way {
-        Some(way) => Line::open(way, CONNECT_TIMEOUT).await.map(Some),
-        None => Ok(None),
-    }
-}
-
-/// Carries what rumqttc says and hears, if it can't do that itself. That the line is through it sees by itself.
-async fn carry(line: Option<Line>) {
-    if let Some(line) = line {
-        line.carry().await;
-    }
-    std::future::pending().await
 }
 
 /// Acknowledges what is due, until nobody can say any more what is.
@@ -508,17 +490,9 @@ impl Session<'_> {
     }
 }
 
-fn options(
-    access: &MqttAccess,
-    external: Option<&ExternalBroker>,
-    line: Option<&Line>,
-    room: MessageRoom,
-) -> MqttOptions {
-    let mut options = match line {
-        Some(line) => MqttOptions::new(access.robot.as_str(), line.name(), 0),
-        None => MqttOptions::new(access.robot.as_str(), &access.host, access.port),
-    };
-    if line.is_some() {
+fn options(access: &MqttAccess, external: Option<&ExternalBroker>, line: &Line, room: MessageRoom) -> MqttOptions {
+    let mut options = MqttOptions::new(access.robot.as_str(), line.name().unwrap_or(&access.host), access.port);
+    if line.name().is_some() {
         options.set_transport(Transport::Unix);
     }
     let password = external.map_or_else(|| access.token.current(), |external| external.password.clone());

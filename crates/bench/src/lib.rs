@@ -5,7 +5,7 @@ pub mod axis;
 pub mod clock;
 pub mod compare;
 mod downloads;
-mod encryption;
+pub mod encryption;
 mod enrolment;
 pub mod fleet;
 pub mod link;

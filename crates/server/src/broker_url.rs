@@ -7,19 +7,20 @@ use std::str::FromStr;
 
 use task_proto::RobotId;
 
-/// MQTT's port, where the URL names none.
-const DEFAULT_PORT: u16 = 1883;
-const SCHEME: &str = "mqtt://";
+/// The schemes, each with its port where the URL names none, and whether it is TLS.
+const SCHEMES: [(&str, u16, bool); 2] = [("mqtt://", 1883, false), ("mqtts://", 8883, true)];
 /// More than any name or password needs; MQTT itself allows 64 KiB.
 const MAX_BYTES: usize = 512;
 
-/// `mqtt://user:password@host:port`.
+/// `mqtt://user:password@host:port`, or `mqtts://…`.
 #[derive(Clone, PartialEq, Eq)]
 pub struct BrokerUrl {
     /// Host name or address; an IPv6 address in brackets.
     pub host: String,
     /// TCP port.
     pub port: u16,
+    /// Whether TLS is spoken there.
+    pub tls: bool,
     /// The server's own user there.
     pub user_name: String,
     /// Its password.
@@ -30,11 +31,8 @@ pub struct BrokerUrl {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum InvalidBrokerUrl {
     /// It begins otherwise.
-    #[error("expected mqtt://USER:PASSWORD@HOST[:PORT], or \"embedded\" for the server's own broker")]
+    #[error("expected mqtt://USER:PASSWORD@HOST[:PORT] or mqtts://…, or \"embedded\" for the server's own broker")]
     Form,
-    /// It asks for TLS.
-    #[error("mqtts:// is not supported yet: expected mqtt://USER:PASSWORD@HOST[:PORT]")]
-    Tls,
     /// Without them the broker's access control list protects nothing.
     #[error("it names no user or no password: expected mqtt://USER:PASSWORD@HOST[:PORT]")]
     NoCredentials,
@@ -69,10 +67,8 @@ impl FromStr for BrokerUrl {
     type Err = InvalidBrokerUrl;
 
     fn from_str(text: &str) -> Result<Self, InvalidBrokerUrl> {
-        if text.starts_with("mqtts://") {
-            return Err(InvalidBrokerUrl::Tls);
-        }
-        let rest = text.strip_prefix(SCHEME).ok_or(InvalidBrokerUrl::Form)?;
+        let of_scheme = |(scheme, port, tls)| text.strip_prefix(scheme).map(|rest| (rest, port, tls));
+        let (rest, default_port, tls) = SCHEMES.into_iter().find_map(of_scheme).ok_or(InvalidBrokerUrl::Form)?;
         let rest = rest.strip_suffix('/').unwrap_or(rest);
         // A host has no '@', a password may.
         let (credentials, place) = rest.rsplit_once('@').ok_or(InvalidBrokerUrl::NoCredentials)?;
@@ -87,11 +83,11 @@ impl FromStr for BrokerUrl {
             return Err(InvalidBrokerUrl::UserName);
         }
         let (host, port) = host_and_port(place)?;
-        Ok(Self { host: host.to_owned(), port, user_name, password })
+        Ok(Self { host: host.to_owned(), port: port.unwrap_or(default_port), tls, user_name, password })
     }
 }
 
-fn host_and_port(place: &str) -> Result<(&str, u16), InvalidBrokerUrl> {
+fn host_and_port(place: &str) -> Result<(&str, Option<u16>), InvalidBrokerUrl> {
     let end = if place.starts_with('[') { place.find(']').map(|at| at + 1) } else { place.find(':') };
     let (host, port) = place.split_at(end.unwrap_or(place.len()));
     let is_address = host
@@ -104,10 +100,10 @@ fn host_and_port(place: &str) -> Result<(&str, u16), InvalidBrokerUrl> {
         return Err(InvalidBrokerUrl::Host);
     }
     if port.is_empty() {
-        return Ok((host, DEFAULT_PORT));
+        return Ok((host, None));
     }
     match port.strip_prefix(':').and_then(|port| port.parse().ok()) {
-        Some(port) if port > 0 => Ok((host, port)),
+        Some(port) if port > 0 => Ok((host, Some(port))),
         _ => Err(InvalidBrokerUrl::Port),
     }
 }
@@ -153,16 +149,18 @@ mod tests {
         assert!(!url.is_loopback());
         assert!(!format!("{url:?}").contains("et@"), "{url:?}");
         let url: BrokerUrl = "mqtt://taskd:x@[::1]/".parse().expect("valid");
-        assert_eq!((url.address().as_str(), url.is_loopback()), ("[::1]:1883", true));
+        assert_eq!((url.address().as_str(), url.is_loopback(), url.tls), ("[::1]:1883", true, false));
+        let url: BrokerUrl = "mqtts://taskd:x@broker.lab".parse().expect("valid");
+        assert_eq!((url.address().as_str(), url.tls), ("broker.lab:8883", true));
     }
 
     #[test]
     fn what_is_wrong_is_said_without_the_password() {
-        use InvalidBrokerUrl::{Form, Host, NoCredentials, Password, Port, Tls, UserName};
+        use InvalidBrokerUrl::{Form, Host, NoCredentials, Password, Port, UserName};
         for (text, expected) in [
             ("", Form),
             ("tcp://a:secret@h", Form),
-            ("mqtts://a:secret@h", Tls),
+            ("mqtts:a:secret@h", Form),
             ("mqtt://h", NoCredentials),
             ("mqtt://a@h", NoCredentials),
             ("mqtt://a:@h", NoCredentials),

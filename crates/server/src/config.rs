@@ -12,6 +12,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::{Arg, ArgAction, ArgMatches};
+use task_proto::CaPin;
 use task_proto::id::LabelKey;
 use task_proto::part::DEFAULT_PART_BYTES;
 use task_proto::topic::TopicPrefix;
@@ -33,6 +34,8 @@ pub struct Config {
     pub mqtt: SocketAddr,
     /// The MQTT broker to be a client of; absent: the server's own, which listens at `mqtt`.
     pub broker: Option<BrokerUrl>,
+    /// The authority behind its certificate; absent: the system's roots vouch for it.
+    pub broker_pin: Option<CaPin>,
     /// The database's URL; absent: SQLite in the data directory.
     pub database: Option<String>,
     /// What all MQTT topics start with.
@@ -186,7 +189,7 @@ pub enum ConfigError {
     PasswordInSight,
     /// The broker's password would cross the network readable.
     #[error(
-        "broker = {address}: an unencrypted connection to another machine is refused; use a broker on this machine or \
+        "broker = {address}: an unencrypted connection to another machine is refused; use mqtts://, a broker on this machine or \
          give --allow-plaintext"
     )]
     PlaintextBroker {
@@ -235,6 +238,7 @@ impl Config {
             http: SocketAddr::from(([127, 0, 0, 1], 8080)),
             mqtt: SocketAddr::from(([127, 0, 0, 1], 1883)),
             broker: None,
+            broker_pin: None,
             database: None,
             topic_prefix: TopicPrefix::default(),
             allow_plaintext: false,
@@ -284,7 +288,8 @@ impl Config {
 
     /// Refuses settings that do not go together.
     fn check(&self) -> Result<(), ConfigError> {
-        if let Some(broker) = self.broker.as_ref().filter(|broker| !broker.is_loopback() && !self.allow_plaintext) {
+        let is_exposed = |broker: &&BrokerUrl| !broker.tls && !broker.is_loopback() && !self.allow_plaintext;
+        if let Some(broker) = self.broker.as_ref().filter(is_exposed) {
             return Err(ConfigError::PlaintextBroker { address: broker.address() });
         }
         match (&self.tls.certificate, &self.tls.key) {

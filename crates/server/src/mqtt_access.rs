@@ -5,6 +5,7 @@ use base64::Engine as _;
 use base64::engine::general_purpose::{STANDARD, URL_SAFE_NO_PAD};
 use hmac::{Hmac, KeyInit as _, Mac as _};
 use sha2::{Sha256, Sha512};
+use task_proto::CaPin;
 use task_proto::api::{BrokerFiles, ExternalBroker, MqttEndpoint};
 use task_proto::topic::TopicPrefix;
 
@@ -30,6 +31,8 @@ struct External {
     secret: [u8; 32],
     user_name: String,
     password: String,
+    /// The authority behind its certificate, if it is not one that systems know.
+    pin: Option<CaPin>,
 }
 
 impl MqttAccess {
@@ -38,9 +41,10 @@ impl MqttAccess {
         Self { endpoint: MqttEndpoint { host, port, prefix, tls, external: None }, external: None }
     }
 
-    /// Robots go to the broker at `url`, at `host` and `port` if these are given.
+    /// Robots go to the broker at `url`, at `host` and `port` if these are given, and know it by `pin` if that is.
     pub fn external(
         url: &BrokerUrl,
+        pin: Option<CaPin>,
         host: Option<String>,
         port: Option<u16>,
         prefix: TopicPrefix,
@@ -48,15 +52,16 @@ impl MqttAccess {
     ) -> Self {
         // What is loopback here is this machine for robots elsewhere: the host they know the server by.
         let host = host.or_else(|| (!url.is_loopback()).then(|| url.host.clone()));
-        let endpoint = MqttEndpoint { host, port: port.unwrap_or(url.port), prefix, tls: false, external: None };
-        let external = External { secret, user_name: url.user_name.clone(), password: url.password.clone() };
+        let endpoint = MqttEndpoint { host, port: port.unwrap_or(url.port), prefix, tls: url.tls, external: None };
+        let external = External { secret, user_name: url.user_name.clone(), password: url.password.clone(), pin };
         Self { endpoint, external: Some(external) }
     }
 
     /// What the robot needs to connect.
     pub fn endpoint_of(&self, credential: &BrokerCredential) -> MqttEndpoint {
         let external = self.external.as_ref();
-        let external = external.map(|external| ExternalBroker { password: external.password_of(credential) });
+        let external = external
+            .map(|external| ExternalBroker { password: external.password_of(credential), ca_pin: external.pin });
         MqttEndpoint { external, ..self.endpoint.clone() }
     }
 
@@ -144,7 +149,7 @@ mod tests {
 
     fn access(secret: u8) -> MqttAccess {
         let url: BrokerUrl = "mqtt://server:hunter2@localhost:1884".parse().expect("valid");
-        MqttAccess::external(&url, None, None, TopicPrefix::default(), [secret; 32])
+        MqttAccess::external(&url, None, None, None, TopicPrefix::default(), [secret; 32])
     }
 
     fn credential(robot: &str, number: u64) -> BrokerCredential {
@@ -170,8 +175,8 @@ mod tests {
         assert_eq!((endpoint.host, endpoint.port), (None, 1884));
         let url: BrokerUrl = "mqtt://server:hunter2@broker.lab".parse().expect("valid");
         let (host, port) = (Some("wifi.lab".to_owned()), Some(1999));
-        let named = MqttAccess::external(&url, None, None, TopicPrefix::default(), [1; 32]);
-        let told = MqttAccess::external(&url, host.clone(), port, TopicPrefix::default(), [1; 32]);
+        let named = MqttAccess::external(&url, None, None, None, TopicPrefix::default(), [1; 32]);
+        let told = MqttAccess::external(&url, None, host.clone(), port, TopicPrefix::default(), [1; 32]);
         assert_eq!((named.endpoint.host.as_deref(), named.endpoint.port), (Some("broker.lab"), 1883));
         assert_eq!((told.endpoint.host, told.endpoint.port), (host, 1999));
     }

@@ -359,10 +359,17 @@ async fn start_broker(
         let port = config.public_mqtt_port.unwrap_or(bound);
         return Ok((broker, MqttAccess::embedded(host, port, prefix, encrypts)));
     };
-    let access = MqttAccess::external(url, host, config.public_mqtt_port, prefix.clone(), data.broker_secret()?);
+    let access = MqttAccess::external(
+        url,
+        config.broker_pin,
+        host,
+        config.public_mqtt_port,
+        prefix.clone(),
+        data.broker_secret()?,
+    );
     // The same over restarts, so that a session which the network forgot ends when the next begins.
     let client_id = format!("taskd-{}", key.id());
-    Ok((Broker::connect(ExternalConfig { url: url.clone(), client_id, prefix }, inbox), access))
+    Ok((Broker::connect(ExternalConfig { url: url.clone(), pin: config.broker_pin, client_id, prefix }, inbox), access))
 }
 
 fn broker_config(config: &Config, tls: Option<Tls>) -> BrokerConfig {

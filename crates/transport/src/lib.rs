@@ -3,9 +3,11 @@
 
 mod client_key;
 mod dial;
+mod line;
 mod trust;
 pub mod websocket;
 
 pub use client_key::{CertificateError, ClientKey, InvalidKey, key_in};
 pub use dial::{DialError, Duplex, Route, dial};
+pub use line::{Line, LineError};
 pub use trust::{BUILT_MS, Clock, Trust, WrongServer, pin_of};

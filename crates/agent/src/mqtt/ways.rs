@@ -5,8 +5,10 @@ use std::sync::Arc;
 
 use reqwest::Url;
 use rustls::ClientConfig;
-use task_transport::Route;
+use task_proto::api::ExternalBroker;
+use task_transport::{Route, Trust};
 
+use crate::clock;
 use crate::config::MqttTransport;
 
 /// Which ways there are, and which is tried next.
@@ -34,18 +36,26 @@ impl Ways {
     }
 
     /// The next way; `None`: rumqttc's own, over a port that does not encrypt. A broker that is not the server's own has
-    /// nothing but its port.
-    pub(super) fn next(&self, host: &str, port: u16, is_encrypted: bool, is_external: bool) -> Option<Route> {
+    /// nothing but its port, and a certificate by somebody else.
+    pub(super) fn next(
+        &self,
+        host: &str,
+        port: u16,
+        is_encrypted: bool,
+        external: Option<&ExternalBroker>,
+    ) -> Option<Route> {
         let by_websocket = match self.transport {
             MqttTransport::Auto => self.is_turned,
             MqttTransport::Tcp => false,
             MqttTransport::Websocket => true,
         };
-        if by_websocket && !is_external {
-            return Some(self.websocket.clone());
-        }
-        let tls = Some(self.tls.clone());
-        is_encrypted.then(|| Route { host: host.to_owned(), port, tls, websocket: None })
+        let tls = match external {
+            None if by_websocket => return Some(self.websocket.clone()),
+            _ if !is_encrypted => return None,
+            None => self.tls.clone(),
+            Some(broker) => Arc::new(Trust::by(broker.ca_pin).client_config(clock::for_certificates())),
+        };
+        Some(Route { host: host.to_owned(), port, tls: Some(tls), websocket: None })
     }
 
     /// No session came about.
@@ -61,7 +71,7 @@ impl Ways {
 
 #[cfg(test)]
 mod tests {
-    use task_transport::{Clock, Trust};
+    use task_transport::Clock;
 
     use super::*;
 
@@ -78,28 +88,35 @@ mod tests {
     #[test]
     fn what_fails_is_given_up_for_the_other() {
         let mut ways = ways("https://fleet.lab/tasks/", MqttTransport::Auto);
-        let direct = |ways: &Ways| shown(ways.next("fleet.lab", 8883, true, false));
+        let direct = |ways: &Ways| shown(ways.next("fleet.lab", 8883, true, None));
         let own_port = Some(("fleet.lab".to_owned(), 8883, None, true));
         let websocket = Some(("fleet.lab".to_owned(), 443, Some("/tasks/mqtt".to_owned()), true));
         assert_eq!(direct(&ways), own_port);
         ways.turn();
         assert_eq!(direct(&ways), websocket);
-        assert_eq!(shown(ways.next("broker.lab", 1883, false, true)), None, "an external broker has no such way");
+        let broker = ExternalBroker { password: "secret".to_owned(), ca_pin: None };
+        assert_eq!(
+            shown(ways.next("broker.lab", 1883, false, Some(&broker))),
+            None,
+            "an external broker has no such way"
+        );
+        let encrypted = Some(("broker.lab".to_owned(), 8883, None, true));
+        assert_eq!(shown(ways.next("broker.lab", 8883, true, Some(&broker))), encrypted);
         ways.turn();
         assert_eq!(direct(&ways), own_port);
         ways.turn();
         ways.begin_anew();
         assert_eq!(direct(&ways), own_port);
-        assert_eq!(shown(ways.next("fleet.lab", 1883, false, false)), None, "plain text is rumqttc's own affair");
+        assert_eq!(shown(ways.next("fleet.lab", 1883, false, None)), None, "plain text is rumqttc's own affair");
     }
 
     #[test]
     fn a_setting_leaves_no_choice() {
         let mut tcp = ways("http://10.0.0.7:8080", MqttTransport::Tcp);
         tcp.turn();
-        assert_eq!(shown(tcp.next("10.0.0.7", 1883, false, false)), None);
+        assert_eq!(shown(tcp.next("10.0.0.7", 1883, false, None)), None);
         let websocket = ways("http://10.0.0.7:8080", MqttTransport::Websocket);
         let way = Some(("10.0.0.7".to_owned(), 8080, Some("/mqtt".to_owned()), false));
-        assert_eq!(shown(websocket.next("10.0.0.7", 1883, false, false)), way);
+        assert_eq!(shown(websocket.next("10.0.0.7", 1883, false, None)), way);
     }
 }

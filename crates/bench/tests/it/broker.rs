@@ -8,10 +8,11 @@ use std::process::Command;
 use nix::sys::signal::Signal;
 use rumqttc::{AsyncClient, Event, EventLoop, MqttOptions, Packet, QoS};
 use serde_json::Value;
-use task_proto::RobotId;
 use task_proto::api::{LogsFrom, LogsView, ServerInfo};
 use task_proto::desired::Delivery;
 use task_proto::report::Phase;
+use task_proto::{CaPin, RobotId};
+use taskbench::encryption::Certificate;
 use tempfile::TempDir;
 use tokio::net::TcpStream;
 
@@ -25,6 +26,7 @@ struct Mosquitto {
     process: Option<Process>,
     dir: PathBuf,
     address: SocketAddr,
+    scheme: &'static str,
 }
 
 impl Mosquitto {
@@ -51,7 +53,21 @@ impl Mosquitto {
         for (name, text) in [("conf", conf.as_str()), ("acl", ""), ("passwd", "")] {
             std::fs::write(dir.join(name), text).expect("written");
         }
-        Self { process: None, dir, address }
+        Self { process: None, dir, address, scheme: "mqtt" }
+    }
+
+    /// Has it encrypt from its next start on; gives the pin of the authority behind its certificate.
+    fn encrypt(&mut self) -> CaPin {
+        let certificate = Certificate::new().expect("a certificate");
+        let (chain, key) = (self.dir.join("chain.pem"), self.dir.join("key.pem"));
+        let conf = self.dir.join("conf");
+        let mut text = std::fs::read_to_string(&conf).expect("written");
+        text.push_str(&format!("certfile {}\nkeyfile {}\n", chain.display(), key.display()));
+        for (path, text) in [(chain, certificate.chain), (key, certificate.key), (conf, text)] {
+            std::fs::write(path, text).expect("written");
+        }
+        self.scheme = "mqtts";
+        certificate.pin
     }
 
     async fn launch(&mut self) {
@@ -71,7 +87,7 @@ impl Mosquitto {
 
     /// What the server's setting says.
     fn url(&self) -> String {
-        format!("mqtt://taskd:{PASSWORD}@{}", self.address)
+        format!("{}://taskd:{PASSWORD}@{}", self.scheme, self.address)
     }
 
     /// What an operator does after robots were enrolled: new files, then SIGHUP.
@@ -214,6 +230,30 @@ async fn packages_travel_inside_mosquittos_messages_when_the_order_says_so() {
         let chosen = view.assignments.expect("asked for")[0].delivery.clone().expect("its batch has begun");
         assert_eq!(chosen.mechanism, delivery, "{chosen:?}");
     }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_encrypted_mosquitto_is_known_by_its_pin_on_both_sides() {
+    let dir = TempDir::new().expect("temp dir");
+    let mut mosquitto = Mosquitto::new(dir.path());
+    let pin = mosquitto.encrypt();
+    mosquitto.launch().await;
+    let wrong = CaPin::of(b"another authority").to_string();
+    let settings = [("TASKD_BROKER", mosquitto.url()), ("TASKD_BROKER_PIN", wrong)];
+    let settings = settings.each_ref().map(|(name, value)| (*name, value.as_str()));
+    let mut server = Server::start_unready(&dir.path().join("server"), &settings).await;
+    says(&server, "not the server whose certificate authority was pinned").await;
+    server.restart_with("TASKD_BROKER_PIN", Some(&pin.to_string())).await;
+    mosquitto.learn(&server).await;
+    server.wait_ready().await;
+    let _robot = Robot::start(&server, dir.path(), "robot-1", 1).await;
+    mosquitto.learn(&server).await;
+    wait_connected(&server, 1).await;
+    server.push(&worker(dir.path(), "1.0.0"), "*").await;
+    runs(&server, "robot-1", "1.0.0").await;
+    // Who trusts the system's roots alone does not trust this one.
+    server.restart_with("TASKD_BROKER_PIN", None).await;
+    says(&server, "no TLS with").await;
 }
 
 /// A client with a robot's own name and password at the broker.

@@ -4,6 +4,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
+use crate::pin::CaPin;
 use crate::topic::TopicPrefix;
 
 /// Where a robot's MQTT session goes: part of the answer to an enrolment, and `GET /robots/{robot}/mqtt` (that robot).
@@ -30,6 +31,9 @@ pub struct MqttEndpoint {
 pub struct ExternalBroker {
     /// The robot's password there, in the place of its token, which such a broker is never shown.
     pub password: String,
+    /// The authority behind the broker's certificate, if that is to be it alone and no root of the robot's system.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ca_pin: Option<CaPin>,
 }
 
 impl fmt::Debug for ExternalBroker {

@@ -351,14 +351,15 @@ fn documents_of_the_api() {
             mqtt: MqttEndpoint { host: None, port: 1883, prefix: TopicPrefix::default(), tls: true, external: None },
         },
     );
-    let external = Some(ExternalBroker { password: "…".to_owned() });
+    let external =
+        Some(ExternalBroker { password: "…".to_owned(), ca_pin: Some(task_proto::CaPin::of(b"authority")) });
     check(
         "mqtt_endpoint.json",
         &MqttEndpoint {
             host: Some("broker.lab".to_owned()),
             port: 1884,
             prefix: TopicPrefix::default(),
-            tls: false,
+            tls: true,
             external,
         },
     );

@@ -51,12 +51,19 @@ pub(super) const SETTINGS: &[Setting] = &[
     Setting {
         name: "broker",
         value_name: "URL",
-        help: "mqtt://USER:PASSWORD@HOST[:PORT] of a broker to use instead of the server's own; in the file or TASKD_BROKER \
+        help: "mqtt(s)://USER:PASSWORD@HOST[:PORT] of a broker to use instead of the server's own; in the file or TASKD_BROKER \
                only, since everybody on the machine can read this command line [default: embedded]",
         set: |config, text| {
             config.broker = if text == "embedded" { None } else { Some(parsed(text)?) };
             Ok(())
         },
+    },
+    Setting {
+        name: "broker-pin",
+        value_name: "PIN",
+        help: "SHA-256 of the public key of the authority behind the broker's certificate, which the server and robots \
+               then trust alone [default: the systems' roots vouch for it]",
+        set: |config, text| parsed(text).map(|pin| config.broker_pin = Some(pin)),
     },
     Setting {
         name: "database",

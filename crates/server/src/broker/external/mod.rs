@@ -14,13 +14,15 @@ use std::time::Duration;
 use bytes::Bytes;
 use task_proto::api::MqttTraffic;
 use task_proto::topic::{Topic, TopicPrefix};
-use task_proto::{Digest, RobotId};
+use task_proto::{CaPin, Digest, RobotId};
+use task_transport::{Route, Trust};
 use tokio::sync::{Notify, Semaphore, watch};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use super::{Health, Inbox, NotAsked, NotConnected, PartQos};
 use crate::broker_url::BrokerUrl;
+use crate::clock::Clock;
 pub(super) use crowd::Crowd;
 use outbox::{Letter, Outbox};
 use present::Present;
@@ -45,15 +47,26 @@ const GOOD_SESSION: Duration = Duration::from_secs(30);
 pub struct ExternalConfig {
     /// Where it is, with the server's user and password there.
     pub url: BrokerUrl,
+    /// The authority behind its certificate; absent: the system's roots vouch for it.
+    pub pin: Option<CaPin>,
     /// The MQTT client id; the broker ends an older session of the same id.
     pub client_id: String,
     /// What all topics start with.
     pub prefix: TopicPrefix,
 }
 
+impl ExternalConfig {
+    fn route(&self) -> Route {
+        let tls = Trust::by(self.pin).client_config(Clock::for_certificates());
+        Route { host: self.url.host.clone(), port: self.url.port, tls: Some(Arc::new(tls)), websocket: None }
+    }
+}
+
 /// The connection to the broker, for as long as the server runs.
 pub(super) struct External {
     config: ExternalConfig,
+    /// How it is reached, where that takes more than TCP.
+    route: Option<Route>,
     inbox: Arc<dyn Inbox>,
     outbox: Mutex<Outbox>,
     /// Something was put into the outbox.
@@ -77,6 +90,7 @@ impl External {
             config.url.address()
         )));
         let external = Arc::new(Self {
+            route: config.url.tls.then(|| config.route()),
             config,
             inbox,
             outbox: Mutex::default(),

@@ -2,16 +2,18 @@
 //! to know that the broker passes messages on, then takes in what robots say and publishes what waits.
 
 use std::collections::VecDeque;
+use std::error::Error;
 use std::net::SocketAddr;
 use std::time::Duration;
 
 use rumqttc::{
     AsyncClient, ConnectReturnCode, ConnectionError, Event, MqttOptions, Outgoing, Packet, Publish, QoS,
-    SubscribeFilter,
+    SubscribeFilter, Transport,
 };
 use task_proto::RobotId;
 use task_proto::report::Status;
 use task_proto::topic::{RobotTopic, Topic};
+use task_transport::{Line, LineError};
 use tokio::sync::{OwnedSemaphorePermit, mpsc, watch};
 use tokio::time::Instant;
 
@@ -23,7 +25,7 @@ use crate::broker_url::BrokerUrl;
 
 const KEEP_ALIVE: Duration = Duration::from_secs(20);
 /// How long connecting, and flushing, may take.
-const NETWORK_TIMEOUT_S: u64 = 10;
+const NETWORK_TIMEOUT: Duration = Duration::from_secs(10);
 /// How long the server's own message may take to come back.
 const CANARY_PATIENCE: Duration = Duration::from_secs(10);
 /// How long saying goodbye may take.
@@ -48,6 +50,8 @@ const HEADER_BYTES: usize = 7;
 pub(super) enum Ended {
     /// The broker does not accept the server.
     Refused(ConnectReturnCode),
+    /// There is no TLS with it.
+    Unreachable(LineError),
     /// The server's own message did not come back.
     Deaf,
     /// Anything else.
@@ -67,6 +71,7 @@ impl Ended {
                 format!("{broker} does not accept the user {} with the password in `broker`", url.user_name)
             }
             Self::Refused(code) => format!("{broker} refuses the server: {code:?}"),
+            Self::Unreachable(error) => format!("{broker} can't be reached: {}", with_causes(error)),
             Self::Deaf => {
                 format!("{broker} does not pass on what the server publishes: it needs the ACL of `taskd broker acl`")
             }
@@ -79,8 +84,16 @@ impl Ended {
 
 /// Runs one session to its end; `None`: the server stops.
 pub(super) async fn run(external: &External, health: &watch::Sender<Health>) -> Option<Ended> {
-    let (client, mut event_loop) = AsyncClient::new(options(external), QUEUED);
-    event_loop.network_options.set_connection_timeout(NETWORK_TIMEOUT_S).set_tcp_nodelay(true);
+    let line = tokio::select! {
+        line = Line::open(external.route.as_ref(), NETWORK_TIMEOUT) => line,
+        () = external.stop.cancelled() => return None,
+    };
+    let line = match line {
+        Ok(line) => line,
+        Err(error) => return Some(Ended::Unreachable(error)),
+    };
+    let (client, mut event_loop) = AsyncClient::new(options(external, &line), QUEUED);
+    event_loop.network_options.set_connection_timeout(NETWORK_TIMEOUT.as_secs()).set_tcp_nodelay(true);
     let (events_in, mut events) = mpsc::channel(QUEUED);
     // rumqttc's poll must not be dropped half way, so it runs in one future that lives as long as the session.
     let pump = async {
@@ -93,13 +106,16 @@ pub(super) async fn run(external: &External, health: &watch::Sender<Health>) -> 
             }
         }
     };
-    tokio::pin!(pump);
+    let carrying = line.carry();
+    tokio::pin!(pump, carrying);
     let mut session = Session::new(external, client);
-    let deadline = Instant::now() + Duration::from_secs(NETWORK_TIMEOUT_S) + CANARY_PATIENCE;
+    let deadline = Instant::now() + NETWORK_TIMEOUT + CANARY_PATIENCE;
     let ended = loop {
         tokio::select! {
             // Cancel-safe: the future is pinned outside of the loop and goes on where it was.
             ended = &mut pump => break Some(ended),
+            // Cancel-safe, likewise. It does not end before the session does.
+            () = &mut carrying => {}
             // Cancel-safe: an event stays in the channel until it is received.
             Some(event) = events.recv() => {
                 if session.take(event).await {
@@ -118,14 +134,33 @@ pub(super) async fn run(external: &External, health: &watch::Sender<Health>) -> 
     if ended.is_none() && session.client.try_disconnect().is_ok() {
         // It ends by itself once the broker has closed the connection.
         let goodbye = async { tokio::join!(&mut pump, async { while events.recv().await.is_some() {} }) };
+        let goodbye = async {
+            tokio::select! {
+                _ = goodbye => {}
+                () = &mut carrying => {}
+            }
+        };
         let _ = tokio::time::timeout(GOODBYE_PATIENCE, goodbye).await;
     }
     ended
 }
 
-fn options(external: &External) -> MqttOptions {
+/// The error with all that led to it, in one line.
+fn with_causes(error: &dyn Error) -> String {
+    let (mut text, mut cause) = (error.to_string(), error.source());
+    while let Some(error) = cause {
+        text.push_str(&format!(": {error}"));
+        cause = error.source();
+    }
+    text
+}
+
+fn options(external: &External, line: &Line) -> MqttOptions {
     let url = &external.config.url;
-    let mut options = MqttOptions::new(&external.config.client_id, &url.host, url.port);
+    let mut options = MqttOptions::new(&external.config.client_id, line.name().unwrap_or(&url.host), url.port);
+    if line.name().is_some() {
+        options.set_transport(Transport::Unix);
+    }
     options.set_credentials(&url.user_name, &url.password);
     options.set_clean_session(true);
     options.set_keep_alive(KEEP_ALIVE);

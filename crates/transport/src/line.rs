@@ -5,18 +5,19 @@
 use std::io;
 use std::time::Duration;
 
-use task_transport::{DialError, Duplex, Route, dial};
 use tokio::io::copy_bidirectional_with_sizes;
 use tokio::net::UnixListener;
 use tokio::time::timeout;
+
+use crate::dial::{DialError, Duplex, Route, dial};
 
 /// What is on its way, in each direction.
 const BUFFER_BYTES: usize = 64 * 1024;
 
 /// Why there is no line.
 #[derive(Debug, thiserror::Error)]
-pub(super) enum LineError {
-    /// The server can't be reached this way.
+pub enum LineError {
+    /// The other end can't be reached this way.
     #[error(transparent)]
     Dial(#[from] DialError),
     /// It did not answer in time.
@@ -34,31 +35,44 @@ pub(super) enum LineError {
     Local(#[source] io::Error),
 }
 
-/// A connection to the server, and the local socket by which rumqttc gets to it.
-pub(super) struct Line {
+/// What a session goes over: a connection that is open, or one that rumqttc makes itself.
+pub struct Line(Option<Lent>);
+
+/// A connection, and the local socket by which rumqttc gets to it.
+struct Lent {
     name: String,
     listener: UnixListener,
     far: Box<dyn Duplex>,
 }
 
 impl Line {
-    /// Opens the connection within `time`.
-    pub(super) async fn open(route: &Route, time: Duration) -> Result<Self, LineError> {
+    /// Opens the connection within `time`; none where rumqttc needs no help.
+    pub async fn open(route: Option<&Route>, time: Duration) -> Result<Self, LineError> {
+        let Some(route) = route else { return Ok(Self(None)) };
         let late = |_| LineError::Late { host: route.host.clone(), port: route.port, time };
         let far = timeout(time, dial(route)).await.map_err(late)??;
         // In the abstract namespace: there is no file that would have to be removed.
-        let name = format!("\0task-agent-{:032x}", rand::random::<u128>());
+        let name = format!("\0task-line-{:032x}", rand::random::<u128>());
         let listener = UnixListener::bind(&name).map_err(LineError::Local)?;
-        Ok(Self { name, listener, far })
+        Ok(Self(Some(Lent { name, listener, far })))
     }
 
-    /// What rumqttc connects to.
-    pub(super) fn name(&self) -> &str {
-        &self.name
+    /// The local socket that rumqttc is to connect to.
+    pub fn name(&self) -> Option<&str> {
+        self.0.as_ref().map(|lent| lent.name.as_str())
     }
 
-    /// Carries bytes both ways until either end is through.
-    pub(super) async fn carry(mut self) {
+    /// Carries bytes both ways until either end is through, which the session sees by itself; then it rests.
+    pub async fn carry(self) {
+        if let Self(Some(lent)) = self {
+            lent.carry().await;
+        }
+        std::future::pending().await
+    }
+}
+
+impl Lent {
+    async fn carry(mut self) {
         let own = i32::try_from(std::process::id()).ok();
         let mut near = loop {
             match self.listener.accept().await {

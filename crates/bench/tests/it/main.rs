@@ -18,6 +18,7 @@ mod restore;
 mod ros;
 mod ros1;
 mod scenarios;
+mod signing;
 mod talker;
 mod tidy;
 mod tls;

@@ -20,5 +20,6 @@ mod ros1;
 mod scenarios;
 mod signing;
 mod talker;
+mod theft;
 mod tidy;
 mod tls;

@@ -126,6 +126,7 @@ mod tests {
             issued_at_ms: NOW_MS,
             expires_at_ms: NOW_MS + 1,
             tasks: vec![task("a"), task("b")],
+            evidence: Default::default(),
         }
     }
 

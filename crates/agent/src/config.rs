@@ -8,11 +8,14 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 use task_proto::RobotName;
+use task_proto::envelope::PublicKey;
 use task_proto::id::Labels;
 use task_proto::log::LogLevel;
+use task_proto::publisher::{InvalidRole, Role};
 use toml::{Table, Value};
 
 use crate::durable;
+use crate::trust::TrustSettings;
 
 /// The file's name.
 pub const FILE_NAME: &str = "agent.toml";
@@ -73,6 +76,30 @@ pub struct Settings {
     /// Which log lines go to the server by themselves.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub logs: Option<LogSettings>,
+    /// Whose packages are run; absent: whatever the server orders.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub trusted_publishers: Option<PublisherSettings>,
+}
+
+/// The `[trusted_publishers]` table.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PublisherSettings {
+    /// Whose signatures a package needs, until a list of publishers says otherwise.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub keys: Option<Vec<PublicKey>>,
+    /// Of how many of them.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub threshold: Option<u32>,
+    /// Whose signatures the first list of publishers needs; absent: the same keys, and as many of them.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub keeper_keys: Option<Vec<PublicKey>>,
+    /// Of how many of them.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub keeper_threshold: Option<u32>,
+    /// Whether nothing is run before the robot has a list.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub require_list: Option<bool>,
 }
 
 /// The `[gate]` table.
@@ -217,6 +244,8 @@ pub struct Config {
     pub parallel_tasks: usize,
     /// Who is asked before a task is started, stopped or switched; nobody unless a program is named.
     pub gate: Option<GateConfig>,
+    /// Whose packages are run; `None`: whatever the server orders.
+    pub trust: Option<TrustSettings>,
 }
 
 /// A setting that can't be used.
@@ -307,6 +336,7 @@ impl Config {
             task_pids: limits.task_pids.unwrap_or(4096),
             limits,
             gate: settings.gate.map(gate).transpose()?,
+            trust: settings.trusted_publishers.map(trust).transpose()?,
             forward,
         };
         let bounds = [
@@ -349,6 +379,26 @@ fn gate(settings: GateSettings) -> Result<GateConfig, ConfigError> {
     Ok(GateConfig { command, timeout, default: settings.default.unwrap_or_default() })
 }
 
+fn trust(settings: PublisherSettings) -> Result<TrustSettings, ConfigError> {
+    let role = |key: &str, keys: Vec<PublicKey>, threshold: u32| {
+        let invalid = |error: InvalidRole| {
+            let key = if matches!(error, InvalidRole::Threshold { .. }) {
+                format!("{key}threshold")
+            } else {
+                format!("{key}keys")
+            };
+            ConfigError::Invalid { origin: format!("trusted_publishers.{key}"), reason: error.to_string() }
+        };
+        Role::new(keys, threshold).map_err(invalid)
+    };
+    let publishers = role("", settings.keys.unwrap_or_default(), settings.threshold.unwrap_or(1))?;
+    let keepers = match (settings.keeper_keys, settings.keeper_threshold) {
+        (None, None) => publishers.clone(),
+        (keys, threshold) => role("keeper_", keys.unwrap_or_default(), threshold.unwrap_or(1))?,
+    };
+    Ok(TrustSettings { publishers, keepers, requires_list: settings.require_list.unwrap_or(false) })
+}
+
 /// A server's URL as people write it.
 pub fn parse_server(text: &str) -> Result<reqwest::Url, ConfigError> {
     let fault = |reason: String| ConfigError::Invalid { origin: "server".to_owned(), reason };
@@ -365,6 +415,10 @@ fn override_by(table: &mut Table, name: &str, text: &str) -> Result<(), ConfigEr
     let value = match key.as_str() {
         "server" | "name" | "task_user" | "mqtt_transport" => Value::String(text.to_owned()),
         "gate_command" => Value::Array(vec![Value::String(text.to_owned())]),
+        "trusted_publishers_keys" | "trusted_publishers_keeper_keys" => {
+            let keys = text.split(',').map(str::trim).filter(|key| !key.is_empty());
+            Value::Array(keys.map(|key| Value::String(key.to_owned())).collect())
+        }
         "underlays" => {
             let paths = text.split(':').filter(|path| !path.is_empty());
             Value::Array(paths.map(|path| Value::String(path.to_owned())).collect())
@@ -378,8 +432,9 @@ fn override_by(table: &mut Table, name: &str, text: &str) -> Result<(), ConfigEr
         }
         _ => scalar(text),
     };
-    let nested =
-        ["limits", "logs", "gate"].iter().find_map(|outer| Some((*outer, key.strip_prefix(outer)?.strip_prefix('_')?)));
+    let nested = ["limits", "logs", "gate", "trusted_publishers"]
+        .iter()
+        .find_map(|outer| Some((*outer, key.strip_prefix(outer)?.strip_prefix('_')?)));
     match nested {
         Some((outer, inner)) => {
             if let Value::Table(table) = table.entry(outer).or_insert_with(|| Value::Table(Table::new())) {
@@ -418,6 +473,8 @@ fn invalid(origin: &str, error: &dyn std::fmt::Display) -> ConfigError {
 #[cfg(test)]
 mod tests {
     use std::os::unix::ffi::OsStringExt as _;
+
+    use task_proto::envelope::SigningKey;
 
     use super::*;
 
@@ -490,9 +547,37 @@ mod tests {
     }
 
     #[test]
+    fn publishers_are_keys_and_how_many_of_them_it_takes() {
+        assert_eq!(load("", &[]).expect("valid").trust, None);
+        let keys: Vec<String> =
+            [1, 2, 3].map(|seed| SigningKey::from_bytes([seed; 32]).public_key().to_string()).into();
+        let table = |rest: &str| format!("[trusted_publishers]\nkeys = {:?}\n{rest}", &keys[..2]);
+        let trust = load(&table("threshold = 2\n"), &[]).expect("valid").trust.expect("given");
+        assert_eq!((trust.publishers.keys().len(), trust.publishers.threshold()), (2, 2));
+        assert_eq!((trust.keepers, trust.requires_list), (trust.publishers, false));
+        let (joined, one) = (keys[..2].join(","), keys[2].as_str());
+        let variables = [
+            ("TASK_AGENT_TRUSTED_PUBLISHERS_KEYS", joined.as_str()),
+            ("TASK_AGENT_TRUSTED_PUBLISHERS_KEEPER_KEYS", one),
+            ("TASK_AGENT_TRUSTED_PUBLISHERS_REQUIRE_LIST", "true"),
+        ];
+        let trust = load("", &variables).expect("valid").trust.expect("given");
+        assert_eq!((trust.publishers.threshold(), trust.keepers.keys().len(), trust.requires_list), (1, 1, true));
+        let text = |file: &str| load(file, &[]).expect_err("refused").to_string();
+        assert!(text("[trusted_publishers]\n").starts_with("trusted_publishers.keys: 0 keys"));
+        assert!(text(&table("threshold = 3\n")).starts_with("trusted_publishers.threshold: a threshold of 3"));
+        assert!(text(&table("keeper_threshold = 1\n")).starts_with("trusted_publishers.keeper_keys: 0 keys"));
+        assert!(text("[trusted_publishers]\nkeys = [\"ssh-ed25519 AAAA\"]\n").contains("not an ed25519 public key"));
+        assert!(text(&table("treshold = 1\n")).contains("treshold"));
+    }
+
+    #[test]
     fn a_written_file_reads_back() {
         let dir = tempfile::tempdir().expect("a directory");
+        let publishers =
+            PublisherSettings { keys: Some(vec![SigningKey::from_bytes([1; 32]).public_key()]), ..Default::default() };
         let settings = Settings {
+            trusted_publishers: Some(publishers),
             server: Some("http://server:8080".to_owned()),
             name: Some("atlas".parse().expect("valid")),
             labels: Some([("site".parse().expect("valid"), "lab".parse().expect("valid"))].into()),

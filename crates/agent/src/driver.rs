@@ -24,7 +24,7 @@ use crate::effects::{Effects, Now, chain};
 use crate::fetch::Asks;
 use crate::ledger::{Ledger, TaskRecord};
 use crate::link::{Heard, Shared};
-use crate::observed::{Health, Prepared, ProcessState, RobotFacts};
+use crate::observed::{Health, Prepared, ProcessState, RobotFacts, TrustFacts, Vouched};
 use crate::plan::{self, Done, Lane, Next, Situation, Step, StepFailure};
 
 mod hearing;
@@ -42,7 +42,8 @@ const MAX_TURNS: u32 = 64;
 const MAX_SIGHTS: usize = 16;
 
 /// What is known of a disk that nobody has looked at.
-static NOTHING_PREPARED: Prepared = Prepared { manifest: None, content: false, built: false, versions: Vec::new() };
+static NOTHING_PREPARED: Prepared =
+    Prepared { manifest: None, content: false, built: false, versions: Vec::new(), vouched: Vouched::No };
 
 /// Who the driver speaks for.
 #[derive(Debug, Clone)]
@@ -131,6 +132,8 @@ pub struct Driver<E> {
     sights: mpsc::Sender<Seen>,
     seen: mpsc::Receiver<Seen>,
     robot: RobotFacts,
+    /// What was last gone by when it was looked who has signed the packages.
+    trust: TrustFacts,
     held: bool,
     /// Conditions by code; those that follow from other fields are not in it.
     conditions: BTreeMap<&'static str, String>,
@@ -181,6 +184,8 @@ impl<E: Effects> Driver<E> {
         let robot = RobotFacts { installations: None, ..effects.robot_facts() };
         let (sights, seen) = mpsc::channel(MAX_SIGHTS);
         let held = effects.is_held();
+        desired.iter().for_each(|state| effects.heed(state));
+        let trust = effects.trust_facts();
         Self {
             effects,
             speaker,
@@ -194,6 +199,7 @@ impl<E: Effects> Driver<E> {
             sights,
             seen,
             robot,
+            trust,
             held,
             conditions,
             withheld: None,
@@ -440,6 +446,11 @@ impl<E: Effects> Driver<E> {
     }
 
     fn tick(&mut self) {
+        let trust = self.effects.trust_facts();
+        if self.trust != trust {
+            self.trust = trust;
+            self.views.values_mut().for_each(|view| view.prepared = None);
+        }
         for view in self.views.values_mut() {
             let known = view.transfers.iter().map(|(lane, transfer)| (*lane, *transfer.borrow()));
             view.progress.extend(known.filter(|(_, progress)| progress.total > 0));

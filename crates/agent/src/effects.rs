@@ -4,7 +4,7 @@
 use std::future::Future;
 
 use bytes::Bytes;
-use task_proto::desired::{BlobRef, PackageRef};
+use task_proto::desired::{BlobRef, DesiredState, PackageRef};
 use task_proto::report::{HostFacts, Progress};
 use task_proto::{Digest, TaskName};
 use tokio::sync::watch;
@@ -12,7 +12,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::fetch::Asks;
 use crate::ledger::{ActiveRun, Collection, GateQuestion, Ledger, LedgerError, ProcessRecord};
-use crate::observed::{Health, Prepared, ProcessState, RobotFacts};
+use crate::observed::{Health, Prepared, ProcessState, RobotFacts, TrustFacts};
 use crate::plan::{Done, StepFailure};
 
 mod robot;
@@ -73,6 +73,19 @@ pub trait Effects: Send + Sync + 'static {
     /// lifecycle nodes to active and setting its parameters unless `process.ready` says that this was done. It goes on
     /// until the receiver is dropped. A package that promises nothing holds since its process was started.
     fn watch(&self, task: &TaskName, run: &ActiveRun) -> watch::Receiver<Health>;
+
+    /// Notes what a desired state says of who has signed what, and begins to get it.
+    fn heed(&self, state: &DesiredState);
+
+    /// What the robot goes by when it asks who has signed a package.
+    fn trust_facts(&self) -> TrustFacts;
+
+    /// Finds out whether enough of the trusted publishers have signed it, so that it may be begun.
+    fn check_signers(
+        &self,
+        package: &PackageRef,
+        cancel: &CancellationToken,
+    ) -> impl Future<Output = Result<(), StepFailure>> + Send;
 
     /// Deletes the gathered bytes of all contents but these.
     fn keep_parts(&self, wanted: &[Digest]);

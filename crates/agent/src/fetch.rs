@@ -21,10 +21,11 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::Duration;
 
 use bytes::Bytes;
-use task_proto::Digest;
+use http::header::CONNECTION;
 use task_proto::desired::{BlobRef, PackageRef};
 use task_proto::manifest::TaskManifest;
 use task_proto::report::Progress;
+use task_proto::{Digest, RepositoryName};
 use tokio::sync::{OwnedMutexGuard, mpsc, watch};
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
@@ -256,17 +257,38 @@ impl Fetcher {
             let reason = format!("it has {} bytes, at most {MAX_MANIFEST_BYTES} are allowed", package.config.size);
             return Err(FetchError::ManifestInvalid(reason));
         }
-        let mut download = self.download(package, package.config, 0).await?;
-        let mut bytes = Vec::with_capacity(package.config.size as usize);
+        self.pull_whole(&RepositoryName::of_package(&package.name), package.config).await
+    }
+
+    /// A blob that is held in memory, of at most `most` bytes: one that came with the order, or pulled.
+    pub async fn small(
+        &self,
+        repository: &RepositoryName,
+        blob: BlobRef,
+        most: u64,
+        cancel: &CancellationToken,
+    ) -> Result<Vec<u8>, FetchError> {
+        if blob.size > most {
+            return Err(FetchError::TooLarge { digest: blob.digest, size: blob.size, most });
+        }
+        if let Some(bytes) = self.offered.get(&blob) {
+            return Ok(bytes.into());
+        }
+        let pulled = cancel.run_until_cancelled(self.pull_whole(repository, blob)).await;
+        pulled.ok_or(FetchError::Cancelled)?
+    }
+
+    async fn pull_whole(&self, repository: &RepositoryName, blob: BlobRef) -> Result<Vec<u8>, FetchError> {
+        let request = self.request(repository, blob)?;
+        let mut download = Download::start(request, repository, blob, 0, self.settings.stall_timeout).await?;
+        let mut bytes = Vec::with_capacity(blob.size as usize);
         while let Some(chunk) = download.next().await? {
             bytes.extend_from_slice(&chunk);
         }
         let found = Digest::of(&bytes);
-        if found != package.config.digest {
-            return Err(FetchError::DigestMismatch {
-                digest: package.config.digest,
-                reason: format!("they hash to {found}"),
-            });
+        if found != blob.digest {
+            let reason = format!("they hash to {found}");
+            return Err(FetchError::DigestMismatch { digest: blob.digest, reason });
         }
         Ok(bytes)
     }
@@ -293,7 +315,7 @@ impl Fetcher {
         } else if let Some(bytes) = self.offered.get(&package.content) {
             Source::Offered(bytes.slice(offset as usize..))
         } else {
-            let answer = cancel.run_until_cancelled(self.download(package, package.content, offset)).await;
+            let answer = cancel.run_until_cancelled(self.download_content(package, offset)).await;
             Source::Download(Box::new(answer.ok_or(FetchError::Cancelled)??))
         };
         // Ends the blocking half even if this future is dropped while it replays.
@@ -342,7 +364,7 @@ impl Fetcher {
             // A server that restarts cuts a whole fleet off at once.
             let longest = self.settings.reconnect_wait * reconnects;
             tokio::time::sleep(longest.mul_f64(rand::random())).await;
-            let ended = match self.download(package, package.content, position).await {
+            let ended = match self.download_content(package, position).await {
                 Ok(mut download) => {
                     let ended = self.pass_on(&mut download, &sender).await;
                     position = download.position();
@@ -369,16 +391,23 @@ impl Fetcher {
         ended
     }
 
-    async fn download(&self, package: &PackageRef, blob: BlobRef, offset: u64) -> Result<Download, FetchError> {
+    async fn download_content(&self, package: &PackageRef, offset: u64) -> Result<Download, FetchError> {
+        let repository = RepositoryName::of_package(&package.name);
+        // Nothing is asked for after it.
+        let request = self.request(&repository, package.content)?.header(CONNECTION, "close");
+        Download::start(request, &repository, package.content, offset, self.settings.stall_timeout).await
+    }
+
+    fn request(&self, repository: &RepositoryName, blob: BlobRef) -> Result<reqwest::RequestBuilder, FetchError> {
         let mut url = self.server.clone();
         match url.path_segments_mut() {
             Ok(mut path) => {
-                path.pop_if_empty().extend(["v2", package.name.as_str(), "blobs", &blob.digest.to_string()]);
+                path.pop_if_empty().push("v2").extend(repository.as_str().split('/'));
+                path.extend(["blobs", &blob.digest.to_string()]);
             }
             Err(()) => return Err(FetchError::NotTheServer(format!("{} is not an HTTP address", self.server))),
         }
-        let request = self.client.get(url).bearer_auth(self.token.current());
-        Download::start(request, package, blob, offset, self.settings.stall_timeout).await
+        Ok(self.client.get(url).bearer_auth(self.token.current()))
     }
 
     fn src(&self, package: &PackageRef) -> PathBuf {

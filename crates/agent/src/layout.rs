@@ -3,6 +3,7 @@
 //! ```text
 //! identity.json                     who this robot is (0600)
 //! ledger.json                       what the agent was doing
+//! publishers.json                   the list of publishers it goes by, if it was shown one
 //! blobs/sha256/<hex>.part           bytes of a package's content that have arrived so far
 //! blobs/sha256/<hex>.parts          the same where they come as parts in any order: a file with holes
 //! blobs/sha256/<hex>.parts-note     which of its parts are on the disk
@@ -14,6 +15,7 @@
 //! tasks/<name>/logs/                the task's and the build's output, and what its nodes say on ROS topics
 //! tasks/<name>/home/                the task's home directory, where it runs as a user of its own
 //! tasks/<name>/uploads.json         which uploads of its files are under way
+//! tasks/<name>/<hex>.signatures     what publishers have signed about a version, out of the task's reach
 //! tasks/<name>/<hex>/               one version, by the digest of its OCI manifest
 //!   task.json                       the task manifest, byte for byte as it was pulled
 //!   src/  build/  install/  run.sh
@@ -32,6 +34,8 @@ use crate::durable;
 /// What a directory is called while it is being removed; no task or version can have such a name. Were it removed in
 /// place, a power cut would leave half a tree where a whole one is expected.
 const REMOVED: &str = ".removed-";
+/// What follows a version's name in that of the file with its signatures.
+const SIGNATURES: &str = ".signatures";
 
 /// The agent's data directory.
 #[derive(Debug, Clone)]
@@ -70,6 +74,11 @@ impl DataDir {
     /// What the agent was doing.
     pub fn ledger(&self) -> PathBuf {
         self.root.join("ledger.json")
+    }
+
+    /// The list of publishers the agent goes by.
+    pub fn publishers(&self) -> PathBuf {
+        self.root.join("publishers.json")
     }
 
     /// Where a blob's bytes gather while they are being pulled.
@@ -191,6 +200,11 @@ impl TaskDir {
         VersionDir { root: self.root.join(manifest.hex()) }
     }
 
+    /// What publishers have signed about that version.
+    pub fn signatures(&self, manifest: &Digest) -> PathBuf {
+        self.root.join(format!("{}{SIGNATURES}", manifest.hex()))
+    }
+
     /// The version that `current` points to.
     pub fn current(&self) -> Option<Digest> {
         digest_of(&fs::read_link(self.current_link()).ok()?)
@@ -212,6 +226,13 @@ impl TaskDir {
         for digest in self.versions()? {
             if !kept.contains(&digest) && current != Some(digest) {
                 remove_whole(self.version(&digest).root())?;
+            }
+        }
+        for path in entries(&self.root)? {
+            let version = file_name(&path).and_then(|name| name.strip_suffix(SIGNATURES)).map(Path::new);
+            let version = version.and_then(digest_of);
+            if version.is_some_and(|digest| !kept.contains(&digest) && current != Some(digest)) {
+                durable::remove_file(&path)?;
             }
         }
         Ok(())
@@ -304,6 +325,7 @@ mod tests {
         let [old, previous, current] = [b"1", b"2", b"3"].map(|bytes| Digest::of(bytes));
         for digest in [old, previous, current] {
             durable::create_dir_all(&task.version(&digest).src()).unwrap();
+            fs::write(task.signatures(&digest), "[]").unwrap();
         }
         assert_eq!(task.current(), None);
         task.set_current(&old).unwrap();
@@ -312,6 +334,7 @@ mod tests {
         let mut left = vec![previous, current];
         left.sort();
         assert_eq!((task.current(), task.versions().unwrap()), (Some(current), left));
+        assert_eq!([old, previous, current].map(|digest| task.signatures(&digest).exists()), [false, true, true]);
         assert_eq!(data.task_names().unwrap(), ["talker".parse().unwrap()]);
         task.remove().unwrap();
         assert_eq!(data.task_names().unwrap(), []);

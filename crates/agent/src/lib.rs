@@ -47,6 +47,8 @@ pub mod shim;
 pub mod supervisor;
 pub mod survey;
 pub mod task_user;
+pub mod trust;
 pub mod underlay;
 pub mod unpack;
+pub mod vouching;
 pub mod watcher;

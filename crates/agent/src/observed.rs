@@ -23,6 +23,29 @@ pub struct Prepared {
     pub built: bool,
     /// Every version of the task that has a directory.
     pub versions: Vec<Digest>,
+    /// Whether this robot may run it, as far as is known of who has signed it.
+    pub vouched: Vouched,
+}
+
+/// What the signatures that are on the disk say.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Vouched {
+    /// Nothing, or not enough.
+    #[default]
+    No,
+    /// It may go on running; new work needs a newer list of publishers.
+    Stale,
+    /// It may run. So may everything on a robot that trusts its server alone.
+    Yes,
+}
+
+/// What a robot goes by when it asks who has signed a package.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct TrustFacts {
+    /// Another number whenever a package may be judged otherwise than before.
+    pub epoch: u64,
+    /// Why the newest list of publishers that it was shown does not count, if it does not.
+    pub refused_list: Option<String>,
 }
 
 /// What became of a process that the ledger knows.

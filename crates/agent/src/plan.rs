@@ -31,7 +31,7 @@ use task_proto::report::{Failure, FailureCode, Phase};
 use task_proto::{Digest, TaskName};
 
 use crate::ledger::{ActiveRun, Collection, GateQuestion, ProcessRecord, RunRules, TaskRecord};
-use crate::observed::{Health, Prepared, ProcessState, RobotFacts};
+use crate::observed::{Health, Prepared, ProcessState, RobotFacts, Vouched};
 use gate::Verdict;
 
 mod alive;
@@ -99,6 +99,8 @@ pub enum Next {
 /// One thing to be done about a task.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Step {
+    /// Find out whether enough of the trusted publishers have signed it.
+    CheckSigners(PackageRef),
     /// Pull the manifest.
     PullManifest(PackageRef),
     /// Look at what ROS there is, to tell whether the version can run here.
@@ -151,7 +153,11 @@ impl Step {
     /// The lane it runs in.
     pub fn lane(&self) -> Lane {
         match self {
-            Self::PullManifest(_) | Self::LookForRos(_) | Self::PullContent { .. } | Self::Build(_) => Lane::Prepare,
+            Self::CheckSigners(_)
+            | Self::PullManifest(_)
+            | Self::LookForRos(_)
+            | Self::PullContent { .. }
+            | Self::Build(_) => Lane::Prepare,
             Self::Start(_) | Self::Stop(_) | Self::Prune { .. } | Self::Remove => Lane::Run,
             Self::Ask(_) => Lane::Gate,
             Self::Collect(_) => Lane::Collect,
@@ -163,7 +169,7 @@ impl Step {
     pub fn deadline(&self) -> Option<Duration> {
         let seconds = match self {
             Self::PullContent { .. } | Self::Build(_) | Self::Collect(_) => return None,
-            Self::PullManifest(_) | Self::LookForRos(_) | Self::Start(_) => STEP_DEADLINE_S,
+            Self::CheckSigners(_) | Self::PullManifest(_) | Self::LookForRos(_) | Self::Start(_) => STEP_DEADLINE_S,
             // Its own, shorter limit is a setting.
             Self::Ask(_) => STEP_DEADLINE_S + crate::config::MAX_GATE_TIMEOUT_S,
             Self::Stop(run) => STEP_DEADLINE_S + 2 * u64::from(run.rules.stop_timeout_s),
@@ -184,7 +190,10 @@ impl Step {
             Self::Ask(question) => {
                 record.and_then(|record| record.gate.as_ref()).is_some_and(|gate| gate.question == *question)
             }
-            Self::PullManifest(package) | Self::LookForRos(package) | Self::Build(package) => {
+            Self::CheckSigners(package)
+            | Self::PullManifest(package)
+            | Self::LookForRos(package)
+            | Self::Build(package) => {
                 desired.is_some_and(|task| task.wanted == Wanted::Running && task.package == *package)
             }
             Self::PullContent { package, is_pushed } => desired.is_some_and(|task| {
@@ -253,6 +262,10 @@ pub fn prepare(s: &Situation<'_>) -> Next {
     if s.now_ms < preparation.retry_at_ms {
         return Next::Rest { until_ms: Some(preparation.retry_at_ms) };
     }
+    // Before anything of it is fetched, and again whenever it turns out that the signatures are not enough any more.
+    if s.prepared.vouched != Vouched::Yes {
+        return Next::Act(Step::CheckSigners(order.package.clone()));
+    }
     let Some(manifest) = &s.prepared.manifest else { return Next::Act(Step::PullManifest(order.package.clone())) };
     if s.robot.labels.is_none() && !manifest.requires.labels.is_empty() {
         return NOTHING;
@@ -294,6 +307,7 @@ fn takes_over(s: &Situation<'_>) -> bool {
         && s.record.preparation.phase == Phase::Staged
         && s.prepared.content
         && s.prepared.built
+        && s.prepared.vouched == Vouched::Yes
         && s.record.end_of_order().is_none()
         && !s.held
         && s.may_begin
@@ -371,6 +385,7 @@ pub fn run_dir_name(run: &ActiveRun, start: u64, starts: u64) -> String {
 /// The line that names a step in the log.
 pub fn describe(task: &TaskName, step: &Step) -> String {
     match step {
+        Step::CheckSigners(package) => format!("look who has signed {task} {}", package.version),
         Step::PullManifest(package) => format!("pull the manifest of {task} {}", package.version),
         Step::LookForRos(package) => format!("look for the ROS that {task} {} needs", package.version),
         Step::PullContent { package, is_pushed: false } => format!("pull {task} {}", package.version),

@@ -29,6 +29,49 @@ pub struct DesiredState {
     pub expires_at_ms: u64,
     /// The tasks, at most one of a name, sorted by name.
     pub tasks: Vec<DesiredTask>,
+    /// Where a robot that asks whether it may run them finds what publishers have signed. It is no part of what is
+    /// desired: it may change without the generation.
+    #[serde(default, skip_serializing_if = "Evidence::is_empty")]
+    pub evidence: Evidence,
+}
+
+/// Blobs that publishers have signed, see [`crate::publisher`]. That the server names them proves nothing.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Evidence {
+    /// Lists of publishers: those by which their keepers changed, and the newest, the oldest first.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub lists: Vec<BlobRef>,
+    /// Signatures of the packages named in the state.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub signatures: Vec<SignatureRef>,
+}
+
+/// An envelope in which somebody says that a package may be run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SignatureRef {
+    /// The package, by its OCI manifest.
+    pub manifest: Digest,
+    /// The envelope's bytes.
+    pub envelope: BlobRef,
+}
+
+impl Evidence {
+    /// Whether there is none.
+    pub fn is_empty(&self) -> bool {
+        self.lists.is_empty() && self.signatures.is_empty()
+    }
+
+    /// The envelopes about one package.
+    pub fn signatures_of(&self, package: &PackageRef) -> Vec<BlobRef> {
+        let same = |signature: &&SignatureRef| signature.manifest == package.manifest.digest;
+        self.signatures.iter().filter(same).map(|signature| signature.envelope).collect()
+    }
+
+    /// All of its blobs.
+    pub fn blobs(&self) -> impl Iterator<Item = BlobRef> {
+        self.lists.iter().copied().chain(self.signatures.iter().map(|signature| signature.envelope))
+    }
 }
 
 /// One task as it should be on the robot.
@@ -78,6 +121,13 @@ pub struct BlobRef {
     pub digest: Digest,
     /// How many they are.
     pub size: u64,
+}
+
+impl BlobRef {
+    /// That of these bytes.
+    pub fn of(bytes: &[u8]) -> Self {
+        Self { digest: Digest::of(bytes), size: bytes.len() as u64 }
+    }
 }
 
 /// Whether a task should be running.

@@ -1,7 +1,9 @@
-//! DSSE envelopes (Dead Simple Signing Envelope, protocol v1.0.2) over ed25519: how a desired state is signed.
-//! An envelope's payload is only ever reached through [`Envelope::open`], which verifies first.
+//! DSSE envelopes (Dead Simple Signing Envelope, protocol v1.0.2) over ed25519: how desired states, packages and lists of
+//! publishers are signed. Whoever is to believe a payload reaches it through [`Envelope::open`] or [`Envelope::signers`],
+//! which verify first.
 
 use std::fmt;
+use std::str::FromStr;
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
@@ -46,6 +48,9 @@ pub enum EnvelopeError {
     /// No signature is by the pinned key.
     #[error("no valid signature by key {0}")]
     NotSigned(String),
+    /// Nobody would look at one more.
+    #[error("it has {MAX_SIGNATURES} signatures already")]
+    TooManySignatures,
 }
 
 impl Envelope {
@@ -59,21 +64,72 @@ impl Envelope {
         }
     }
 
+    /// A payload that nobody has signed yet.
+    pub fn unsigned(payload_type: &'static str, payload: &[u8]) -> Self {
+        Self { payload: STANDARD.encode(payload), payload_type: payload_type.to_owned(), signatures: Vec::new() }
+    }
+
+    /// Adds a signature of the same payload by another key; one that has signed already stays once.
+    pub fn sign_also(&mut self, expected: &'static str, key: &SigningKey) -> Result<(), EnvelopeError> {
+        let payload = self.unverified_payload(expected)?;
+        if self.has_signed(&pre_authentication_encoding(expected, &payload), &key.public_key()) {
+            return Ok(());
+        }
+        if self.signatures.len() >= MAX_SIGNATURES {
+            return Err(EnvelopeError::TooManySignatures);
+        }
+        self.signatures.extend(Self::seal(expected, &payload, key).signatures);
+        Ok(())
+    }
+
     /// The payload, once a signature by `key` has been verified. Key ids are hints only and are not trusted.
     pub fn open(&self, expected: &'static str, key: &PublicKey) -> Result<Vec<u8>, EnvelopeError> {
+        let payload = self.unverified_payload(expected)?;
+        let signed = self.has_signed(&pre_authentication_encoding(expected, &payload), key);
+        if signed { Ok(payload) } else { Err(EnvelopeError::NotSigned(key.id())) }
+    }
+
+    /// The payload, and which of `keys` have signed it, in their order and each once: perhaps none.
+    pub fn signers<'a>(
+        &self,
+        expected: &'static str,
+        keys: &'a [PublicKey],
+    ) -> Result<(Vec<u8>, Vec<&'a PublicKey>), EnvelopeError> {
+        let payload = self.unverified_payload(expected)?;
+        let message = pre_authentication_encoding(expected, &payload);
+        let mut signers: Vec<&PublicKey> = Vec::new();
+        for key in keys {
+            if !signers.contains(&key) && self.has_signed(&message, key) {
+                signers.push(key);
+            }
+        }
+        Ok((payload, signers))
+    }
+
+    /// The payload as somebody sent it, for whoever shows it, signs it or only passes it on. It proves nothing.
+    pub fn unverified_payload(&self, expected: &'static str) -> Result<Vec<u8>, EnvelopeError> {
         if self.payload_type != expected {
             return Err(EnvelopeError::WrongType { found: self.payload_type.chars().take(80).collect(), expected });
         }
-        let payload = STANDARD.decode(&self.payload).map_err(|_| EnvelopeError::Encoding("payload"))?;
-        let message = pre_authentication_encoding(expected, &payload);
-        let signed = self.signatures.iter().take(MAX_SIGNATURES).any(|signature| {
+        STANDARD.decode(&self.payload).map_err(|_| EnvelopeError::Encoding("payload"))
+    }
+
+    /// What the signatures say of whose they are, not verified.
+    pub fn claimed_signers(&self) -> impl Iterator<Item = &str> {
+        self.signatures.iter().take(MAX_SIGNATURES).map(|signature| signature.keyid.as_str())
+    }
+
+    /// Whether one of the signatures is by `key`. One that names another key is not tried: a verification costs time.
+    fn has_signed(&self, message: &[u8], key: &PublicKey) -> bool {
+        let id = key.id();
+        let may_be = |signature: &&EnvelopeSignature| signature.keyid.is_empty() || signature.keyid == id;
+        self.signatures.iter().take(MAX_SIGNATURES).filter(may_be).any(|signature| {
             STANDARD
                 .decode(&signature.sig)
                 .ok()
                 .and_then(|sig| Signature::from_slice(&sig).ok())
-                .is_some_and(|sig| key.0.verify_strict(&message, &sig).is_ok())
-        });
-        if signed { Ok(payload) } else { Err(EnvelopeError::NotSigned(key.id())) }
+                .is_some_and(|sig| key.0.verify_strict(message, &sig).is_ok())
+        })
     }
 }
 
@@ -112,7 +168,7 @@ impl SigningKey {
     }
 }
 
-/// An ed25519 public key, in JSON as standard base64 of its 32 bytes.
+/// An ed25519 public key, as text standard base64 of its 32 bytes.
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct PublicKey(ed25519_dalek::VerifyingKey);
@@ -135,21 +191,34 @@ impl PublicKey {
 }
 
 /// A text that is not a public key.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("not an ed25519 public key: expected base64 of 32 bytes")]
 pub struct InvalidKey;
 
-impl TryFrom<String> for PublicKey {
-    type Error = InvalidKey;
-    fn try_from(text: String) -> Result<Self, InvalidKey> {
+impl FromStr for PublicKey {
+    type Err = InvalidKey;
+    fn from_str(text: &str) -> Result<Self, InvalidKey> {
         let bytes = STANDARD.decode(text).map_err(|_| InvalidKey)?;
         bytes.try_into().ok().and_then(Self::from_bytes).ok_or(InvalidKey)
     }
 }
 
+impl TryFrom<String> for PublicKey {
+    type Error = InvalidKey;
+    fn try_from(text: String) -> Result<Self, InvalidKey> {
+        text.parse()
+    }
+}
+
 impl From<PublicKey> for String {
     fn from(key: PublicKey) -> String {
-        STANDARD.encode(key.to_bytes())
+        key.to_string()
+    }
+}
+
+impl fmt::Display for PublicKey {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&STANDARD.encode(self.to_bytes()))
     }
 }
 
@@ -170,6 +239,25 @@ mod tests {
         assert_eq!(envelope.open(DESIRED_STATE_TYPE, &key.public_key()), Ok(b"{}".to_vec()));
         let stranger = SigningKey::from_bytes([8; 32]).public_key();
         assert_eq!(envelope.open(DESIRED_STATE_TYPE, &stranger), Err(EnvelopeError::NotSigned(stranger.id())));
+    }
+
+    #[test]
+    fn each_key_counts_once_and_only_if_it_signed() {
+        let [ada, bob, eve] = [1, 2, 3].map(|seed| SigningKey::from_bytes([seed; 32]));
+        let mut envelope = Envelope::seal(DESIRED_STATE_TYPE, b"{}", &ada);
+        for key in [&ada, &bob, &bob] {
+            envelope.sign_also(DESIRED_STATE_TYPE, key).expect("signed");
+        }
+        assert_eq!(envelope.signatures.len(), 2);
+        let keys = [&bob, &eve, &ada, &ada].map(SigningKey::public_key);
+        let (payload, signers) = envelope.signers(DESIRED_STATE_TYPE, &keys).expect("opens");
+        assert_eq!((payload, signers), (b"{}".to_vec(), vec![&keys[0], &keys[2]]));
+        // A key id is what its writer says: another's name on a signature makes it nobody's.
+        envelope.signatures[0].keyid = eve.public_key().id();
+        assert_eq!(envelope.signers(DESIRED_STATE_TYPE, &keys).expect("opens").1, [&keys[0]]);
+        envelope.signatures[0].keyid.clear();
+        assert_eq!(envelope.signers(DESIRED_STATE_TYPE, &keys).expect("opens").1, [&keys[0], &keys[2]]);
+        assert!(envelope.signers("text/plain", &keys).is_err());
     }
 
     #[test]

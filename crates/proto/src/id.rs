@@ -137,6 +137,13 @@ text_id!(
         t.len() <= 255 && t.split('/').all(is_repository_component)
     }
 );
+impl RepositoryName {
+    /// The repository of a package's manifests and blobs.
+    pub fn of_package(name: &TaskName) -> Self {
+        Self(name.as_str().to_owned())
+    }
+}
+
 text_id!(
     /// A file that came back from a task, by its path below the task's directory. It can't leave the directory it is
     /// written into.

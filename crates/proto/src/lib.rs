@@ -14,6 +14,7 @@ pub mod output;
 pub mod part;
 pub mod person;
 pub mod pin;
+pub mod publisher;
 pub mod report;
 pub mod request;
 pub mod ros;

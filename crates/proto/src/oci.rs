@@ -17,6 +17,12 @@ pub const PACKAGE_TYPE: &str = "application/vnd.taskd.package.v1";
 pub const CONFIG_TYPE: &str = "application/vnd.taskd.config.v1+json";
 /// Media type of a package's one layer.
 pub const CONTENT_TYPE: &str = "application/vnd.taskd.content.v1.tar+zstd";
+/// Media type of a config that says nothing: `{}`.
+pub const EMPTY_TYPE: &str = "application/vnd.oci.empty.v1+json";
+/// The bytes of such a config.
+pub const EMPTY: &[u8] = b"{}";
+/// Media type of a layer that is a [`crate::envelope::Envelope`].
+pub const ENVELOPE_TYPE: &str = "application/vnd.dsse.envelope.v1+json";
 
 /// An OCI content descriptor.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -90,6 +96,25 @@ impl ImageManifest {
             subject: None,
             annotations: BTreeMap::new(),
         }
+    }
+
+    /// The manifest of an artifact of type `artifact_type` that is a signed document, about `subject` or on its own.
+    pub fn signed_document(artifact_type: &str, envelope: BlobRef, subject: Option<BlobRef>) -> Self {
+        Self {
+            schema_version: 2,
+            media_type: Some(MANIFEST_TYPE.to_owned()),
+            artifact_type: Some(artifact_type.to_owned()),
+            config: Descriptor::new(EMPTY_TYPE, BlobRef::of(EMPTY)),
+            layers: vec![Descriptor::new(ENVELOPE_TYPE, envelope)],
+            subject: subject.map(|subject| Descriptor::new(MANIFEST_TYPE, subject)),
+            annotations: BTreeMap::new(),
+        }
+    }
+
+    /// The signed document that is all this artifact has.
+    pub fn lone_envelope(&self) -> Option<BlobRef> {
+        let [envelope] = &self.layers[..] else { return None };
+        (envelope.media_type == ENVELOPE_TYPE).then(|| envelope.blob())
     }
 
     /// The config and content blobs, if this is the manifest of a task package.

@@ -25,8 +25,8 @@ pub enum Permission {
     Publish,
     /// Change robots themselves: their names and labels, and whether they are there at all.
     Maintain,
-    /// What concerns everybody: people and their tokens, enrolment, the broker's files, the audit. Only ever for who is
-    /// limited to no robots.
+    /// What concerns everybody: people and their tokens, enrolment, the list of publishers, the broker's files, the audit.
+    /// Only ever for who is limited to no robots.
     Administer,
 }
 

@@ -83,6 +83,10 @@ pub struct HostFacts {
     /// What is left of its battery; absent where it has none that can be read.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub battery_percent: Option<u8>,
+    /// The version of the list of publishers whose signatures it asks for; 0: it goes by its own settings. Absent: it
+    /// runs whatever its server orders.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub publishers: Option<u64>,
 }
 
 /// How tasks on a robot meet ROS.
@@ -408,6 +412,10 @@ failure_codes! {
     IO_ERROR = "io_error";
     /// A person at the robot said `hold`.
     HELD = "held";
+    /// Too few of the publishers that the robot trusts have signed the package, or it was withdrawn.
+    UNTRUSTED_PACKAGE = "untrusted_package";
+    /// The robot's list of publishers is past its lifetime, or it has none and must have one.
+    PUBLISHERS_EXPIRED = "publishers_expired";
 }
 
 impl FailureCode {

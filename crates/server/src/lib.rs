@@ -20,6 +20,7 @@ pub mod downlink;
 pub mod fan_out;
 pub mod gatekeeper;
 pub mod http;
+pub mod key_file;
 pub mod mqtt_access;
 pub mod package;
 pub mod part_requests;

@@ -124,6 +124,13 @@ impl Presence {
         self.robots().get(robot).is_some_and(|sightings| sightings.instances.is_duplicate(now_ms))
     }
 
+    /// Its other tokens have ended, so that nobody else is let in by them any more.
+    pub fn ended_others(&self, robot: &RobotId) {
+        if let Some(sightings) = self.robots().get_mut(robot) {
+            sightings.instances = InstanceHistory::default();
+        }
+    }
+
     /// The robot was removed.
     pub fn forget(&self, robot: &RobotId) {
         self.robots().remove(robot);
@@ -309,6 +316,18 @@ mod tests {
         assert!(presence.is_online(&robot, 100_500));
         presence.forget(&robot);
         assert_eq!(presence.get(&robot, 100_000), None);
+    }
+
+    #[test]
+    fn a_duplicate_ends_when_only_one_is_let_in() {
+        let presence = Presence::new(1000);
+        let (robot, a, b) = (RobotId::random(), InstanceId::random(), InstanceId::random());
+        for instance in [&a, &b, &a, &b] {
+            presence.instance_seen(&robot, None, instance, 1);
+        }
+        assert!(presence.is_duplicate(&robot, 2));
+        presence.ended_others(&robot);
+        assert!(!presence.instance_seen(&robot, None, &InstanceId::random(), 2));
     }
 
     #[test]

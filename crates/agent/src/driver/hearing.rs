@@ -54,10 +54,12 @@ impl<E: Effects> Driver<E> {
             Ok(state) => {
                 self.conditions.remove("state_refused");
                 if !inline.is_empty() {
-                    let blobs = state.tasks.iter().flat_map(|task| [task.package.config, task.package.content]);
+                    let packages = state.tasks.iter().flat_map(|task| [task.package.config, task.package.content]);
+                    let blobs = packages.chain(state.evidence.blobs());
                     let came = blobs.filter_map(|blob| Some((blob, Bytes::copy_from_slice(inline.get(&blob)?))));
                     self.effects.offer(came.collect());
                 }
+                self.effects.heed(&state);
                 if self.desired.as_ref() != Some(&state) {
                     tracing::info!(generation = %state.generation, tasks = state.tasks.len(), "accepted a desired state");
                     self.ledger.accepted = Some(Accepted { generation: state.generation, envelope });

@@ -10,7 +10,7 @@ use super::{Driver, View};
 use crate::effects::Effects;
 use crate::ledger::{LostFiles, TaskRecord};
 use crate::link_meter;
-use crate::observed::{Health, ProcessState};
+use crate::observed::{Health, ProcessState, Vouched};
 use crate::plan::Lane;
 use crate::{admission, clock};
 
@@ -73,6 +73,9 @@ impl<E: Effects> Driver<E> {
             );
             conditions.push(condition("clock_wrong", &text));
         }
+        if let Some(text) = &self.trust.refused_list {
+            conditions.push(condition("publishers_refused", text));
+        }
         conditions.extend(self.withheld.clone());
         conditions
     }
@@ -114,9 +117,21 @@ fn degraded(record: &TaskRecord, view: Option<&View>) -> Option<Failure> {
                 |lost: &&LostFiles| lost.deployment == record.order.deployment && lost.run == record.order.run;
             let files = record.collections.iter().find_map(|files| files.failure.as_ref());
             let lost = record.lost.as_ref().filter(of_order).map(|lost| &lost.failure);
-            refusal.map(|(_, why)| why).or(files).or(lost).cloned()
+            let distrusted = distrusted(record, view).filter(|_| ready);
+            distrusted.or(refusal.map(|(_, why)| why).or(files).or(lost).cloned())
         }
     }
+}
+
+/// That what runs would not be started again.
+fn distrusted(record: &TaskRecord, view: Option<&View>) -> Option<Failure> {
+    let active = record.active.as_ref().filter(|active| active.package == record.order.package)?;
+    let vouched = view?.prepared.as_ref()?.vouched;
+    let text = format!(
+        "the trusted publishers' signatures are not enough for {} {} any more: it goes on, and is not started again",
+        active.package.name, active.package.version
+    );
+    (vouched == Vouched::No).then(|| Failure::new(FailureCode::UNTRUSTED_PACKAGE, text))
 }
 
 fn task_report(task: &TaskName, record: &TaskRecord, view: Option<&View>, now_ms: u64) -> TaskReport {

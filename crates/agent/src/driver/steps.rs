@@ -36,6 +36,7 @@ impl<E: Effects> Driver<E> {
             let done = |()| Done::Well;
             let work = async {
                 match &doing {
+                    Step::CheckSigners(package) => effects.check_signers(package, &stop).await.map(done),
                     Step::PullManifest(package) => effects.pull_manifest(package, &stop).await,
                     Step::LookForRos(_) => {
                         effects.look_for_ros().await;

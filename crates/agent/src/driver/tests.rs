@@ -74,6 +74,7 @@ impl Bench {
             issued_at_ms: now_ms,
             expires_at_ms: now_ms + 1_000_000,
             tasks,
+            evidence: Default::default(),
         };
         let payload = serde_json::to_vec(&state).expect("json");
         let envelope = Box::new(Envelope::seal(DESIRED_STATE_TYPE, &payload, key));
@@ -142,6 +143,31 @@ async fn a_robot_that_lacks_a_package_says_so_before_it_pulls_and_runs_it_once_i
     bench.fake.state(|state| state.ros_packages.extend(["nav2_bringup", "slam_toolbox"].map(str::to_owned)));
     bench.order(2, vec![order("1.0")]).await;
     bench.phase(Phase::Running).await;
+}
+
+#[tokio::test]
+async fn what_nobody_trusted_has_signed_fails_before_anything_is_pulled() {
+    let bench = Bench::new().await;
+    let (unsigned, signed) = (order("1.0"), order("2.0"));
+    bench.fake.state(|state| state.untrusted.insert(unsigned.package.manifest.digest));
+    bench.order(1, vec![unsigned.clone()]).await;
+    let report = bench.phase(Phase::Failed).await;
+    assert_eq!(report.tasks[0].failure.as_ref().expect("why").code, FailureCode::UNTRUSTED_PACKAGE);
+    bench.fake.state(|state| {
+        assert!(state.manifests.is_empty() && state.contents.is_empty() && state.started.is_empty());
+        assert_eq!((&state.heeded, &state.checked), (&vec![Generation(1)], &vec![unsigned.package.manifest.digest]));
+    });
+    bench.order(2, vec![signed.clone()]).await;
+    bench.phase(Phase::Running).await;
+    // Its publisher is revoked: it goes on, and the report says what that is worth.
+    bench.fake.state(|state| {
+        state.untrusted.insert(signed.package.manifest.digest);
+        state.trust = TrustFacts { epoch: 1, refused_list: Some("it is old".to_owned()) };
+    });
+    let report = bench.report(|report| report.tasks[0].degraded.is_some()).await;
+    assert_eq!(report.tasks[0].phase, Phase::Running);
+    assert_eq!(report.tasks[0].degraded.as_ref().expect("waited for").code, FailureCode::UNTRUSTED_PACKAGE);
+    assert!(has(&report, "publishers_refused"));
 }
 
 #[tokio::test]

@@ -4,20 +4,21 @@
 use std::collections::BTreeMap;
 use std::error::Error;
 use std::path::{Path, PathBuf};
-use std::sync::{PoisonError, RwLock};
+use std::sync::{Arc, PoisonError, RwLock};
 use std::time::Duration;
 
 use bytes::Bytes;
-use task_proto::desired::{BlobRef, PackageRef};
+use task_proto::desired::{BlobRef, DesiredState, PackageRef};
 use task_proto::manifest::{BuildTool, TaskManifest};
 use task_proto::report::{Failure, FailureCode, HostFacts, Isolation, Progress, RosFacts};
 use task_proto::{Digest, MacAddress, RobotId, TaskName};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
-use self::outcomes::{fetch_failure, finally, later, millis, outputs_code, pulled};
+pub(crate) use self::outcomes::chain;
+use self::outcomes::{build_failure, fetch_failure, finally, later, millis, outputs_code, pulled};
 use super::{Effects, Now};
-use crate::builder::{self, BuildError, BuildLimits, BuildOrder};
+use crate::builder::{self, BuildLimits, BuildOrder};
 use crate::cgroup::{Cgroups, RunLimits};
 use crate::config::Config;
 use crate::fetch::{self, Asks, Fetcher};
@@ -26,7 +27,7 @@ use crate::graph_access::GraphAccess;
 use crate::installation::Installation;
 use crate::layout::{DataDir, VersionDir};
 use crate::ledger::{ActiveRun, Collection, GateQuestion, Ledger, LedgerError, ProcessRecord};
-use crate::observed::{Exit, Health, Prepared, ProcessState, RobotFacts};
+use crate::observed::{Exit, Health, Prepared, ProcessState, RobotFacts, TrustFacts, Vouched};
 use crate::outputs::{self, OutputOrder, Registry};
 use crate::parts::Listening;
 use crate::plan::{Done, StepFailure};
@@ -35,12 +36,15 @@ use crate::readiness::Promise;
 use crate::run_dir::{LogSpec, RunSpec};
 use crate::supervisor::{Observed, Supervisor, SupervisorError};
 use crate::task_user::{TaskUser, TaskUserError};
+use crate::trust::{Trust, Use};
 use crate::underlay::{self, Places};
+use crate::vouching::Vouching;
 use crate::watcher::{Watched, Watcher};
 use crate::{battery, clock, disk, durable, environment, installation, launch, logs, script, survey};
 
 mod graph;
 mod outcomes;
+mod signers;
 
 /// Written into a version's directory once it is built.
 const BUILT_MARKER: &str = "built";
@@ -56,7 +60,9 @@ const TAIL_BYTES: u64 = 3072;
 /// This robot.
 pub struct Robot {
     data: DataDir,
-    fetcher: Fetcher,
+    fetcher: Arc<Fetcher>,
+    /// Who vouches for packages, where the robot asks for more than its server's word.
+    vouching: Option<Arc<Vouching>>,
     listening: Listening,
     gate: Option<Gate>,
     registry: Registry,
@@ -103,10 +109,16 @@ impl Robot {
         let cgroups = Cgroups::find();
         let graph = GraphAccess::of_robot(mac, data.clone(), config.limits.log_bytes);
         let environment = environment::of_this_robot(&settings);
+        let fetcher = Arc::new(fetcher);
+        let vouching = config.trust.clone().map(|settings| {
+            let trust = Trust::open(settings, data.publishers());
+            Arc::new(Vouching::new(trust, fetcher.clone(), data.clone()))
+        });
         let gate = config.gate.clone().map(|gate| Gate::new(gate, robot.clone(), environment.clone(), data.root()));
         Self {
             data,
             fetcher,
+            vouching,
             listening,
             gate,
             registry,
@@ -190,21 +202,6 @@ impl Robot {
     }
 }
 
-impl Robot {
-    /// A build that failed on a disk without room says little of the package: it is tried again.
-    fn build_failure(&self, error: BuildError) -> StepFailure {
-        let Some(code) = error.code() else { return later(FailureCode::BUILD_FAILED, &error, 0) };
-        match disk::room(self.data.root()) {
-            Ok(room) if room.is_used_up() => {
-                let text = format!("{} of {} bytes are free; {}", room.free, room.total, chain(&error));
-                let least_ms = millis(disk::FULL_PAUSE);
-                StepFailure { failure: Failure::new(FailureCode::DISK_FULL, text), retry_after_ms: Some(least_ms) }
-            }
-            _ => finally(code, &error),
-        }
-    }
-}
-
 impl Effects for Robot {
     fn now(&self) -> Now {
         Now { boot_ms: clock::boot_ms(), wall_ms: clock::wall_ms() }
@@ -252,6 +249,7 @@ impl Effects for Robot {
             ros: environment::ros_facts(&installations, &self.environment),
             battery_percent: battery::percent(Path::new(battery::SUPPLIES)),
             isolation: if isolates { Isolation::Cgroup } else { Isolation::None },
+            publishers: self.vouching.as_ref().map(|vouching| vouching.version()),
         }
     }
 
@@ -290,6 +288,7 @@ impl Effects for Robot {
             built: content && (!needs_build || version.root().join(BUILT_MARKER).exists()),
             manifest,
             versions: task.versions().unwrap_or_default(),
+            vouched: self.vouching.as_ref().map_or(Vouched::Yes, |vouching| vouching.look(package)),
         }
     }
 
@@ -327,6 +326,18 @@ impl Effects for Robot {
         self.watcher.watch(watched.unwrap_or_default(), self.promise(&run.package), self.ros_facts())
     }
 
+    fn heed(&self, state: &DesiredState) {
+        self.vouching.iter().for_each(|vouching| vouching.heed(state));
+    }
+
+    fn trust_facts(&self) -> TrustFacts {
+        self.vouching.as_ref().map(|vouching| vouching.facts()).unwrap_or_default()
+    }
+
+    async fn check_signers(&self, package: &PackageRef, cancel: &CancellationToken) -> Result<(), StepFailure> {
+        self.vouched(package, Use::Begin, cancel).await
+    }
+
     fn keep_parts(&self, wanted: &[Digest]) {
         if let Err(error) = self.data.clean_parts(wanted) {
             tracing::warn!(%error, "bytes of packages that are no longer ordered can't be removed");
@@ -334,6 +345,7 @@ impl Effects for Robot {
     }
 
     async fn pull_manifest(&self, package: &PackageRef, cancel: &CancellationToken) -> Result<Done, StepFailure> {
+        self.still_vouched(package)?;
         pulled(self.fetcher.manifest(package, cancel).await.map(drop))
     }
 
@@ -347,6 +359,7 @@ impl Effects for Robot {
         progress: &watch::Sender<Progress>,
         cancel: &CancellationToken,
     ) -> Result<Done, StepFailure> {
+        self.still_vouched(package)?;
         let manifest = match self.fetcher.manifest(package, cancel).await {
             Ok(manifest) => manifest,
             Err(error) => return pulled(Err(error)),
@@ -361,6 +374,7 @@ impl Effects for Robot {
         asks: &watch::Sender<Asks>,
         cancel: &CancellationToken,
     ) -> Result<Done, StepFailure> {
+        self.still_vouched(package)?;
         let manifest = match self.fetcher.manifest(package, cancel).await {
             Ok(manifest) => manifest,
             Err(error) => return pulled(Err(error)),
@@ -370,6 +384,7 @@ impl Effects for Robot {
     }
 
     async fn build(&self, package: &PackageRef, cancel: &CancellationToken) -> Result<(), StepFailure> {
+        self.still_vouched(package)?;
         let manifest = self.manifest(package).await?;
         let version = self.version(package);
         let (user, environment) = self.account(&package.name)?;
@@ -383,7 +398,7 @@ impl Effects for Robot {
             user,
             cgroups: self.cgroups.clone(),
         };
-        builder::build(&order, cancel).await.map_err(|error| self.build_failure(error))?;
+        builder::build(&order, cancel).await.map_err(|error| build_failure(error, self.data.root()))?;
         let marker = version.root().join(BUILT_MARKER);
         durable::write(&marker, b"", 0o600).map_err(|error| finally(FailureCode::IO_ERROR, &error))
     }
@@ -398,6 +413,7 @@ impl Effects for Robot {
         let Some(process) = &run.process else {
             return Err(failed(&std::io::Error::other("the ledger names no process to start")));
         };
+        self.vouched(&run.package, Use::GoOn, &CancellationToken::new()).await?;
         let manifest = self.manifest(&run.package).await?;
         let version = self.version(&run.package);
         let text = script::run_script(&manifest, &version, &self.setup_files(&manifest)?);
@@ -521,16 +537,4 @@ fn other_runs(runs: &Path, kept: Option<&Path>) -> Vec<PathBuf> {
 async fn on_disk(work: impl FnOnce() -> std::io::Result<()> + Send + 'static) -> Result<(), StepFailure> {
     let done = tokio::task::spawn_blocking(work).await.map_err(std::io::Error::other);
     done.flatten().map_err(|error| later(FailureCode::IO_ERROR, &error, 0))
-}
-
-/// An error with all its causes.
-pub(crate) fn chain(error: &dyn Error) -> String {
-    let mut text = error.to_string();
-    let mut cause = error.source();
-    while let Some(error) = cause {
-        text.push_str(": ");
-        text.push_str(&error.to_string());
-        cause = error.source();
-    }
-    text
 }

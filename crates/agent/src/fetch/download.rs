@@ -7,9 +7,10 @@
 use std::time::Duration;
 
 use bytes::Bytes;
-use http::header::{CONNECTION, CONTENT_RANGE, CONTENT_TYPE, ETAG, RANGE, RETRY_AFTER};
+use http::header::{CONTENT_RANGE, CONTENT_TYPE, ETAG, RANGE, RETRY_AFTER};
 use http::{HeaderMap, HeaderName, StatusCode};
-use task_proto::desired::{BlobRef, PackageRef};
+use task_proto::RepositoryName;
+use task_proto::desired::BlobRef;
 use tokio::sync::mpsc;
 use tokio::time::Instant;
 
@@ -45,23 +46,19 @@ impl Download {
     /// Asks for `blob` from `offset` on, which is less than its size unless both are 0.
     pub(super) async fn start(
         request: reqwest::RequestBuilder,
-        package: &PackageRef,
+        repository: &RepositoryName,
         blob: BlobRef,
         offset: u64,
         stall_timeout: Duration,
     ) -> Result<Self, FetchError> {
         let mut request = request.timeout(REQUEST_TIMEOUT);
-        if blob.digest == package.content.digest {
-            // Nothing is asked for after it.
-            request = request.header(CONNECTION, "close");
-        }
         if offset > 0 {
             request = request.header(RANGE, format!("bytes={offset}-"));
         }
         let asked_at = Instant::now();
         let answer = tokio::time::timeout(stall_timeout, request.send()).await;
         let response = answer.map_err(|_| FetchError::Stalled(stall_timeout))?.map_err(FetchError::Unreachable)?;
-        let skip = judge(&response, package, blob, offset)?;
+        let skip = judge(&response, repository, blob, offset)?;
         Ok(Self {
             response,
             size: blob.size,
@@ -123,7 +120,12 @@ impl Download {
 }
 
 /// How many bytes of the answer to skip, if it is one to read at all.
-fn judge(response: &reqwest::Response, package: &PackageRef, blob: BlobRef, offset: u64) -> Result<u64, FetchError> {
+fn judge(
+    response: &reqwest::Response,
+    repository: &RepositoryName,
+    blob: BlobRef,
+    offset: u64,
+) -> Result<u64, FetchError> {
     let (status, headers) = (response.status(), response.headers());
     // A captive portal may answer with any status.
     if header(headers, &CONTENT_TYPE)
@@ -146,8 +148,8 @@ fn judge(response: &reqwest::Response, package: &PackageRef, blob: BlobRef, offs
         }
         status if status.is_server_error() => return Err(busy(status, headers)),
         status if status.is_client_error() => {
-            let (digest, package) = (blob.digest, package.name.clone());
-            return Err(FetchError::Unavailable { status: status.as_u16(), digest, package });
+            let (digest, repository) = (blob.digest, repository.clone());
+            return Err(FetchError::Unavailable { status: status.as_u16(), digest, repository });
         }
         status => return Err(FetchError::NotTheServer(format!("status {} for a blob", status.as_u16()))),
     };

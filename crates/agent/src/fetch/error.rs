@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use task_proto::report::FailureCode;
-use task_proto::{Digest, TaskName};
+use task_proto::{Digest, RepositoryName};
 
 use crate::disk::{self, DiskFull, Need};
 use crate::unpack::Refusal;
@@ -45,14 +45,24 @@ pub enum FetchError {
     #[error("the server does not accept this robot's token")]
     Unauthorized,
     /// The server will not give this blob to this robot.
-    #[error("the server answers {status} for blob {digest} of {package}")]
+    #[error("the server answers {status} for blob {digest} of {repository}")]
     Unavailable {
         /// The HTTP status.
         status: u16,
         /// What was asked for.
         digest: Digest,
-        /// The package it belongs to.
-        package: TaskName,
+        /// Where: that of its package.
+        repository: RepositoryName,
+    },
+    /// More bytes are announced than such a blob may have.
+    #[error("blob {digest} is said to have {size} bytes, {most} are possible")]
+    TooLarge {
+        /// What was asked for.
+        digest: Digest,
+        /// What is announced.
+        size: u64,
+        /// What is possible.
+        most: u64,
     },
     /// The bytes are not the ordered ones.
     #[error("the server's bytes for {digest} are others: {reason}")]
@@ -93,7 +103,7 @@ impl FetchError {
             | Self::Busy { .. } => Some(FailureCode::SERVER_UNREACHABLE),
             Self::Unauthorized => Some(FailureCode::UNAUTHORIZED),
             Self::Unavailable { .. } => Some(FailureCode::PACKAGE_UNAVAILABLE),
-            Self::DigestMismatch { .. } => Some(FailureCode::DIGEST_MISMATCH),
+            Self::DigestMismatch { .. } | Self::TooLarge { .. } => Some(FailureCode::DIGEST_MISMATCH),
             Self::ManifestInvalid(_) => Some(FailureCode::MANIFEST_INVALID),
             Self::ArchiveRefused(_) => Some(FailureCode::ARCHIVE_REFUSED),
             Self::DiskFull(_) => Some(FailureCode::DISK_FULL),
@@ -134,7 +144,7 @@ impl FetchError {
         matches!(self, Self::Unreachable(_) | Self::Interrupted { .. } | Self::Stalled(_))
     }
 
-    pub(super) fn disk(path: &Path, source: io::Error) -> Self {
+    pub(crate) fn disk(path: &Path, source: io::Error) -> Self {
         Self::Disk { path: path.to_owned(), source }
     }
 

@@ -31,12 +31,13 @@ proptest! {
     fn whatever_happens_it_is_safe_and_converges(
         rules in run_rules(),
         outputs in prop::bool::ANY,
+        asks in any::<bool>(),
         bad in prop_oneof![Just(None), Just(Some(0)), Just(Some(1))],
         happenings in prop::collection::vec(happening(), 1..80),
     ) {
         let outputs = Outputs { paths: outputs.then(|| "maps/*".to_owned()).into_iter().collect() };
         let mut world = World::new(rules);
-        (world.bad, world.outputs) = (bad, outputs);
+        (world.bad, world.outputs, world.asks) = (bad, outputs, asks);
         for happening in happenings {
             world.happen(happening);
             prop_assert!(world.alive.len() <= 1);
@@ -384,4 +385,25 @@ fn every_step_of_the_run_lane_has_a_deadline() {
     assert!(steps.iter().all(|step| step.lane() == Lane::Run && step.deadline().is_some()));
     let stop = steps[1].deadline().expect("checked");
     assert!(stop > Duration::from_secs(2 * u64::from(stop_timeout_s)), "both signals have their time: {stop:?}");
+}
+
+#[test]
+fn who_has_signed_it_is_looked_for_before_anything_of_it_is_fetched() {
+    let mut world = World::new(Run::default());
+    world.asks = true;
+    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+    assert!(matches!(world.steps[..], [(Step::CheckSigners(_), false)]), "{:?}", world.steps);
+    world.happen(Happening::Effect { well: true });
+    world.happen(Happening::Learn);
+    assert!(matches!(world.steps[..], [(Step::PullManifest(_), false)]), "{:?}", world.steps);
+    // Whoever signed it is trusted no more while it is pulled.
+    world.happen(Happening::Signed(false));
+    world.happen(Happening::Effect { well: true });
+    world.happen(Happening::Learn);
+    assert!(matches!(world.steps[..], [(Step::CheckSigners(_), false)]), "{:?}", world.steps);
+    world.happen(Happening::Effect { well: true });
+    assert_eq!(phase(&world), Phase::Failed);
+    let failure = world.record.as_ref().expect("a record").preparation.failure.clone().expect("a reason");
+    assert_eq!(failure.code, FailureCode::UNTRUSTED_PACKAGE);
+    assert!(world.steps.is_empty() && world.disk.iter().all(|(_, level)| *level < 2), "{:?}", world.disk);
 }

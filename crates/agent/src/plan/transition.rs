@@ -69,7 +69,9 @@ pub fn adopted(record: &TaskRecord, order: &DesiredTask, now_ms: u64) -> TaskRec
 pub fn begun(record: &TaskRecord, step: &Step, boot_id: &str, start: u64, now_ms: u64) -> TaskRecord {
     let mut record = record.clone();
     let phase = match step {
-        Step::PullManifest(_) | Step::LookForRos(_) | Step::PullContent { .. } => Some(Phase::Fetching),
+        Step::CheckSigners(_) | Step::PullManifest(_) | Step::LookForRos(_) | Step::PullContent { .. } => {
+            Some(Phase::Fetching)
+        }
         Step::Build(_) => Some(Phase::Building),
         Step::Ask(_) | Step::Start(_) | Step::Stop(_) | Step::Collect(_) | Step::Prune { .. } | Step::Remove => None,
     };
@@ -114,7 +116,8 @@ pub fn finished(s: &Situation<'_>, step: &Step, outcome: Result<Done, StepFailur
     let mut record = s.record.clone();
     match (step, outcome) {
         (
-            Step::PullManifest(package)
+            Step::CheckSigners(package)
+            | Step::PullManifest(package)
             | Step::LookForRos(package)
             | Step::PullContent { package, .. }
             | Step::Build(package),

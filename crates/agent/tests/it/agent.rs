@@ -81,6 +81,7 @@ fn state(robot: &RobotId, generation: u64) -> DesiredState {
         issued_at_ms: 1,
         expires_at_ms: u64::MAX,
         tasks: Vec::new(),
+        evidence: Default::default(),
     }
 }
 

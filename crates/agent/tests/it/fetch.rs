@@ -35,6 +35,8 @@ pub enum Answer {
     Cut(usize),
     /// As it should, but after so many bytes nothing more comes.
     Stall(usize),
+    /// As it should, but a byte at a time: each comes soon, all of them never.
+    Drip,
     /// The whole blob, whatever range was asked for.
     IgnoreRange,
     /// This status and these headers, with an empty body.
@@ -205,6 +207,15 @@ async fn answer(
         Answer::Well | Answer::IgnoreRange => exact(response).body(Body::from(bytes)),
         Answer::Cut(after) => exact(response).body(cut(bytes, after)),
         Answer::Stall(after) => exact(response).body(stalled(bytes, after)),
+        Answer::Drip => {
+            let every = tokio::time::interval(Duration::from_millis(2));
+            let drops = stream::unfold((bytes, 0, every), async |(bytes, at, mut every)| {
+                every.tick().await;
+                let drop = Bytes::copy_from_slice(bytes.get(at..=at)?);
+                Some((Ok::<_, std::io::Error>(drop), (bytes, at + 1, every)))
+            });
+            exact(response).body(Body::from_stream(drops))
+        }
         Answer::Status(status, headers) => {
             let response = Response::builder().status(status);
             headers
@@ -464,6 +475,15 @@ async fn a_server_that_stalls_is_given_up() {
     let error = site.pull().await.unwrap_err();
     assert!(matches!(error, FetchError::Stalled(_)), "{error:?}");
     assert!(error.is_retryable());
+}
+
+#[tokio::test]
+async fn slow_retrieval_is_cut_by_a_least_rate() {
+    let site = Site::with(&tar(), FetchSettings { stall_timeout: Duration::from_millis(100), ..settings() }).await;
+    site.answers(vec![Answer::Drip; 6]);
+    let error = site.pull().await.unwrap_err();
+    assert!(matches!(error, FetchError::Stalled(_)), "{error:?}");
+    assert_eq!(site.asked().len(), 6, "each time it was cut and asked for anew");
 }
 
 #[tokio::test]

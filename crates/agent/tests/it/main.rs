@@ -17,3 +17,4 @@ mod peer;
 mod ros;
 mod supervise;
 mod unpack;
+mod vouching;

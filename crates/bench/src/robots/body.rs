@@ -9,10 +9,10 @@ use task_agent::clock;
 use task_agent::effects::{Effects, Now, Robot};
 use task_agent::fetch::Asks;
 use task_agent::ledger::{ActiveRun, Collection, GateQuestion, Ledger, LedgerError, ProcessRecord};
-use task_agent::observed::{Exit, Health, Prepared, ProcessState, RobotFacts};
+use task_agent::observed::{Exit, Health, Prepared, ProcessState, RobotFacts, TrustFacts};
 use task_agent::plan::{Done, StepFailure};
 use task_agent::process::ExitStatus;
-use task_proto::desired::{BlobRef, PackageRef};
+use task_proto::desired::{BlobRef, DesiredState, PackageRef};
 use task_proto::report::{HostFacts, Progress};
 use task_proto::{Digest, TaskName};
 use tokio::sync::watch;
@@ -93,6 +93,18 @@ impl Effects for Body {
     fn watch(&self, _: &TaskName, _: &ActiveRun) -> watch::Receiver<Health> {
         self.health.send_replace(Health::Holds { since_ms: clock::boot_ms() });
         self.health.subscribe()
+    }
+
+    fn heed(&self, state: &DesiredState) {
+        self.robot.heed(state);
+    }
+
+    fn trust_facts(&self) -> TrustFacts {
+        self.robot.trust_facts()
+    }
+
+    async fn check_signers(&self, package: &PackageRef, cancel: &CancellationToken) -> Result<(), StepFailure> {
+        self.robot.check_signers(package, cancel).await
     }
 
     fn keep_parts(&self, wanted: &[Digest]) {

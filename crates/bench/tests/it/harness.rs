@@ -322,18 +322,30 @@ impl Robot {
     ) -> Self {
         let data = dir.join(name);
         let token = server.enrollment_token().await;
-        let mut enroll = Command::new(program("task-agent"));
-        enroll.args(["enroll", "--server", url, "--token", &token, "--name", name]);
-        enroll.args(["--mac", &format!("02:00:00:00:00:{number:02x}")]).arg("--data").arg(&data);
-        enroll.envs(environment.iter().copied());
-        let output =
-            tokio::task::spawn_blocking(move || enroll.output().expect("task-agent runs")).await.expect("no panic");
-        assert!(output.status.success(), "enroll: {}", String::from_utf8_lossy(&output.stderr));
+        let environment: Vec<_> = environment.iter().map(|(k, v)| ((*k).to_owned(), (*v).to_owned())).collect();
+        enroll(&data, number, &environment, &["--server", url, "--token", &token, "--name", name]).await;
         let id = server.robot(name).await.expect("an enrolled robot").id;
-        let environment = environment.iter().map(|(k, v)| ((*k).to_owned(), (*v).to_owned())).collect();
         let mut robot = Self { process: None, data, environment, name: name.to_owned(), id };
         robot.restart();
         robot
+    }
+
+    /// Enrols it anew with this token; the agent must not be running.
+    pub async fn enroll_anew(&self, number: u8, token: &str) {
+        enroll(&self.data, number, &self.environment, &["--token", token, "--force"]).await;
+    }
+
+    /// Somebody who has this robot's identity and starts an agent with it elsewhere.
+    pub fn stolen(&self, dir: &Path, name: &str) -> Self {
+        let data = dir.join(name);
+        std::fs::create_dir(&data).expect("directory");
+        for file in ["identity.json", "agent.toml"] {
+            std::fs::copy(self.data.join(file), data.join(file)).expect("copied");
+        }
+        let (environment, id) = (self.environment.clone(), self.id.clone());
+        let mut thief = Self { process: None, data, environment, name: self.name.clone(), id };
+        thief.restart();
+        thief
     }
 
     /// Starts the agent, which must not be running.
@@ -382,6 +394,16 @@ impl Drop for Robot {
         end_processes_below(&self.data);
         groups.iter().for_each(|group| remove_cgroup(group));
     }
+}
+
+/// Runs `task-agent enroll` for the robot with this number, which must succeed.
+async fn enroll(data: &Path, number: u8, environment: &[(String, String)], options: &[&str]) {
+    let mut enroll = Command::new(program("task-agent"));
+    enroll.arg("enroll").args(options).args(["--mac", &format!("02:00:00:00:00:{number:02x}")]);
+    enroll.arg("--data").arg(data).envs(environment.iter().map(|(k, v)| (k, v))).stdin(Stdio::null());
+    let output =
+        tokio::task::spawn_blocking(move || enroll.output().expect("task-agent runs")).await.expect("no panic");
+    assert!(output.status.success(), "enroll: {}", String::from_utf8_lossy(&output.stderr));
 }
 
 /// The control groups of a robot's runs, and of what else it has started: those that none but its killed agent removes.

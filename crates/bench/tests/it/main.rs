@@ -18,6 +18,8 @@ mod restore;
 mod ros;
 mod ros1;
 mod scenarios;
+mod signing;
 mod talker;
+mod theft;
 mod tidy;
 mod tls;

@@ -13,7 +13,9 @@ use task_proto::api::{
     ExternalBroker, HttpTraffic, LogEvent, LogsFrom, LogsView, MqttConnection, MqttEndpoint, MqttTraffic, OutputList,
     OutputView, ReportReply, RobotToken, ServerInfo, Traffic,
 };
-use task_proto::desired::{BlobRef, Delivery, DesiredState, DesiredTask, Doorbell, Inline, PackageRef, Wanted};
+use task_proto::desired::{
+    BlobRef, Delivery, DesiredState, DesiredTask, Doorbell, Evidence, Inline, PackageRef, SignatureRef, Wanted,
+};
 use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
 use task_proto::log::{LogBatch, LogLevel, LogLine, LogSource};
 use task_proto::manifest::{
@@ -22,6 +24,7 @@ use task_proto::manifest::{
 use task_proto::oci::ImageManifest;
 use task_proto::output::{OutputFile, OutputSet};
 use task_proto::part::{Part, PartRange};
+use task_proto::publisher::{PackageStatement, PublisherList, Role, SIGNATURE_ARTIFACT};
 use task_proto::report::{
     ActiveVersion, Condition, Failure, FailureCode, HostFacts, Isolation, LinkFacts, Phase, Progress, Report, RosFacts,
     Status, TaskReport,
@@ -68,6 +71,10 @@ fn desired_state() -> DesiredState {
             delivery: Delivery::PushPull,
             priority: 5,
         }],
+        evidence: Evidence {
+            lists: vec![blob("list")],
+            signatures: vec![SignatureRef { manifest: package().manifest.digest, envelope: blob("signature") }],
+        },
     }
 }
 
@@ -95,6 +102,7 @@ fn report() -> Report {
             }),
             isolation: Isolation::Cgroup,
             battery_percent: Some(80),
+            publishers: Some(3),
         },
         conditions: vec![Condition { code: "held".to_owned(), text: "held at the robot".to_owned() }],
         link: Some(LinkFacts { throughput_bytes_per_s: Some(2_400_000), rtt_ms: Some(31), reconnects: 1, losses: 2 }),
@@ -323,6 +331,30 @@ fn documents_of_a_package() {
     assert_eq!(manifest().problems(), []);
     check("oci_manifest.json", &ImageManifest::package(blob("config"), blob("content")));
     check_tolerance::<ImageManifest>("oci_manifest.json");
+}
+
+#[test]
+fn documents_that_publishers_sign() {
+    let keys = [1, 2, 3].map(|seed| SigningKey::from_bytes([seed; 32]));
+    let public = |keys: &[SigningKey]| keys.iter().map(SigningKey::public_key).collect::<Vec<_>>();
+    let statement = PackageStatement { package: package() };
+    check("package_statement.json", &statement);
+    check_tolerance::<PackageStatement>("package_statement.json");
+    check("package_signature.json", &statement.seal(&keys[0]));
+    let list = PublisherList {
+        version: 3,
+        issued_at_ms: 1_800_000_000_000,
+        expires_at_ms: 1_807_776_000_000,
+        publishers: Role::new(public(&keys[..2]), 2).expect("a role"),
+        keepers: Role::new(public(&keys[2..]), 1).expect("a role"),
+        withdrawn: vec![Digest::of(b"manifest of a bad one")],
+    };
+    check("publisher_list.json", &list);
+    check_tolerance::<PublisherList>("publisher_list.json");
+    let manifest = ImageManifest::signed_document(SIGNATURE_ARTIFACT, blob("envelope"), Some(blob("manifest")));
+    check("signature_manifest.json", &manifest);
+    assert_eq!(manifest.lone_envelope(), Some(blob("envelope")));
+    assert_eq!(ImageManifest::package(blob("config"), blob("content")).lone_envelope(), None);
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::sync::{Mutex, PoisonError};
 
-use task_proto::desired::{BlobRef, DesiredState};
+use task_proto::desired::{BlobRef, DesiredState, Evidence};
 use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope};
 use task_proto::{Generation, RobotId};
 
@@ -29,6 +29,7 @@ pub struct Desired {
 struct Kept {
     issued_at_ms: u64,
     generation: Generation,
+    evidence: Evidence,
     envelope: Envelope,
 }
 
@@ -37,10 +38,17 @@ struct Kept {
 pub(super) struct Envelopes(Mutex<HashMap<RobotId, Kept>>);
 
 impl Envelopes {
-    fn get(&self, robot: &RobotId, generation: Generation, signed_since_ms: u64) -> Option<Envelope> {
+    fn get(
+        &self,
+        robot: &RobotId,
+        generation: Generation,
+        evidence: &Evidence,
+        signed_since_ms: u64,
+    ) -> Option<Envelope> {
         let kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let kept = kept.get(robot)?;
-        (kept.generation == generation && kept.issued_at_ms >= signed_since_ms).then(|| kept.envelope.clone())
+        let is_same = kept.generation == generation && kept.evidence == *evidence;
+        (is_same && kept.issued_at_ms >= signed_since_ms).then(|| kept.envelope.clone())
     }
 
     fn keep(&self, robot: &RobotId, state: Kept) {
@@ -76,13 +84,14 @@ impl Actions {
     }
 
     fn sign(&self, found: DesiredTasks) -> Result<Desired, ActionError> {
-        let DesiredTasks { robot, generation, observed_generation, tasks, along } = found;
+        let DesiredTasks { robot, generation, observed_generation, tasks, along, evidence } = found;
         if observed_generation > generation {
             return Err(ActionError::Diverged(robot));
         }
         let now_ms = self.clock.now_ms();
         let lifetime_ms = self.settings.desired_lifetime_ms;
-        if let Some(envelope) = self.envelopes.get(&robot, generation, now_ms.saturating_sub(lifetime_ms / 2)) {
+        let signed_since_ms = now_ms.saturating_sub(lifetime_ms / 2);
+        if let Some(envelope) = self.envelopes.get(&robot, generation, &evidence, signed_since_ms) {
             return Ok(Desired { generation, envelope, along });
         }
         let state = DesiredState {
@@ -91,10 +100,11 @@ impl Actions {
             issued_at_ms: now_ms,
             expires_at_ms: now_ms + lifetime_ms,
             tasks,
+            evidence: evidence.clone(),
         };
         let payload = serde_json::to_vec(&state).expect("a desired state always has a JSON form");
         let envelope = Envelope::seal(DESIRED_STATE_TYPE, &payload, &self.key);
-        self.envelopes.keep(&robot, Kept { issued_at_ms: now_ms, generation, envelope: envelope.clone() });
+        self.envelopes.keep(&robot, Kept { issued_at_ms: now_ms, generation, evidence, envelope: envelope.clone() });
         Ok(Desired { generation, envelope, along })
     }
 }

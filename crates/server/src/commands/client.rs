@@ -163,6 +163,11 @@ impl Client {
         self.answer(|| self.request(Method::GET, &format!("{BASE}{path}")).query(query)).await
     }
 
+    /// Reads JSON from any path of the server.
+    pub(crate) async fn read<T: DeserializeOwned>(&self, path: &str) -> Result<T, ClientError> {
+        self.answer(|| self.request(Method::GET, path)).await
+    }
+
     /// Likewise, with a query of this type.
     pub(crate) async fn get_by<Q: Serialize, T: DeserializeOwned>(
         &self,

@@ -8,6 +8,7 @@ use std::process::ExitCode;
 use clap::{Args, Subcommand};
 use task_proto::CaPin;
 
+use crate::key_file::KeyError;
 use crate::package::PackageError;
 use client::{Client, ClientError};
 use output::{Format, Output};
@@ -18,6 +19,7 @@ mod client;
 mod confirm;
 mod deploy;
 mod enroll_token;
+mod key;
 mod login;
 mod logs;
 mod output;
@@ -83,6 +85,12 @@ pub enum Command {
         /// What to do.
         #[command(subcommand)]
         action: enroll_token::Action,
+    },
+    /// Make publishers' keys, and the list of those that robots trust
+    Key {
+        /// What to do.
+        #[command(subcommand)]
+        action: key::Action,
     },
     /// Pack a directory, upload it and, with --to, deploy it
     Push(push::Push),
@@ -194,6 +202,9 @@ pub enum CommandError {
     /// The directory is not a package that could run.
     #[error(transparent)]
     Package(#[from] PackageError),
+    /// A key can't be used.
+    #[error(transparent)]
+    Key(#[from] KeyError),
     /// The command line asks for something that makes no sense.
     #[error("{0}")]
     Usage(String),
@@ -215,7 +226,7 @@ impl CommandError {
         match self {
             Self::Client(error) => error.outcome(),
             Self::Package(PackageError::Io { .. }) | Self::Io { .. } | Self::Broken(_) => Outcome::Failed,
-            Self::Package(_) | Self::Usage(_) => Outcome::Usage,
+            Self::Package(_) | Self::Key(_) | Self::Usage(_) => Outcome::Usage,
         }
     }
 }
@@ -245,6 +256,7 @@ async fn dispatch(connection: &Connection, command: Command) -> Result<Outcome, 
         Command::Server { action } => server::run(&connection.open()?, action).await,
         Command::Broker { action } => broker::run(&connection.open()?, action).await,
         Command::EnrollToken { action } => enroll_token::run(&connection.open()?, action).await,
+        Command::Key { action } => key::run(connection, action).await,
         Command::Push(push) => push::run(&connection.open()?, push).await,
         Command::Deploy { action } => deploy::run(&connection.open()?, action).await,
         Command::Start(order) => task::run(&connection.open()?, task::Verb::Start, order).await,

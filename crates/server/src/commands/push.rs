@@ -4,15 +4,19 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::{Args, ValueEnum};
+use task_proto::RepositoryName;
 use task_proto::api::{
     CreateDeployment, DeliveryChoice, DeploymentView, MAX_PRIORITY, MIN_PRIORITY, MatchedRobot, MatchedRobots,
 };
+use task_proto::envelope::SigningKey;
+use task_proto::publisher::{PackageStatement, SIGNATURE_ARTIFACT};
 use task_proto::selector::Selector;
 
 use super::confirm::confirm;
 use super::output::{Output, bytes, robots, say};
 use super::{CommandError, Outcome, Session, client, robot, upload, view, wait};
 use crate::config::lifetime;
+use crate::key_file;
 use crate::package::{self, Packed};
 
 /// What to push, where to and how.
@@ -46,6 +50,9 @@ pub struct Push {
     /// When what is not done by then expires [default: the server's setting]
     #[arg(long, value_name = "TIME", value_parser = lifetime, requires = "to")]
     expires: Option<Duration>,
+    /// Sign it with this private key, of taskd key new; may be repeated
+    #[arg(long = "sign", value_name = "KEY")]
+    keys: Vec<PathBuf>,
     /// Only check the package and list the robots that are meant
     #[arg(long)]
     dry_run: bool,
@@ -95,6 +102,8 @@ pub struct Pack {
 }
 
 pub(super) async fn run(session: &Session, push: Push) -> Result<Outcome, CommandError> {
+    // Before anything is done: a key that can't be used must not leave a package without its signature on the server.
+    let keys = push.keys.iter().map(|path| key_file::read(path)).collect::<Result<Vec<_>, _>>()?;
     let matched = match &push.to {
         Some(selector) => Some(matched(session, selector).await?),
         None => None,
@@ -108,6 +117,7 @@ pub(super) async fn run(session: &Session, push: Push) -> Result<Outcome, Comman
         confirm(&format!("push {} to {selector}", packed.package.name), matched.robots.len(), push.yes)?;
     }
     upload::upload(&session.client, &packed).await?;
+    sign(session, &packed, &keys).await?;
     let Some(selector) = push.to else {
         session.output.described(&packed.package, |_| describe(&packed))?;
         return Ok(Outcome::Succeeded);
@@ -135,6 +145,19 @@ pub(super) async fn run(session: &Session, push: Push) -> Result<Outcome, Comman
         return Ok(Outcome::Succeeded);
     }
     wait::until_settled(session, &ordered.id, push.timeout).await
+}
+
+/// Puts what publishers say of the package beside it.
+async fn sign(session: &Session, packed: &Packed, keys: &[SigningKey]) -> Result<(), CommandError> {
+    let package = &packed.package;
+    let repository = RepositoryName::of_package(&package.name);
+    for key in keys {
+        let envelope = PackageStatement { package: package.clone() }.seal(key);
+        let about = (Some(package.manifest), None);
+        upload::upload_signed(&session.client, &repository, SIGNATURE_ARTIFACT, &envelope, about).await?;
+        say(&format!("{} {}: signed by {}", package.name, package.version, key.public_key().id()));
+    }
+    Ok(())
 }
 
 /// The robots meant; none at all is a mistake in the command, noticed before anything travels.

@@ -120,6 +120,7 @@ fn describe(robot: &RobotView) -> String {
         }
         facts.push(("isolation", if host.isolation == Isolation::Cgroup { "cgroup" } else { "none" }.to_owned()));
         facts.push(("disk free", super::output::bytes(host.disk_free_bytes)));
+        facts.push(("publishers", publishers(host.publishers)));
         if let Some(percent) = host.battery_percent {
             facts.push(("battery", format!("{percent}%")));
         }
@@ -140,6 +141,15 @@ fn describe(robot: &RobotView) -> String {
         text.push_str(&table(&header, robot.tasks.iter().map(task_row).collect()));
     }
     text
+}
+
+/// By whose word a robot runs packages, in words.
+fn publishers(version: Option<u64>) -> String {
+    match version {
+        None => "not asked for: it runs what the server orders".to_owned(),
+        Some(0) => "those of its own settings".to_owned(),
+        Some(version) => format!("by version {version} of their list"),
+    }
 }
 
 /// What transfers have shown of a robot's way to the server, in words.

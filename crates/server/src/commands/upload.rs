@@ -7,7 +7,9 @@ use futures_util::TryStreamExt as _;
 use reqwest::header::{CONTENT_LENGTH, CONTENT_TYPE, LOCATION};
 use reqwest::{Body, Method, Response, StatusCode};
 use task_proto::desired::BlobRef;
-use task_proto::oci::MANIFEST_TYPE;
+use task_proto::envelope::Envelope;
+use task_proto::oci::{EMPTY, ImageManifest, MANIFEST_TYPE};
+use task_proto::{Digest, RepositoryName};
 use tokio_util::io::ReaderStream;
 
 use super::CommandError;
@@ -53,6 +55,31 @@ pub(super) async fn upload(client: &Client, packed: &Packed) -> Result<(), Comma
             bytes(package.content.size)
         )),
     }
+    Ok(())
+}
+
+/// Uploads a signed document, about `subject` or on its own. The same twice is the same.
+pub(super) async fn upload_signed(
+    client: &Client,
+    repository: &RepositoryName,
+    artifact_type: &str,
+    envelope: &Envelope,
+    (subject, tag): (Option<BlobRef>, Option<String>),
+) -> Result<(), CommandError> {
+    let bytes = serde_json::to_vec(envelope).expect("an envelope always has a JSON form");
+    let blob = BlobRef::of(&bytes);
+    for (blob, bytes) in [(BlobRef::of(EMPTY), EMPTY), (blob, &bytes)] {
+        if !exists(client, &format!("/v2/{repository}/blobs/{}", blob.digest)).await? {
+            upload_blob(client, repository.as_str(), blob, &Source::Bytes(bytes)).await?;
+        }
+    }
+    let manifest = ImageManifest::signed_document(artifact_type, blob, subject);
+    let manifest = serde_json::to_vec(&manifest).expect("a manifest always has a JSON form");
+    let reference = tag.unwrap_or_else(|| Digest::of(&manifest).to_string());
+    let path = format!("/v2/{repository}/manifests/{reference}");
+    client
+        .send(|| client.request(Method::PUT, &path).header(CONTENT_TYPE, MANIFEST_TYPE).body(manifest.clone()))
+        .await?;
     Ok(())
 }
 
@@ -171,7 +198,6 @@ mod tests {
 
     use axum::Router;
     use axum::routing::{head, post, put};
-    use task_proto::Digest;
     use task_proto::token::{Token, TokenKind};
 
     use super::super::Connection;

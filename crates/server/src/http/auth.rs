@@ -207,6 +207,7 @@ async fn identify(app: &App, shown: Shown<'_>) -> Result<(Caller, TokenNumber), 
             if is_first_use {
                 // Whoever is connected came in by the token that has just ended.
                 app.broker.disconnect(&robot);
+                app.presence.ended_others(&robot);
             }
             (Caller::Robot(robot), TokenNumber(token_number))
         }

@@ -132,6 +132,7 @@ impl FromRef<App> for oci::Registry {
             blobs: app.blobs.clone(),
             clock: app.clock.clone(),
             transfers: app.transfers.clone(),
+            changes: app.changes.clone(),
         }
     }
 }

@@ -1,4 +1,5 @@
-//! Who was let in a moment ago, so that a robot's thousand requests ask the database once. An answer is remembered until
+//! Who was let in a moment ago, so that a robot's thousand requests ask the database once, and what publishers have signed,
+//! which robots are told each time they ask what they should have. An answer is remembered until
 //! the next write that could change it has ended, at most for some seconds, and never beyond a token's own end: what is
 //! revoked here is revoked at once. Refusals are not remembered. It never decides who may do what.
 
@@ -6,6 +7,7 @@ use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use task_proto::desired::BlobRef;
 use task_proto::token::{Token, TokenKind};
 use task_proto::{Digest, RobotId};
 
@@ -13,6 +15,8 @@ use super::{FetchedBy, TokenHolder};
 
 /// Answers remembered of each kind; beyond it all are forgotten.
 const MAX_ANSWERS: usize = 32 * 1024;
+/// Packages whose signatures are remembered.
+const MAX_PACKAGES: usize = 1024;
 /// How long an answer counts in any case: somebody else could write to the same database.
 const MAX_AGE: Duration = Duration::from_secs(5);
 
@@ -28,6 +32,8 @@ struct Answers {
     since: Option<Instant>,
     holders: HashMap<Shown, Holder>,
     fetches: HashMap<(RobotId, Digest), Arc<FetchedBy>>,
+    lists: Option<Vec<BlobRef>>,
+    signatures: HashMap<Digest, Vec<BlobRef>>,
 }
 
 /// A token by its kind, its id and the digest of its secret. Whoever could make use of how long a look-up takes would have
@@ -109,6 +115,35 @@ impl Access {
         order
     }
 
+    /// The lists of publishers that robots are told of, if they are known.
+    pub(super) fn lists(&self) -> Option<Vec<BlobRef>> {
+        self.answers().lists.clone()
+    }
+
+    /// Remembers the lists of publishers that robots are told of.
+    pub(super) fn remember_lists(&self, asked: Asked, lists: &[BlobRef]) {
+        let mut answers = self.answers();
+        if answers.epoch == asked.epoch {
+            answers.lists = Some(lists.to_vec());
+        }
+    }
+
+    /// The signatures of the package with this manifest, if they are known.
+    pub(super) fn signatures(&self, manifest: &Digest) -> Option<Vec<BlobRef>> {
+        self.answers().signatures.get(manifest).cloned()
+    }
+
+    /// Remembers the signatures of a package.
+    pub(super) fn remember_signatures(&self, asked: Asked, manifest: Digest, signatures: Vec<BlobRef>) {
+        let mut answers = self.answers();
+        if answers.epoch == asked.epoch {
+            if answers.signatures.len() >= MAX_PACKAGES {
+                answers.signatures.clear();
+            }
+            answers.signatures.insert(manifest, signatures);
+        }
+    }
+
     /// A write begins. It changes nobody's rights until it says that it may.
     pub(super) fn until_ended(&self) -> Ending {
         Ending { access: self.clone(), is_due: false }
@@ -134,6 +169,8 @@ impl Answers {
         self.since = Some(Instant::now());
         self.holders.clear();
         self.fetches.clear();
+        self.lists = None;
+        self.signatures.clear();
     }
 }
 
@@ -160,8 +197,14 @@ mod tests {
             access.remember_holder(asked, &token, &holder, Some(100));
             let order = FetchedBy { priority: 0, number: 1, labels: Default::default() };
             access.remember_fetch(asked, &robot, &blob, order);
+            access.remember_lists(asked, &[BlobRef::of(b"list")]);
+            access.remember_signatures(asked, blob, Vec::new());
         };
-        let known = || (access.holder(&token, 99), access.fetched_by(&robot, &blob).is_some());
+        let known = || {
+            let found = access.fetched_by(&robot, &blob).is_some();
+            assert_eq!((access.lists().is_some(), access.signatures(&blob).is_some()), (found, found));
+            (access.holder(&token, 99), found)
+        };
         assert_eq!(known(), (None, false));
         remember(access.ask());
         assert_eq!(known(), (Some(holder.clone()), true));

@@ -16,6 +16,7 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[
     (6, "delivery", include_str!("../migrations/0006_delivery.sql")),
     (7, "people", include_str!("../migrations/0007_people.sql")),
     (8, "direct_pushes", include_str!("../migrations/0008_direct_pushes.sql")),
+    (9, "publishers", include_str!("../migrations/0009_publishers.sql")),
     (11, "client_keys", include_str!("../migrations/0011_client_keys.sql")),
 ];
 

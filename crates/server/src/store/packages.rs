@@ -12,7 +12,7 @@ use task_proto::oci::Descriptor;
 use task_proto::output::OutputSet;
 use task_proto::{Digest, RepositoryName, Tag, TaskName};
 
-use super::{Deed, Store, StoreError, Write, rows};
+use super::{Deed, SignedDocument, Store, StoreError, Write, rows};
 
 /// A manifest's name inside its repository.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -53,6 +53,8 @@ pub struct NewManifest {
     pub package: Option<(PackageRef, TaskManifest)>,
     /// What it says if it is the output of a run.
     pub output: Option<OutputSet>,
+    /// What it brings if it is something that publishers have signed.
+    pub document: Option<SignedDocument>,
 }
 
 /// How storing a manifest ended.
@@ -62,6 +64,8 @@ pub enum PutManifest {
     Stored,
     /// Nothing is stored: these parts are not in the repository.
     PartsMissing(Vec<Digest>),
+    /// Nothing is stored: it is a list of publishers, and another has its version or a later one.
+    Outdated,
 }
 
 impl Store {
@@ -83,6 +87,11 @@ impl Store {
         }
         if !missing.is_empty() {
             return Ok(PutManifest::PartsMissing(missing));
+        }
+        if let Some(document) = &new.document
+            && !write.insert_document(repository, &new.manifest.digest, document, now_ms).await?
+        {
+            return Ok(PutManifest::Outdated);
         }
         write.insert_manifest(repository, new, now_ms).await?;
         for tag in &new.tags {
@@ -307,6 +316,7 @@ impl Write {
                 .bind(digest.to_string())
                 .fetch_all(self.connection())
                 .await?;
+        self.delete_document(repository, digest).await?;
         let mut deleted = 0;
         for sql in [
             "DELETE FROM packages WHERE name = $1 AND manifest = $2",

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use sqlx::{AssertSqlSafe, Row as _};
 use task_proto::api::{RobotTask, RobotView};
-use task_proto::desired::{BlobRef, Delivery, DesiredTask, PackageRef};
+use task_proto::desired::{BlobRef, Delivery, DesiredTask, Evidence, PackageRef};
 use task_proto::id::Labels;
 use task_proto::report::{Condition, Phase, Report};
 use task_proto::selector::Selector;
@@ -51,6 +51,8 @@ pub struct DesiredTasks {
     pub tasks: Vec<DesiredTask>,
     /// Blobs that are to ride along with its state: it does not have them yet.
     pub along: Vec<BlobRef>,
+    /// What publishers have signed about these tasks' packages.
+    pub evidence: Evidence,
 }
 
 /// An order for which a robot fetches something.
@@ -170,6 +172,7 @@ impl Store {
                         observed_generation: Generation(number(row.try_get("observed_generation")?)),
                         tasks: Vec::new(),
                         along: Vec::new(),
+                        evidence: Evidence::default(),
                     });
                 }
                 if let (Some(last), Some(task)) = (found.last_mut(), desired_task(&row)?) {
@@ -180,6 +183,7 @@ impl Store {
                 }
             }
         }
+        self.add_evidence(&mut found).await?;
         Ok(found)
     }
 

@@ -26,6 +26,7 @@ mod permissions;
 mod registry;
 mod scope;
 mod serve;
+mod signatures;
 mod story;
 mod tls;
 mod tokens;

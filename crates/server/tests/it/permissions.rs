@@ -277,6 +277,8 @@ fn registry_probes(path: &str) -> Vec<Probe> {
             ("PUT", "/v2/walker/manifests/2.0.0", "/v2/NAME/manifests/TAG"),
             ("DELETE", "/v2/walker/manifests/none", "/v2/NAME/manifests/TAG"),
             ("DELETE", "/v2/other/blobs/{blob}", "/v2/NAME/blobs/DIGEST"),
+            ("PUT", "/v2/taskd/publishers/manifests/1", "/v2/taskd/publishers/manifests/TAG"),
+            ("DELETE", "/v2/taskd/publishers/manifests/none", "/v2/taskd/publishers/manifests/TAG"),
             ("GET", "/v2/outputs/{itself}/mapping/tags/list", "/v2/outputs/ROBOT/TASK/tags/list"),
             ("GET", "/v2/outputs/{itself}/mapping/blobs/{blob}", "/v2/outputs/ROBOT/TASK/blobs/DIGEST"),
             ("POST", "/v2/outputs/{itself}/mapping/blobs/uploads/", "/v2/outputs/ROBOT/TASK/blobs/uploads/"),

@@ -13,6 +13,7 @@ use task_proto::desired::BlobRef;
 use task_proto::oci::MANIFEST_TYPE;
 use task_proto::token::{Token, TokenKind};
 use taskd::blobs::{BlobSettings, Blobs};
+use taskd::changes::Changes;
 use taskd::clock::Clock;
 use taskd::collector::{self, Collected};
 use taskd::config::TransferLimits;
@@ -51,7 +52,8 @@ impl TestRegistry {
         let blobs = Blobs::open(data.path(), settings).expect("a blob store");
         let site_label = "site".parse().expect("a label's key");
         let transfers = Transfers::new(&TransferLimits::default(), site_label);
-        let registry = Registry { store, blobs, clock: Clock::fixed(NOW_MS), transfers };
+        let (clock, changes) = (Clock::fixed(NOW_MS), Changes::new());
+        let registry = Registry { store, blobs, clock, transfers, changes };
         Self { base: serve(registry.clone(), caller).await, client: client(), registry, data }
     }
 

@@ -7,7 +7,7 @@ use bytes::Bytes;
 use task_proto::desired::{BlobRef, PackageRef};
 use task_proto::manifest::{Build, ContentFacts, Outputs, Ready, Requires, Run, TaskManifest};
 use task_proto::report::{Failure, FailureCode, HostFacts};
-use task_proto::{DeploymentId, Digest};
+use task_proto::{DeploymentId, Digest, Generation};
 
 use crate::driver::*;
 use crate::installation::Installation;
@@ -61,6 +61,12 @@ pub(super) struct State {
     pub(super) jobs: bool,
     /// How processes ended.
     exits: Vec<(String, i32)>,
+    /// Versions that nobody trusted has signed, and what is gone by.
+    pub(super) untrusted: BTreeSet<Digest>,
+    pub(super) trust: TrustFacts,
+    /// The states whose evidence was noted, and the versions whose signers were looked for.
+    pub(super) heeded: Vec<Generation>,
+    pub(super) checked: Vec<Digest>,
     /// Versions that never get ready.
     pub(super) bad: BTreeSet<Digest>,
     /// What ROS says of every process that lives.
@@ -138,7 +144,9 @@ impl Effects for Fake {
             };
             let manifest = || TaskManifest { exec_depends: state.exec_depends.clone(), ..of_jobs(manifest(package)) };
             let manifest = state.manifests.contains(&package.manifest.digest).then(manifest);
-            Prepared { manifest, content, built: content, versions: Vec::new() }
+            let is_trusted = !state.untrusted.contains(&package.manifest.digest);
+            let vouched = if is_trusted { Vouched::Yes } else { Vouched::No };
+            Prepared { manifest, content, built: content, versions: Vec::new(), vouched }
         })
     }
 
@@ -166,6 +174,20 @@ impl Effects for Fake {
             return watch::channel(Health::Refused(failure)).1;
         }
         self.state(|state| state.health.subscribe())
+    }
+
+    fn heed(&self, desired: &DesiredState) {
+        self.state(|state| state.heeded.push(desired.generation));
+    }
+
+    fn trust_facts(&self) -> TrustFacts {
+        self.state(|state| state.trust.clone())
+    }
+
+    async fn check_signers(&self, package: &PackageRef, _cancel: &CancellationToken) -> Result<(), StepFailure> {
+        self.state(|state| state.checked.push(package.manifest.digest));
+        let failure = Failure::new(FailureCode::UNTRUSTED_PACKAGE, "nobody has signed it");
+        Err(StepFailure { failure, retry_after_ms: None })
     }
 
     fn keep_parts(&self, wanted: &[Digest]) {

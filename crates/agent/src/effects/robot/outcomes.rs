@@ -1,11 +1,13 @@
 //! What the plan is told of how a step ended: each module's error as a failure's code and text, and whether to try again.
 
 use std::error::Error;
+use std::path::Path;
 use std::time::Duration;
 
 use task_proto::report::{Failure, FailureCode};
 
-use super::chain;
+use crate::builder::BuildError;
+use crate::disk;
 use crate::fetch::FetchError;
 use crate::outputs::OutputError;
 use crate::plan::{Done, StepFailure};
@@ -34,6 +36,19 @@ pub(super) fn fetch_failure(error: FetchError) -> StepFailure {
     finally(code, &error)
 }
 
+/// A build that failed on a disk without room, which holds `root`, says little of the package: it is tried again.
+pub(super) fn build_failure(error: BuildError, root: &Path) -> StepFailure {
+    let Some(code) = error.code() else { return later(FailureCode::BUILD_FAILED, &error, 0) };
+    match disk::room(root) {
+        Ok(room) if room.is_used_up() => {
+            let text = format!("{} of {} bytes are free; {}", room.free, room.total, chain(&error));
+            let least_ms = millis(disk::FULL_PAUSE);
+            StepFailure { failure: Failure::new(FailureCode::DISK_FULL, text), retry_after_ms: Some(least_ms) }
+        }
+        _ => finally(code, &error),
+    }
+}
+
 pub(super) fn outputs_code(error: &OutputError) -> FailureCode {
     match error {
         OutputError::Unreachable(_) | OutputError::Busy { .. } => FailureCode::SERVER_UNREACHABLE,
@@ -51,4 +66,16 @@ pub(super) fn finally(code: FailureCode, error: &dyn Error) -> StepFailure {
 
 pub(super) fn later(code: FailureCode, error: &dyn Error, least_ms: u64) -> StepFailure {
     StepFailure { failure: Failure::new(code, chain(error)), retry_after_ms: Some(least_ms) }
+}
+
+/// An error with all its causes.
+pub(crate) fn chain(error: &dyn Error) -> String {
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(error) = cause {
+        text.push_str(": ");
+        text.push_str(&error.to_string());
+        cause = error.source();
+    }
+    text
 }

@@ -39,6 +39,11 @@ pub(super) struct World {
     pub(super) bad: Option<u8>,
     pub(super) gated: bool,
     pub(super) outputs: Outputs,
+    /// Whether the robot asks who has signed a version, those whose signatures are on its disk, and whether these are
+    /// enough.
+    pub(super) asks: bool,
+    vouched: Vec<PackageRef>,
+    signed: bool,
 }
 
 /// What can happen.
@@ -68,6 +73,8 @@ pub(super) enum Happening {
     Reboot,
     Hold(bool),
     MayBegin(bool),
+    /// Signatures are enough, or not any more.
+    Signed(bool),
     Gate(bool),
     Sees(Sight),
     Wait {
@@ -117,6 +124,7 @@ pub(super) fn happening() -> impl Strategy<Value = Happening> {
         1 => Just(Reboot),
         1 => any::<bool>().prop_map(Hold),
         1 => any::<bool>().prop_map(MayBegin),
+        1 => any::<bool>().prop_map(Signed),
         1 => any::<bool>().prop_map(Gate),
         3 => sight().prop_map(Sees),
         3 => (0..90_000u64).prop_map(|ms| Wait { ms }),
@@ -171,6 +179,9 @@ impl World {
             bad: None,
             gated: false,
             outputs: Outputs::default(),
+            asks: false,
+            vouched: Vec::new(),
+            signed: true,
         }
     }
 
@@ -196,6 +207,7 @@ impl World {
             }
             Happening::Hold(held) => self.held = held,
             Happening::MayBegin(may_begin) => self.may_begin = may_begin,
+            Happening::Signed(signed) => self.signed = signed,
             Happening::Gate(gated) => self.gated = gated,
             Happening::Sees(sight) => self.health = health(sight, self.now_ms),
             Happening::Wait { ms } => self.now_ms += ms,
@@ -255,6 +267,14 @@ impl World {
 
     fn begin(&mut self, step: Step) {
         let record = self.record.as_ref().expect("a step is of a record");
+        let same = |run: &ActiveRun, other: &ActiveRun| run.deployment == other.deployment && run.run == other.run;
+        let new = match &step {
+            Step::PullManifest(package) | Step::PullContent { package, .. } | Step::Build(package) => Some(package),
+            Step::Start(run) if record.active.as_ref().is_none_or(|active| !same(active, run)) => Some(&run.package),
+            _ => None,
+        };
+        let vouched = new.map_or(Vouched::Yes, |package| self.vouched_for(package));
+        assert_eq!(vouched, Vouched::Yes, "nobody trusted has signed what is begun: {step:?}");
         self.record = Some(begun(record, &step, &self.boot.to_string(), self.start, self.now_ms));
         // What a start will do is fixed by the record written before it.
         let step = match step {
@@ -275,6 +295,7 @@ impl World {
             content: level > 1,
             built: level > 2,
             versions: self.disk.iter().map(|(package, _)| package.manifest.digest).collect(),
+            vouched: self.vouched_for(&record.order.package),
         };
         let process = match record.active.as_ref().and_then(|active| active.process.as_ref()) {
             None => ProcessState::None,
@@ -334,6 +355,13 @@ impl World {
             return;
         }
         match &step {
+            Step::CheckSigners(package) if self.signed => self.vouched.push(package.clone()),
+            Step::CheckSigners(_) => {
+                self.steps.retain(|(other, _)| *other != step);
+                let failure = Failure::new(FailureCode::UNTRUSTED_PACKAGE, "nobody has signed it");
+                let error = StepFailure { failure, retry_after_ms: None };
+                self.record = Some(self.with_situation(|s| finished(s, &step, Err(error.clone()))));
+            }
             Step::PullManifest(package) => self.raise(package, 1),
             Step::LookForRos(_) => self.ros_seen = true,
             Step::Ask(_) => {}
@@ -382,6 +410,11 @@ impl World {
         }
     }
 
+    fn vouched_for(&self, package: &PackageRef) -> Vouched {
+        let is_vouched = !self.asks || (self.signed && self.vouched.contains(package));
+        if is_vouched { Vouched::Yes } else { Vouched::No }
+    }
+
     fn raise(&mut self, package: &PackageRef, level: u8) {
         self.disk.retain(|(on_disk, _)| on_disk != package);
         self.disk.push((package.clone(), level));
@@ -403,6 +436,7 @@ impl World {
     pub(super) fn settle(&mut self) {
         self.happen(Happening::Hold(false));
         self.happen(Happening::MayBegin(true));
+        self.happen(Happening::Signed(true));
         self.health = health(Sight::All, 0);
         for _ in 0..60 {
             self.happen(Happening::Effect { well: true });

@@ -16,7 +16,7 @@ use task_proto::{Digest, RepositoryName, Tag};
 
 use super::blobs::serve;
 use super::parsed::Parsed;
-use super::{Answer, OciError, Registry, empty};
+use super::{Answer, OciError, Registry, empty, signed};
 use crate::blobs::Blob;
 use crate::person::Person;
 use crate::store::{Act, Deed, NewManifest, PutManifest, Reference, StoredManifest};
@@ -86,6 +86,7 @@ pub(super) async fn put(registry: &Registry, push: Push<'_>, parts: &Parts, body
         Some(image) => Some(check_output(registry, repository, image).await?),
         None => None,
     };
+    let document = signed::check(registry, repository, &parsed, &tags).await?;
     if only.is_some() && output.as_ref().is_some_and(|output| tags.iter().any(|tag| output.tag().as_ref() != Some(tag)))
     {
         return Err(OciError::denied("a robot may only tag an output with its own run"));
@@ -103,11 +104,16 @@ pub(super) async fn put(registry: &Registry, push: Push<'_>, parts: &Parts, body
         tags,
         package,
         output,
+        document,
     };
     let deed = by.map(|by| pushed(by, repository, &new));
     match registry.store.put_manifest(repository, &new, deed.as_ref(), now_ms).await? {
         PutManifest::PartsMissing(missing) => Err(OciError::parts_unknown(&missing)),
-        PutManifest::Stored => created(repository, &digest, subject, parts, &new.tags),
+        PutManifest::Outdated => Err(OciError::manifest_invalid("there is a list of publishers as new as this one")),
+        PutManifest::Stored => {
+            signed::tell(registry, repository, new.document.as_ref()).await;
+            created(repository, &digest, subject, parts, &new.tags)
+        }
     }
 }
 
@@ -195,7 +201,11 @@ async fn check_output(
 }
 
 /// Whether a blob is in the repository and as large as it is said to be.
-async fn check_blob(registry: &Registry, repository: &RepositoryName, part: BlobRef) -> Result<Blob, OciError> {
+pub(super) async fn check_blob(
+    registry: &Registry,
+    repository: &RepositoryName,
+    part: BlobRef,
+) -> Result<Blob, OciError> {
     let is_here = registry.store.has_blob(Some(repository), &part.digest).await?;
     let blob = if is_here { registry.blobs.get(part.digest).await? } else { None };
     let blob = blob.ok_or_else(|| OciError::parts_unknown(&[part.digest]))?;

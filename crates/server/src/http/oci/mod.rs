@@ -6,6 +6,7 @@ mod error;
 mod lists;
 mod manifests;
 mod parsed;
+mod signed;
 mod uploads;
 
 use axum::extract::{Path, Request, State};
@@ -14,12 +15,14 @@ use http::{HeaderMap, HeaderValue, Method, StatusCode, Uri};
 use serde::de::DeserializeOwned;
 use task_proto::output::{self, OUTPUT_TYPE};
 use task_proto::person::Permission;
+use task_proto::publisher::LIST_REPOSITORY;
 use task_proto::{Digest, RepositoryName, RobotId};
 
 pub use error::OciError;
 
 use super::auth::Caller;
 use crate::blobs::Blobs;
+use crate::changes::Changes;
 use crate::clock::Clock;
 use crate::person::Person;
 use crate::store::{Reference, Store};
@@ -36,6 +39,8 @@ pub struct Registry {
     pub clock: Clock,
     /// Whose turn it is to pull.
     pub transfers: Transfers,
+    /// Who hears of what was signed.
+    pub changes: Changes,
 }
 
 /// How every handler here ends.
@@ -181,7 +186,7 @@ async fn check_person(
 }
 
 /// What a person needs for this. Outputs are the robots': one may be ended like the task it came from, and only who may do
-/// everything pushes in a robot's name.
+/// everything pushes in a robot's name. The list of publishers concerns all robots.
 fn needed(repository: &RepositoryName, method: &Method, endpoint: &Endpoint<'_>) -> Permission {
     let is_output = repository.as_str().starts_with("outputs/");
     match (method, endpoint) {
@@ -189,7 +194,7 @@ fn needed(repository: &RepositoryName, method: &Method, endpoint: &Endpoint<'_>)
             Permission::Read
         }
         (&Method::DELETE, Endpoint::Manifest(_)) if is_output => Permission::Operate,
-        _ if is_output => Permission::Administer,
+        _ if is_output || repository.as_str() == LIST_REPOSITORY => Permission::Administer,
         _ => Permission::Publish,
     }
 }

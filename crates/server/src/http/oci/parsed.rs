@@ -7,6 +7,7 @@ use serde::Deserialize;
 use task_proto::Digest;
 use task_proto::oci::{INDEX_TYPE, ImageManifest, MANIFEST_TYPE, PACKAGE_TYPE};
 use task_proto::output::OUTPUT_TYPE;
+use task_proto::publisher::{LIST_ARTIFACT, SIGNATURE_ARTIFACT};
 
 use super::OciError;
 
@@ -32,6 +33,10 @@ pub(super) struct Parsed {
     pub(super) package: Option<ImageManifest>,
     /// The same, if it is meant to be the output of a run.
     pub(super) output: Option<ImageManifest>,
+    /// The same, if it is meant to be what publishers have signed about a package.
+    pub(super) signature: Option<ImageManifest>,
+    /// The same, if it is meant to be a list of publishers.
+    pub(super) publishers: Option<ImageManifest>,
 }
 
 #[derive(Deserialize)]
@@ -74,6 +79,7 @@ impl Parsed {
             is_meant.then(|| serde_json::from_slice(bytes).map_err(invalid)).transpose()
         };
         let (package, output) = (whole_if(PACKAGE_TYPE)?, whole_if(OUTPUT_TYPE)?);
+        let (signature, publishers) = (whole_if(SIGNATURE_ARTIFACT)?, whole_if(LIST_ARTIFACT)?);
         let config_type = document.config.as_ref().map(|config| config.media_type.clone());
         let parsed = Self {
             media_type,
@@ -83,6 +89,8 @@ impl Parsed {
             subject: document.subject.map(|subject| subject.digest),
             package,
             output,
+            signature,
+            publishers,
         };
         parsed.check_texts()?;
         Ok(parsed)

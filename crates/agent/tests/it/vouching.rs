@@ -1,0 +1,343 @@
+//! Who vouches for a package, against a real HTTP server that has, or does not have, what publishers have signed.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use axum::Router;
+use axum::extract::{Path, State};
+use axum::http::{StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use axum::routing::get;
+use task_agent::config::Config;
+use task_agent::credential::Credential;
+use task_agent::effects::{Effects as _, Robot as Body};
+use task_agent::fetch::{FetchSettings, Fetcher};
+use task_agent::layout::DataDir;
+use task_agent::ledger::{ActiveRun, ProcessRecord, RunRules};
+use task_agent::observed::Vouched;
+use task_agent::outputs::Registry;
+use task_agent::parts::Listening;
+use task_agent::trust::{Trust, TrustSettings, Use};
+use task_agent::vouching::{NotVouched, Vouching};
+use task_proto::desired::{BlobRef, DesiredState, DesiredTask, Evidence, PackageRef, SignatureRef, Wanted};
+use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
+use task_proto::manifest::TaskManifest;
+use task_proto::publisher::{MAX_SIGNATURE_BYTES, PackageStatement, PublisherList, Role};
+use task_proto::report::{FailureCode, Progress};
+use task_proto::{DeploymentId, Digest, Generation, RobotId};
+use tokio::sync::watch;
+use tokio_util::sync::CancellationToken;
+
+use crate::harness::{eventually, within};
+
+/// What the server has, by digest, and what was asked for.
+#[derive(Default)]
+struct Shelf {
+    blobs: HashMap<String, Vec<u8>>,
+    asked: Vec<String>,
+    is_away: bool,
+}
+
+/// A robot that asks for two of the publishers 1, 2 and 3; the keeper is 7.
+struct Robot {
+    shelf: Arc<Mutex<Shelf>>,
+    vouching: Arc<Vouching>,
+    server: reqwest::Url,
+    dir: tempfile::TempDir,
+}
+
+fn key(seed: u8) -> SigningKey {
+    SigningKey::from_bytes([seed; 32])
+}
+
+fn role(seeds: &[u8], threshold: u32) -> Role {
+    Role::new(seeds.iter().map(|seed| key(*seed).public_key()).collect(), threshold).unwrap()
+}
+
+fn package(name: &str) -> PackageRef {
+    let blob = |part: &str| BlobRef::of(format!("{name} {part}").as_bytes());
+    PackageRef {
+        name: name.parse().unwrap(),
+        version: "1.0".parse().unwrap(),
+        manifest: blob("manifest"),
+        config: blob("config"),
+        content: blob("content"),
+    }
+}
+
+fn signature(seed: u8, package: &PackageRef) -> Envelope {
+    PackageStatement { package: package.clone() }.seal(&key(seed))
+}
+
+fn list(version: u64, publishers: &[u8]) -> Envelope {
+    let list = PublisherList {
+        version,
+        issued_at_ms: 1,
+        expires_at_ms: u64::MAX,
+        publishers: role(publishers, 1),
+        keepers: role(&[7], 1),
+        withdrawn: Vec::new(),
+    };
+    list.seal(&key(7))
+}
+
+fn order(package: &PackageRef) -> DesiredTask {
+    DesiredTask {
+        task: package.name.clone(),
+        deployment: DeploymentId::random(),
+        package: package.clone(),
+        wanted: Wanted::Running,
+        run: 1,
+        delivery: Default::default(),
+        priority: 0,
+    }
+}
+
+fn rules() -> RunRules {
+    let manifest = serde_json::json!({
+        "name": "talker", "version": "1.0", "run": { "exec": ["true"] },
+        "content": { "tar_digest": Digest::of(b""), "tar_size": 0, "entries": 0 },
+    });
+    RunRules::from(&serde_json::from_value::<TaskManifest>(manifest).unwrap())
+}
+
+async fn answer(State(shelf): State<Arc<Mutex<Shelf>>>, Path(path): Path<String>) -> Response {
+    let mut shelf = shelf.lock().unwrap();
+    shelf.asked.push(path.clone());
+    if shelf.is_away {
+        return (StatusCode::SERVICE_UNAVAILABLE, [(header::RETRY_AFTER, "0")]).into_response();
+    }
+    let digest = path.rsplit('/').next().unwrap().to_owned();
+    match shelf.blobs.get(&digest) {
+        Some(bytes) => ([("docker-content-digest", digest)], bytes.clone()).into_response(),
+        None => StatusCode::NOT_FOUND.into_response(),
+    }
+}
+
+impl Robot {
+    async fn new() -> Self {
+        let shelf: Arc<Mutex<Shelf>> = Arc::default();
+        let router = Router::new().route("/v2/{*path}", get(answer)).with_state(shelf.clone());
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let server: reqwest::Url = format!("http://{}/", listener.local_addr().unwrap()).parse().unwrap();
+        tokio::spawn(async move { axum::serve(listener, router).await });
+        let dir = tempfile::tempdir().unwrap();
+        let vouching = Self::vouching(&server, &dir);
+        Self { shelf, vouching, server, dir }
+    }
+
+    fn vouching(server: &reqwest::Url, dir: &tempfile::TempDir) -> Arc<Vouching> {
+        let data = DataDir::new(dir.path()).unwrap();
+        let _ = rustls::crypto::ring::default_provider().install_default();
+        let client = reqwest::Client::builder().no_proxy().build().unwrap();
+        let settings = FetchSettings { stall_timeout: Duration::from_secs(20), ..FetchSettings::default() };
+        let fetcher = Fetcher::new(client, server.clone(), "token".to_owned(), data.clone(), settings);
+        let trusted = TrustSettings { publishers: role(&[1, 2, 3], 2), keepers: role(&[7], 1), requires_list: false };
+        let trust = Trust::open(trusted, data.publishers());
+        Arc::new(Vouching::new(trust, Arc::new(fetcher), data))
+    }
+
+    fn restart(&mut self) {
+        self.vouching = Self::vouching(&self.server, &self.dir);
+    }
+
+    /// Puts a document on the server's shelf.
+    fn shelve(&self, envelope: &Envelope) -> BlobRef {
+        let bytes = serde_json::to_vec(envelope).unwrap();
+        let blob = BlobRef::of(&bytes);
+        self.shelf.lock().unwrap().blobs.insert(blob.digest.to_string(), bytes);
+        blob
+    }
+
+    /// The server names these.
+    fn told(&self, package: &PackageRef, lists: &[&Envelope], signatures: &[&Envelope]) {
+        let manifest = package.manifest.digest;
+        self.told_of(
+            package,
+            Evidence {
+                lists: lists.iter().map(|list| self.shelve(list)).collect(),
+                signatures: signatures
+                    .iter()
+                    .map(|signature| SignatureRef { manifest, envelope: self.shelve(signature) })
+                    .collect(),
+            },
+        );
+    }
+
+    fn told_of(&self, package: &PackageRef, evidence: Evidence) {
+        self.vouching.heed(&DesiredState {
+            robot_id: RobotId::random(),
+            generation: Generation(1),
+            issued_at_ms: 0,
+            expires_at_ms: u64::MAX,
+            tasks: vec![order(package)],
+            evidence,
+        });
+    }
+
+    async fn vouch(&self, package: &PackageRef) -> Result<(), NotVouched> {
+        within("a judgement", self.vouching.vouch(package, Use::Begin, &CancellationToken::new())).await
+    }
+
+    fn asked(&self) -> usize {
+        std::mem::take(&mut self.shelf.lock().unwrap().asked).len()
+    }
+
+    fn is_away(&self, is_away: bool) {
+        self.shelf.lock().unwrap().is_away = is_away;
+    }
+}
+
+#[tokio::test]
+async fn signatures_are_pulled_and_count_without_the_server_from_then_on() {
+    let (mut robot, talker) = (Robot::new().await, package("talker"));
+    let [ada, bob, eve] = [1, 2, 9].map(|seed| signature(seed, &talker));
+    robot.told(&talker, &[], &[&eve, &ada]);
+    let error = robot.vouch(&talker).await.unwrap_err().to_string();
+    assert!(error.starts_with("1 of the 2 trusted publishers that it takes"), "{error}");
+    assert_eq!(robot.vouching.look(&talker), Vouched::No);
+    robot.told(&talker, &[], &[&eve, &ada, &bob]);
+    robot.vouch(&talker).await.unwrap();
+    assert_eq!(robot.vouching.look(&talker), Vouched::Yes);
+    robot.asked();
+    robot.is_away(true);
+    robot.restart();
+    robot.vouch(&talker).await.unwrap();
+    assert_eq!((robot.vouching.look(&talker), robot.asked()), (Vouched::Yes, 0));
+}
+
+#[tokio::test]
+async fn a_server_that_is_away_is_asked_again_and_one_that_has_nothing_is_not() {
+    let (robot, talker) = (Robot::new().await, package("talker"));
+    let [ada, bob] = [1, 2].map(|seed| signature(seed, &talker));
+    robot.is_away(true);
+    robot.told(&talker, &[], &[&ada, &bob]);
+    let error = robot.vouch(&talker).await.unwrap_err();
+    assert!(matches!(&error, NotVouched::Fetch(error) if error.is_retryable()), "{error:?}");
+    robot.is_away(false);
+    robot.shelf.lock().unwrap().blobs.clear();
+    let error = robot.vouch(&talker).await.unwrap_err();
+    assert!(matches!(error, NotVouched::Distrusted(_)), "{error:?}");
+}
+
+#[tokio::test]
+async fn endless_data_in_the_place_of_a_signature_is_not_even_asked_for() {
+    let (robot, talker) = (Robot::new().await, package("talker"));
+    let endless = BlobRef { digest: Digest::of(b"endless"), size: MAX_SIGNATURE_BYTES + 1 };
+    let signatures = vec![SignatureRef { manifest: talker.manifest.digest, envelope: endless }];
+    robot.told_of(&talker, Evidence { lists: Vec::new(), signatures });
+    assert!(robot.vouch(&talker).await.is_err());
+    // Nor are more bytes read than were announced, whatever comes.
+    let ada = signature(1, &talker);
+    let short = BlobRef { size: 10, ..robot.shelve(&ada) };
+    let signatures = vec![SignatureRef { manifest: talker.manifest.digest, envelope: short }];
+    assert_eq!(robot.asked(), 0);
+    robot.told_of(&talker, Evidence { lists: Vec::new(), signatures });
+    assert!(robot.vouch(&talker).await.is_err());
+    assert_eq!(robot.asked(), 1);
+}
+
+#[tokio::test]
+async fn a_new_list_is_followed_without_an_order_and_an_old_one_never() {
+    let (mut robot, talker) = (Robot::new().await, package("talker"));
+    let [ada, eve] = [1, 9].map(|seed| signature(seed, &talker));
+    let (first, second) = (list(1, &[1]), list(2, &[9]));
+    robot.told(&talker, &[&first], &[&ada]);
+    robot.vouch(&talker).await.unwrap();
+    assert_eq!(robot.vouching.version(), 1);
+    assert_eq!(robot.vouching.facts().refused_list, None, "who follows and who waits have both had it");
+    let epoch = robot.vouching.facts().epoch;
+    robot.told(&talker, &[&first, &second], &[&ada]);
+    eventually("the second list to be followed", || (robot.vouching.version() == 2).then_some(())).await;
+    assert_ne!(robot.vouching.facts().epoch, epoch, "what was judged is judged anew");
+    assert_eq!(robot.vouching.look(&talker), Vouched::No, "its publisher is revoked");
+    // A server that was taken over, or put back from a copy, names the first again.
+    robot.restart();
+    robot.told(&talker, &[&first], &[&ada]);
+    let refused = eventually("the first to be refused", || robot.vouching.facts().refused_list).await;
+    assert!(refused.contains("its version 1 is not newer than 2"), "{refused}");
+    assert!(robot.vouch(&talker).await.is_err());
+    robot.told(&talker, &[&first, &second], &[&eve]);
+    robot.vouch(&talker).await.unwrap();
+}
+
+#[tokio::test]
+async fn what_is_installed_gets_the_signature_of_a_new_key_without_an_order() {
+    let (robot, talker) = (Robot::new().await, package("talker"));
+    let [ada, eve] = [1, 9].map(|seed| signature(seed, &talker));
+    robot.told(&talker, &[&list(1, &[1])], &[&ada]);
+    robot.vouch(&talker).await.unwrap();
+    let src = DataDir::new(robot.dir.path()).unwrap().task(&talker.name).version(&talker.manifest.digest).src();
+    std::fs::create_dir_all(src).unwrap();
+    robot.told(&talker, &[&list(1, &[1]), &list(2, &[9])], &[&ada, &eve]);
+    let vouched = || (robot.vouching.version() == 2 && robot.vouching.look(&talker) == Vouched::Yes).then_some(());
+    eventually("the new signature to be there", vouched).await;
+}
+
+#[tokio::test]
+async fn a_list_by_others_than_the_keepers_changes_nothing_and_is_told() {
+    let (robot, talker) = (Robot::new().await, package("talker"));
+    let forged = PublisherList {
+        version: 5,
+        issued_at_ms: 1,
+        expires_at_ms: u64::MAX,
+        publishers: role(&[9], 1),
+        keepers: role(&[9], 1),
+        withdrawn: Vec::new(),
+    };
+    let eve = signature(9, &talker);
+    robot.told(&talker, &[&forged.seal(&key(9))], &[&eve]);
+    assert!(robot.vouch(&talker).await.is_err());
+    let refused = robot.vouching.facts().refused_list.unwrap();
+    assert!(refused.contains("signed by 0 of the 1 keepers"), "{refused}");
+    assert_eq!(robot.vouching.version(), 0);
+    // Nor does what was signed as something else.
+    let other = Envelope::seal(DESIRED_STATE_TYPE, &serde_json::to_vec(&forged).unwrap(), &key(7));
+    robot.told(&talker, &[&other], &[&eve]);
+    assert!(robot.vouch(&talker).await.is_err());
+    assert_eq!(robot.vouching.version(), 0);
+}
+
+#[tokio::test]
+async fn a_step_that_is_under_way_when_its_publishers_are_not_trusted_does_nothing() {
+    let (site, talker) = (Robot::new().await, package("talker"));
+    let data = DataDir::new(site.dir.path()).unwrap();
+    let keys = [("TASK_AGENT_TRUSTED_PUBLISHERS_KEYS".into(), key(1).public_key().to_string().into())];
+    let config = Config::load(site.dir.path(), keys.into_iter()).unwrap();
+    let client = reqwest::Client::builder().no_proxy().build().unwrap();
+    let (token, settings) = (Credential::from("token".to_owned()), FetchSettings::default());
+    let fetcher = Fetcher::new(client.clone(), site.server.clone(), token.clone(), data.clone(), settings);
+    let registry = Registry::new(client, site.server.clone(), token);
+    let mac = "02:00:00:00:00:01".parse().unwrap();
+    let robot = Body::new(data, (fetcher, Listening::default()), registry, &config, &RobotId::random(), mac);
+    let (cancel, progress) = (CancellationToken::new(), watch::Sender::new(Progress { done: 0, total: 0 }));
+    let asks = watch::Sender::default();
+    let run = ActiveRun {
+        process: Some(ProcessRecord {
+            dir: "d.1.1.1".to_owned(),
+            boot_id: "boot".to_owned(),
+            started_ms: 1,
+            pid: None,
+            ready: false,
+            condemned: None,
+        }),
+        ..ActiveRun::of(&order(&talker), rules(), 0)
+    };
+    let outcomes = [
+        robot.check_signers(&talker, &cancel).await,
+        robot.pull_manifest(&talker, &cancel).await.map(drop),
+        robot.pull_content(&talker, &progress, &cancel).await.map(drop),
+        robot.gather_content(&talker, &progress, &asks, &cancel).await.map(drop),
+        robot.build(&talker, &cancel).await,
+        robot.start(&talker.name, &run).await.map(drop),
+    ];
+    for (at, outcome) in outcomes.into_iter().enumerate() {
+        let refused = outcome.unwrap_err();
+        assert_eq!(refused.failure.code, FailureCode::UNTRUSTED_PACKAGE, "{at}: {}", refused.failure);
+        // What was planned on another judgement is judged again; what decides is final.
+        assert_eq!(refused.retry_after_ms.is_none(), matches!(at, 0 | 5), "{at}");
+    }
+    assert_eq!(site.asked(), 0, "nothing was fetched");
+    assert_eq!(robot.prepared(&talker).await.vouched, Vouched::No);
+}

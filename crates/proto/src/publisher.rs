@@ -1,0 +1,417 @@
+//! Who may say that a package may be run: what publishers sign, the list of those who count, and how both are judged.
+//! After TUF and Uptane: what is signed pins digests and sizes; a list has a version and a lifetime, and is signed by the
+//! keepers of the list before it. Pure, and the same on both sides; a server judges only to turn mistakes away early.
+
+use serde::{Deserialize, Serialize};
+
+use crate::Digest;
+use crate::desired::PackageRef;
+use crate::envelope::{Envelope, EnvelopeError, PublicKey, SigningKey};
+
+/// The payload type of a signed [`PackageStatement`].
+pub const STATEMENT_TYPE: &str = "application/vnd.taskd.package-statement.v1+json";
+/// The payload type of a signed [`PublisherList`].
+pub const LIST_TYPE: &str = "application/vnd.taskd.publisher-list.v1+json";
+/// `artifactType` of a package's signature.
+pub const SIGNATURE_ARTIFACT: &str = "application/vnd.taskd.signature.v1";
+/// `artifactType` of a list of publishers.
+pub const LIST_ARTIFACT: &str = "application/vnd.taskd.publisher-list.v1";
+/// The repository of the lists; each has its version as tag.
+pub const LIST_REPOSITORY: &str = "taskd/publishers";
+/// The most keys of a role.
+pub const MAX_KEYS: usize = 16;
+/// The most packages a list withdraws.
+pub const MAX_WITHDRAWN: usize = 256;
+/// The largest envelope about a package, as JSON.
+pub const MAX_SIGNATURE_BYTES: u64 = 16 * 1024;
+/// The most envelopes about one package that anyone looks at.
+pub const MAX_SIGNATURES: usize = 16;
+/// The largest envelope of a list, as JSON.
+pub const MAX_LIST_BYTES: u64 = 64 * 1024;
+/// The most lists one robot is told of.
+pub const MAX_LISTS: usize = 16;
+
+/// Keys, and how many of them it takes.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "RoleFields")]
+pub struct Role {
+    keys: Vec<PublicKey>,
+    threshold: u32,
+}
+
+#[derive(Deserialize)]
+struct RoleFields {
+    keys: Vec<PublicKey>,
+    threshold: u32,
+}
+
+/// Keys and a number that are no role.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum InvalidRole {
+    /// Nobody, or too many.
+    #[error("{0} keys, expected 1 to {MAX_KEYS}")]
+    Keys(usize),
+    /// One key would count twice.
+    #[error("key {0} is there twice")]
+    Twice(String),
+    /// Nobody could be asked for, or nobody could ever do it.
+    #[error("a threshold of {threshold} with {keys} keys")]
+    Threshold {
+        /// What is asked for.
+        threshold: u32,
+        /// How many keys there are.
+        keys: usize,
+    },
+}
+
+impl Role {
+    /// `threshold` of `keys`.
+    pub fn new(keys: Vec<PublicKey>, threshold: u32) -> Result<Self, InvalidRole> {
+        if keys.is_empty() || keys.len() > MAX_KEYS {
+            return Err(InvalidRole::Keys(keys.len()));
+        }
+        if let Some(twice) = keys.iter().enumerate().find(|(at, key)| keys[..*at].contains(key)) {
+            return Err(InvalidRole::Twice(twice.1.id()));
+        }
+        if threshold == 0 || threshold as usize > keys.len() {
+            return Err(InvalidRole::Threshold { threshold, keys: keys.len() });
+        }
+        Ok(Self { keys, threshold })
+    }
+
+    /// Whose signatures count.
+    pub fn keys(&self) -> &[PublicKey] {
+        &self.keys
+    }
+
+    /// How many of them it takes.
+    pub fn threshold(&self) -> u32 {
+        self.threshold
+    }
+
+    /// Whether so many different keys are enough.
+    fn is_reached_by(&self, signers: usize) -> bool {
+        signers >= self.threshold as usize
+    }
+}
+
+impl TryFrom<RoleFields> for Role {
+    type Error = InvalidRole;
+    fn try_from(fields: RoleFields) -> Result<Self, InvalidRole> {
+        Self::new(fields.keys, fields.threshold)
+    }
+}
+
+/// What a publisher signs: that just this package may be run. All its blobs are in it with digest and size, so that no
+/// part can be exchanged for another's and none has more bytes than was signed. Nothing else is in it: whoever signs the
+/// same package twice has signed the same bytes.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct PackageStatement {
+    /// The package.
+    pub package: PackageRef,
+}
+
+impl PackageStatement {
+    /// Signs it.
+    pub fn seal(&self, key: &SigningKey) -> Envelope {
+        let payload = serde_json::to_vec(self).expect("a statement always has a JSON form");
+        Envelope::seal(STATEMENT_TYPE, &payload, key)
+    }
+
+    /// What an envelope says, as somebody sent it.
+    pub fn unverified(envelope: &Envelope) -> Result<Self, Refused> {
+        let payload = envelope.unverified_payload(STATEMENT_TYPE)?;
+        serde_json::from_slice(&payload).map_err(|error| Refused::Malformed(error.to_string()))
+    }
+}
+
+/// Who may publish from now on, and who says so the next time.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct PublisherList {
+    /// From 1, and only growing: a robot goes back to none below the one it has.
+    pub version: u64,
+    /// When it was made: milliseconds since the Unix epoch.
+    pub issued_at_ms: u64,
+    /// Until when new work may be begun by it, likewise.
+    pub expires_at_ms: u64,
+    /// Whose signatures a package needs.
+    pub publishers: Role,
+    /// Whose signatures the next list needs.
+    pub keepers: Role,
+    /// Packages that are not to be run any more, whoever has signed them: their manifests.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub withdrawn: Vec<Digest>,
+}
+
+/// Why a list, or an envelope about a package, is not taken.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum Refused {
+    /// The envelope can't be read.
+    #[error("its envelope can't be used: {0}")]
+    Envelope(#[from] EnvelopeError),
+    /// What was signed can't be read.
+    #[error("what is signed can't be read: {0}")]
+    Malformed(String),
+    /// Too few of those have signed it whose say it is.
+    #[error(
+        "signed by {signed} of the {needed} keepers that it takes: those of the list before it, or for the first, of the robot"
+    )]
+    NotByKeepers {
+        /// How many have.
+        signed: usize,
+        /// How many it takes.
+        needed: u32,
+    },
+    /// Too few of the keepers that it names itself have shown that they have their keys.
+    #[error("signed by {signed} of the {needed} keepers that it names itself")]
+    NotByItsOwn {
+        /// How many have.
+        signed: usize,
+        /// How many it takes.
+        needed: u32,
+    },
+    /// Not newer than what is known.
+    #[error("its version {offered} is not newer than {known}, which is known")]
+    NotNewer {
+        /// Its version.
+        offered: u64,
+        /// What is known.
+        known: u64,
+    },
+    /// It would never have counted.
+    #[error("it expires before it was made")]
+    NoLifetime,
+    /// More packages than anybody keeps in mind.
+    #[error("it withdraws {0} packages, at most {MAX_WITHDRAWN} are possible")]
+    TooManyWithdrawn(usize),
+}
+
+impl PublisherList {
+    /// Signs it.
+    pub fn seal(&self, key: &SigningKey) -> Envelope {
+        let payload = serde_json::to_vec(self).expect("a list always has a JSON form");
+        Envelope::seal(LIST_TYPE, &payload, key)
+    }
+
+    /// The list in `envelope`, if it may follow the one with `version` (0: none) whose keepers are `keepers`.
+    pub fn follow(envelope: &Envelope, keepers: &Role, version: u64) -> Result<Self, Refused> {
+        let (payload, signers) = envelope.signers(LIST_TYPE, &keepers.keys)?;
+        if !keepers.is_reached_by(signers.len()) {
+            return Err(Refused::NotByKeepers { signed: signers.len(), needed: keepers.threshold });
+        }
+        let list = Self::read(&payload)?;
+        list.check_own_keepers(envelope)?;
+        if list.version <= version {
+            return Err(Refused::NotNewer { offered: list.version, known: version });
+        }
+        Ok(list)
+    }
+
+    /// The list in `envelope`, if its own keepers have signed it: what can be told of the first.
+    pub fn alone(envelope: &Envelope) -> Result<Self, Refused> {
+        let list = Self::unverified(envelope)?;
+        list.check_own_keepers(envelope)?;
+        Ok(list)
+    }
+
+    /// What an envelope says, as somebody sent it.
+    pub fn unverified(envelope: &Envelope) -> Result<Self, Refused> {
+        Self::read(&envelope.unverified_payload(LIST_TYPE)?)
+    }
+
+    /// Whether its lifetime is over.
+    pub fn is_expired(&self, now_ms: u64) -> bool {
+        now_ms >= self.expires_at_ms
+    }
+
+    fn read(payload: &[u8]) -> Result<Self, Refused> {
+        let list: Self = serde_json::from_slice(payload).map_err(|error| Refused::Malformed(error.to_string()))?;
+        if list.withdrawn.len() > MAX_WITHDRAWN {
+            return Err(Refused::TooManyWithdrawn(list.withdrawn.len()));
+        }
+        if list.expires_at_ms <= list.issued_at_ms {
+            return Err(Refused::NoLifetime);
+        }
+        Ok(list)
+    }
+
+    fn check_own_keepers(&self, envelope: &Envelope) -> Result<(), Refused> {
+        let (_, own) = envelope.signers(LIST_TYPE, &self.keepers.keys)?;
+        if self.keepers.is_reached_by(own.len()) {
+            return Ok(());
+        }
+        Err(Refused::NotByItsOwn { signed: own.len(), needed: self.keepers.threshold })
+    }
+}
+
+/// Too few of those who count have signed a package.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{signed} of the {needed} trusted publishers that it takes have signed it (have not: {})", missing.join(", "))]
+pub struct Unsigned {
+    /// How many have.
+    pub signed: usize,
+    /// How many it takes.
+    pub needed: u32,
+    /// The ids of those who count and have not.
+    pub missing: Vec<String>,
+}
+
+/// Those of `envelopes` by which a threshold of `publishers` say that just this package may be run.
+pub fn vouching<'a>(
+    publishers: &Role,
+    package: &PackageRef,
+    envelopes: &'a [Envelope],
+) -> Result<Vec<&'a Envelope>, Unsigned> {
+    let mut signers: Vec<&PublicKey> = Vec::new();
+    let mut counted = Vec::new();
+    for envelope in envelopes.iter().take(MAX_SIGNATURES) {
+        let Ok((payload, by)) = envelope.signers(STATEMENT_TYPE, &publishers.keys) else { continue };
+        let is_meant = serde_json::from_slice::<PackageStatement>(&payload).is_ok_and(|said| said.package == *package);
+        let new: Vec<&PublicKey> = by.into_iter().filter(|key| is_meant && !signers.contains(key)).collect();
+        if !new.is_empty() {
+            signers.extend(new);
+            counted.push(envelope);
+        }
+    }
+    if publishers.is_reached_by(signers.len()) {
+        return Ok(counted);
+    }
+    let missing = publishers.keys.iter().filter(|key| !signers.contains(key)).map(PublicKey::id).collect();
+    Err(Unsigned { signed: signers.len(), needed: publishers.threshold, missing })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::desired::BlobRef;
+
+    fn key(seed: u8) -> SigningKey {
+        SigningKey::from_bytes([seed; 32])
+    }
+
+    fn role(seeds: &[u8], threshold: u32) -> Role {
+        Role::new(seeds.iter().map(|seed| key(*seed).public_key()).collect(), threshold).expect("a role")
+    }
+
+    fn package(name: &str) -> PackageRef {
+        let blob = |part: &str| BlobRef::of(format!("{name} {part}").as_bytes());
+        PackageRef {
+            name: name.parse().expect("valid"),
+            version: "1.0".parse().expect("valid"),
+            manifest: blob("manifest"),
+            config: blob("config"),
+            content: blob("content"),
+        }
+    }
+
+    fn said_by(seed: u8, package: &PackageRef) -> Envelope {
+        PackageStatement { package: package.clone() }.seal(&key(seed))
+    }
+
+    fn list(version: u64, publishers: Role, keepers: Role) -> PublisherList {
+        PublisherList { version, issued_at_ms: 10, expires_at_ms: 20, publishers, keepers, withdrawn: Vec::new() }
+    }
+
+    fn sealed(list: &PublisherList, seeds: &[u8]) -> Envelope {
+        let mut envelope = list.seal(&key(seeds[0]));
+        seeds[1..].iter().for_each(|seed| envelope.sign_also(LIST_TYPE, &key(*seed)).expect("signed"));
+        envelope
+    }
+
+    #[test]
+    fn it_takes_a_threshold_of_different_trusted_keys() {
+        let (talker, publishers) = (package("talker"), role(&[1, 2, 3], 2));
+        let [ada, bob, eve] = [1, 2, 9].map(|seed| said_by(seed, &talker));
+        let signed = |envelopes: &[&Envelope]| {
+            let envelopes: Vec<Envelope> = envelopes.iter().map(|envelope| (*envelope).clone()).collect();
+            match vouching(&publishers, &talker, &envelopes) {
+                Ok(counted) => counted.len(),
+                Err(unsigned) => panic!("{unsigned}"),
+            }
+        };
+        assert_eq!(signed(&[&eve, &ada, &ada, &bob]), 2);
+        for few in [vec![], vec![&ada, &ada], vec![&ada, &eve], vec![&eve, &eve]] {
+            let few: Vec<Envelope> = few.into_iter().cloned().collect();
+            let unsigned = vouching(&publishers, &talker, &few).expect_err("too few");
+            assert_eq!((unsigned.needed, unsigned.signed + unsigned.missing.len()), (2, 3));
+        }
+        // Both in one envelope.
+        let mut both = ada.clone();
+        both.sign_also(STATEMENT_TYPE, &key(2)).expect("signed");
+        assert_eq!(signed(&[&both]), 1);
+    }
+
+    #[test]
+    fn a_signature_is_about_one_package_with_all_its_digests_and_sizes() {
+        let (talker, publishers) = (package("talker"), role(&[1], 1));
+        let envelopes = [said_by(1, &talker)];
+        assert!(vouching(&publishers, &talker, &envelopes).is_ok());
+        let other = package("other");
+        // Mix and match: parts of other packages, also signed ones, in its place; and more bytes than were signed.
+        let endless = BlobRef { size: u64::MAX, ..talker.content };
+        for changed in [
+            PackageRef { content: other.content, ..talker.clone() },
+            PackageRef { config: other.config, ..talker.clone() },
+            PackageRef { manifest: other.manifest, ..talker.clone() },
+            PackageRef { name: other.name.clone(), ..talker.clone() },
+            PackageRef { version: "2.0".parse().expect("valid"), ..talker.clone() },
+            PackageRef { content: endless, ..talker.clone() },
+        ] {
+            let envelopes = [said_by(1, &talker), said_by(1, &other)];
+            assert!(vouching(&publishers, &changed, &envelopes).is_err(), "{changed:?}");
+        }
+    }
+
+    #[test]
+    fn what_was_signed_as_something_else_is_no_statement() {
+        let (talker, publishers) = (package("talker"), role(&[1], 1));
+        let statement = PackageStatement { package: talker.clone() };
+        let payload = serde_json::to_vec(&statement).expect("json");
+        for kind in [LIST_TYPE, crate::envelope::DESIRED_STATE_TYPE] {
+            assert!(vouching(&publishers, &talker, &[Envelope::seal(kind, &payload, &key(1))]).is_err());
+        }
+    }
+
+    #[test]
+    fn a_list_follows_if_the_keepers_before_it_and_its_own_have_signed() {
+        let before = role(&[1, 2], 2);
+        let next = list(2, role(&[5], 1), role(&[2, 3], 1));
+        assert_eq!(PublisherList::follow(&sealed(&next, &[1, 2]), &before, 1), Ok(next.clone()));
+        let refused = |seeds: &[u8]| PublisherList::follow(&sealed(&next, seeds), &before, 1).expect_err("refused");
+        assert_eq!(refused(&[1, 3]), Refused::NotByKeepers { signed: 1, needed: 2 });
+        assert_eq!(refused(&[5]), Refused::NotByKeepers { signed: 0, needed: 2 });
+        let strangers = list(2, role(&[5], 1), role(&[3], 1));
+        let without_their_say = PublisherList::follow(&sealed(&strangers, &[1, 2]), &before, 1);
+        assert_eq!(without_their_say, Err(Refused::NotByItsOwn { signed: 0, needed: 1 }));
+        assert!(PublisherList::alone(&sealed(&strangers, &[3])).is_ok());
+        assert!(PublisherList::alone(&sealed(&strangers, &[1])).is_err());
+    }
+
+    #[test]
+    fn an_older_list_never_follows() {
+        let keepers = role(&[1], 1);
+        for (version, known) in [(1, 1), (1, 2), (0, 0)] {
+            let old = sealed(&list(version, role(&[5], 1), keepers.clone()), &[1]);
+            let refused = PublisherList::follow(&old, &keepers, known);
+            assert_eq!(refused, Err(Refused::NotNewer { offered: version, known }));
+        }
+    }
+
+    #[test]
+    fn a_list_has_limits() {
+        let keepers = role(&[1], 1);
+        let follow = |list: &PublisherList| PublisherList::follow(&sealed(list, &[1]), &keepers, 0);
+        let good = list(1, role(&[5], 1), keepers.clone());
+        assert!(follow(&good).is_ok_and(|list| list.is_expired(20) && !list.is_expired(19)));
+        assert_eq!(follow(&PublisherList { expires_at_ms: 10, ..good.clone() }), Err(Refused::NoLifetime));
+        let withdrawn = vec![Digest::of(b"x"); MAX_WITHDRAWN + 1];
+        assert_eq!(follow(&PublisherList { withdrawn, ..good }), Err(Refused::TooManyWithdrawn(MAX_WITHDRAWN + 1)));
+        let keys = |count: u8| (0..count).map(|seed| key(seed).public_key()).collect::<Vec<_>>();
+        assert_eq!(Role::new(keys(0), 1), Err(InvalidRole::Keys(0)));
+        assert_eq!(Role::new(keys(17), 1), Err(InvalidRole::Keys(17)));
+        assert_eq!(Role::new(keys(2), 3), Err(InvalidRole::Threshold { threshold: 3, keys: 2 }));
+        assert_eq!(Role::new(keys(2), 0), Err(InvalidRole::Threshold { threshold: 0, keys: 2 }));
+        let twice = [keys(2), keys(1)].concat();
+        assert_eq!(Role::new(twice, 1), Err(InvalidRole::Twice(keys(1)[0].id())));
+    }
+}

@@ -1,0 +1,126 @@
+//! What publishers have signed, as it is pushed: an envelope about a package, or a list of publishers. Whether a signature
+//! counts is for robots to say; what could never count, or says something else than its manifest, is turned away here.
+
+use task_proto::desired::BlobRef;
+use task_proto::envelope::Envelope;
+use task_proto::oci::ImageManifest;
+use task_proto::publisher::{LIST_REPOSITORY, MAX_LIST_BYTES, MAX_SIGNATURE_BYTES, PackageStatement, PublisherList};
+use task_proto::{RepositoryName, Tag};
+
+use super::manifests::check_blob;
+use super::parsed::Parsed;
+use super::{OciError, Registry};
+use crate::store::SignedDocument;
+
+/// The signed document that a manifest brings, if it is meant to bring one.
+pub(super) async fn check(
+    registry: &Registry,
+    repository: &RepositoryName,
+    parsed: &Parsed,
+    tags: &[Tag],
+) -> Result<Option<SignedDocument>, OciError> {
+    if let Some(image) = &parsed.signature {
+        return check_signature(registry, repository, image).await.map(Some);
+    }
+    match &parsed.publishers {
+        Some(image) => check_list(registry, repository, image, tags).await.map(Some),
+        None => Ok(None),
+    }
+}
+
+/// Tells the robots whom a document concerns. Should that fail they hear of it when they ask.
+pub(super) async fn tell(registry: &Registry, repository: &RepositoryName, document: Option<&SignedDocument>) {
+    match document {
+        Some(SignedDocument::List { .. }) => registry.changes.ring_everyone(),
+        Some(SignedDocument::Signature { package, .. }) => {
+            let Ok(name) = repository.as_str().parse() else { return };
+            match registry.store.robots_with_package(&name, package).await {
+                Ok(robots) => registry.changes.ring(robots),
+                Err(error) => tracing::warn!(
+                    error = &error as &dyn std::error::Error,
+                    "robots are not told of a signature; they hear of it when they ask"
+                ),
+            }
+        }
+        None => {}
+    }
+}
+
+async fn check_signature(
+    registry: &Registry,
+    repository: &RepositoryName,
+    image: &ImageManifest,
+) -> Result<SignedDocument, OciError> {
+    let subject =
+        image.subject.as_ref().ok_or_else(|| OciError::manifest_invalid("subject: a signature is about one"))?;
+    let name = repository.as_str().parse().map_err(|error| OciError::name_invalid(&error))?;
+    let package = registry.store.package(&name, &subject.digest).await?.map(|view| view.package);
+    let package =
+        package.ok_or_else(|| OciError::manifest_invalid("subject: there is no such package; push it first"))?;
+    let (blob, envelope) = envelope(registry, repository, image, MAX_SIGNATURE_BYTES).await?;
+    let statement = PackageStatement::unverified(&envelope);
+    let statement = statement.map_err(|error| OciError::manifest_invalid(format!("the signature: {error}")))?;
+    if statement.package != package {
+        let message = format!("{} {} was signed, not the subject", statement.package.name, statement.package.version);
+        return Err(OciError::manifest_invalid(message));
+    }
+    Ok(SignedDocument::Signature { package: subject.digest, envelope: blob })
+}
+
+async fn check_list(
+    registry: &Registry,
+    repository: &RepositoryName,
+    image: &ImageManifest,
+    tags: &[Tag],
+) -> Result<SignedDocument, OciError> {
+    if repository.as_str() != LIST_REPOSITORY {
+        let message = format!("a list of publishers belongs into the repository {LIST_REPOSITORY}");
+        return Err(OciError::manifest_invalid(message));
+    }
+    let refused = |error| OciError::manifest_invalid(format!("the list of publishers: {error}"));
+    let (blob, envelope) = envelope(registry, repository, image, MAX_LIST_BYTES).await?;
+    let offered = PublisherList::unverified(&envelope).map_err(refused)?;
+    if tags.iter().any(|tag| tag.as_str() != offered.version.to_string()) {
+        return Err(OciError::manifest_invalid("the tag of a list of publishers is its version"));
+    }
+    let again = registry.store.publisher_list(Some(offered.version)).await?;
+    let newest = registry.store.publisher_list(None).await?.filter(|_| again != Some(blob));
+    let before = match newest {
+        Some(newest) => Some(newest_list(registry, newest).await?),
+        None => None,
+    };
+    let list = match &before {
+        Some(before) => PublisherList::follow(&envelope, &before.keepers, before.version),
+        None => PublisherList::alone(&envelope),
+    };
+    let list = list.map_err(refused)?;
+    let changes_keepers = before.is_none_or(|before| before.keepers != list.keepers);
+    Ok(SignedDocument::List { version: list.version, envelope: blob, changes_keepers })
+}
+
+async fn newest_list(registry: &Registry, newest: BlobRef) -> Result<PublisherList, OciError> {
+    let blob = registry.blobs.get(newest.digest).await?.ok_or_else(OciError::blob_unknown)?;
+    let envelope = parse(&blob.read().await?)?;
+    PublisherList::unverified(&envelope).map_err(|error| OciError::manifest_invalid(error.to_string()))
+}
+
+/// The one layer of a signed document.
+async fn envelope(
+    registry: &Registry,
+    repository: &RepositoryName,
+    image: &ImageManifest,
+    most: u64,
+) -> Result<(BlobRef, Envelope), OciError> {
+    let envelope = image.lone_envelope();
+    let envelope = envelope.ok_or_else(|| OciError::manifest_invalid("layers: one DSSE envelope is expected"))?;
+    if envelope.size > most {
+        let message = format!("layers: the envelope has {} bytes, {most} are possible", envelope.size);
+        return Err(OciError::manifest_invalid(message));
+    }
+    let blob = check_blob(registry, repository, envelope).await?;
+    Ok((envelope, parse(&blob.read().await?)?))
+}
+
+fn parse(bytes: &[u8]) -> Result<Envelope, OciError> {
+    serde_json::from_slice(bytes).map_err(|error| OciError::manifest_invalid(format!("not a DSSE envelope: {error}")))
+}

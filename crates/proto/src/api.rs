@@ -2,6 +2,7 @@
 //! bytes. Unknown fields are tolerated in answers; requests are checked by the server.
 
 mod delivery;
+mod enrolment;
 mod logs;
 mod mqtt;
 mod people;
@@ -9,6 +10,7 @@ mod people;
 use serde::{Deserialize, Serialize};
 
 pub use self::delivery::{DeliveryChoice, DeliveryDecision, MAX_PRIORITY, MIN_PRIORITY};
+pub use self::enrolment::{EnrollmentTokenList, EnrollmentTokenView};
 pub use self::logs::{LogEvent, LogsFrom, LogsQuery, LogsView};
 pub use self::mqtt::{BrokerFiles, ExternalBroker, MqttEndpoint};
 pub use self::people::{

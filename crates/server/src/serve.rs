@@ -140,6 +140,7 @@ impl Server {
             blobs,
             transfers,
             sessions: Arc::default(),
+            visits: Arc::default(),
             attempts: Arc::default(),
             events: EventFeed::new(),
             key: public_key,

@@ -237,7 +237,7 @@ async fn polling_goes_on_after_every_kind_of_answer() {
     let polling = tokio::spawn(link::poll(server(&url, &robot), shared.clone(), intervals, heard));
     let answers = [(200, "text/html", "<html>".to_owned()), sealed(&state(&robot, 1), &key)];
     let mut next = async || tokio::time::timeout(PATIENCE, messages.recv()).await.unwrap().unwrap();
-    assert!(matches!(next().await, Heard::TokenRefused));
+    assert!(matches!(next().await, Heard::TokenRefused(_)));
     for (answer, is_state) in answers.into_iter().zip([false, true]) {
         fake.set(answer);
         loop {

@@ -15,6 +15,7 @@ mod proxy;
 mod questions;
 mod registry;
 mod restore;
+mod revoked;
 mod ros;
 mod ros1;
 mod scenarios;

@@ -243,6 +243,9 @@ pub enum ActionError {
     /// Someone has this name.
     #[error("a robot named {0} exists")]
     NameTaken(RobotName),
+    /// No such enrolment token, or it has ended.
+    #[error("there is no enrolment token {0}")]
+    EnrolmentNotFound(TokenId),
     /// The enrolment token is unknown, used up, expired or revoked.
     #[error("the enrolment token is unknown, used up, expired or revoked")]
     TokenRefused,
@@ -284,9 +287,11 @@ impl ActionError {
             Self::NameTaken(_) => "name_taken",
             Self::TokenRefused | Self::SignInRefused => "unauthorized",
             Self::EnrolledAnew(_) => "enrolled_anew",
-            Self::RobotNotFound(_) | Self::DeploymentNotFound(_) | Self::UserNotFound(_) | Self::TokenNotFound(_) => {
-                "not_found"
-            }
+            Self::RobotNotFound(_)
+            | Self::DeploymentNotFound(_)
+            | Self::UserNotFound(_)
+            | Self::TokenNotFound(_)
+            | Self::EnrolmentNotFound(_) => "not_found",
             Self::DeploymentCancelled(_) => "deployment_cancelled",
             Self::Diverged(_) => "diverged",
             Self::Store(_) | Self::PasswordFailed => "internal",

@@ -2,12 +2,14 @@
 
 use std::net::IpAddr;
 
-use task_proto::api::{CreateEnrollmentToken, EditRobot, EnrollRequest, EnrollmentToken, MatchedRobot};
+use task_proto::api::{
+    CreateEnrollmentToken, EditRobot, EnrollRequest, EnrollmentToken, EnrollmentTokenList, MatchedRobot,
+};
 use task_proto::id::Labels;
 use task_proto::request::Ask;
 use task_proto::selector::Selector;
 use task_proto::token::{Token, TokenKind};
-use task_proto::{MacAddress, RobotId, RobotName};
+use task_proto::{MacAddress, RobotId, RobotName, TokenId};
 
 use super::{ActionError, Actions, MAX_LIFETIME_MS, check_scope, quoted};
 use crate::advance::advance;
@@ -56,6 +58,7 @@ impl Actions {
             Some(known) if is_retry || terms.robot.as_ref() == Some(&known.id) => {
                 // A disk that was lost or copied holds the old one.
                 write.renew_broker_credential(&known.id).await?;
+                write.readmit(&known.id).await?;
                 known
             }
             Some(known) => return Err(ActionError::MacKnown { mac: known.mac, name: known.name }),
@@ -120,6 +123,22 @@ impl Actions {
         Ok(EnrollmentToken { id: token.id(), token: token.reveal(), expires_at_ms })
     }
 
+    /// The enrolment tokens that are good for something.
+    pub async fn enrollment_tokens(&self) -> Result<EnrollmentTokenList, ActionError> {
+        Ok(EnrollmentTokenList { tokens: self.store.enrolment_tokens(self.clock.now_ms()).await? })
+    }
+
+    /// Ends an enrolment token now. Robots that came by it stay.
+    pub async fn revoke_enrollment_token(&self, by: &Person, id: &TokenId) -> Result<(), ActionError> {
+        let now_ms = self.clock.now_ms();
+        let mut write = self.store.begin().await?;
+        if !write.revoke_enrolment_token(id, now_ms).await? {
+            return Err(ActionError::EnrolmentNotFound(id.clone()));
+        }
+        write.audit(&Deed::by(by, Act::EnrolmentRevoke, id), now_ms).await?;
+        Ok(write.commit().await?)
+    }
+
     /// Changes a robot's name or labels. Before and after it has to be one of the person's.
     pub async fn edit_robot(&self, by: &Person, robot: &RobotId, edit: &EditRobot) -> Result<(), ActionError> {
         let mut write = self.store.begin().await?;
@@ -164,6 +183,23 @@ impl Actions {
         self.envelopes.forget(robot);
         self.changes.announce(Change::RobotRemoved(Box::new(known)));
         self.changes.publish(consequences);
+        Ok(())
+    }
+
+    /// Ends all tokens of a robot and those made for it, now; its name, its history and what is ordered of it stay. There is no
+    /// way back by the same tokens, for who has them is in doubt: it has to be registered anew. Doing it twice is harmless.
+    pub async fn revoke_robot(&self, by: &Person, robot: &RobotId) -> Result<(), ActionError> {
+        let now_ms = self.clock.now_ms();
+        let mut write = self.store.begin().await?;
+        let known = known_robot(&mut write, robot.as_str()).await?;
+        check_scope(by, std::slice::from_ref(&known), || known.name.to_string())?;
+        if !write.revoke_robot(robot, now_ms).await? {
+            return Ok(());
+        }
+        let deed = Deed::by(by, Act::RobotRevoke, robot).with("name", &known.name).with("mac", known.mac);
+        write.audit(&deed, now_ms).await?;
+        write.commit().await?;
+        self.changes.announce(Change::Robot(known.id));
         Ok(())
     }
 

@@ -40,7 +40,7 @@ mod wait;
 /// The operator's commands; `main` adds `serve` to them.
 #[derive(Debug, Subcommand)]
 pub enum Command {
-    /// Look at robots, or remove one
+    /// Look at robots, revoke or remove one
     Robot {
         /// What to do.
         #[command(subcommand)]
@@ -78,7 +78,7 @@ pub enum Command {
         #[command(subcommand)]
         action: broker::Action,
     },
-    /// Make the tokens that robots enrol with
+    /// Make, list or revoke the tokens that robots enrol with
     EnrollToken {
         /// What to do.
         #[command(subcommand)]

@@ -1,4 +1,4 @@
-//! `taskd robot`: shows robots and removes them.
+//! `taskd robot`: shows robots, puts them out and removes them.
 
 use clap::Subcommand;
 use task_proto::RobotName;
@@ -25,6 +25,11 @@ pub enum Action {
         /// Its name or id
         robot: RobotName,
     },
+    /// End a robot's tokens and whatever it does by them, now; it comes back only by enrolling with a token made for it
+    Revoke {
+        /// Its name or id
+        robot: RobotName,
+    },
     /// Remove a robot; its token ends, its tasks run on but nothing new starts
     Rm {
         /// Its name or id
@@ -45,6 +50,12 @@ pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, Co
             let robot = one(session, &robot).await?.id;
             let robot: RobotView = session.client.get(&format!("/robots/{robot}"), &[]).await?;
             session.output.described(&robot, describe)?;
+        }
+        Action::Revoke { robot } => {
+            let robot = one(session, &robot).await?;
+            session.client.act(&format!("/robots/{}/revoke", robot.id)).await?;
+            say(&format!("revoked {} ({})", robot.name, robot.id));
+            say(&format!("it comes back with: taskd enroll-token create --uses 1 --robot {}", robot.name));
         }
         Action::Rm { robot, yes } => {
             let robot = one(session, &robot).await?;

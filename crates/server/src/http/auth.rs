@@ -17,7 +17,8 @@ use task_proto::person::Permission;
 use task_proto::token::Token;
 
 use super::App;
-use super::error::ApiError;
+use super::error::{ApiError, ROBOT_REVOKED};
+use super::visits::Line;
 use crate::person::Person;
 use crate::store::{Admitted, TokenHolder};
 
@@ -120,7 +121,7 @@ pub(super) async fn guard(
     let is_oci = request.uri().path().starts_with("/v2");
     // A path that is no text names nobody; the handler says that there is no such thing.
     let own = params.iter().flatten().find(|(name, _)| *name == "robot").map(|(_, value)| value);
-    match admit(&gate, peer, own, request.method(), request.headers()).await {
+    match admit(&gate, peer, own, Showing::of(&request)).await {
         Ok((mut caller, token_number)) => {
             if let Caller::Person(person) = &mut caller {
                 person.address = Some(peer.ip().to_canonical());
@@ -138,23 +139,37 @@ pub(super) async fn guard(
     })
 }
 
+/// What a request shows of who sent it.
+struct Showing<'a> {
+    method: &'a Method,
+    headers: &'a HeaderMap,
+    line: Option<&'a Line>,
+}
+
+impl<'a> Showing<'a> {
+    fn of(request: &'a Request) -> Self {
+        Self { method: request.method(), headers: request.headers(), line: request.extensions().get() }
+    }
+}
+
 async fn admit(
     gate: &Gate,
     peer: SocketAddr,
     own: Option<&str>,
-    method: &Method,
-    headers: &HeaderMap,
+    showing: Showing<'_>,
 ) -> Result<(Caller, TokenNumber), ApiError> {
     if gate.access == Access::Anyone {
         return Ok((Caller::Anyone, TokenNumber(0)));
     }
-    match identify(&gate.app, method, headers).await {
+    match identify_on_line(&gate.app, &showing).await {
         Ok((caller, token_number)) if caller.may(gate.access, own) => Ok((caller, token_number)),
         Ok((Caller::Anyone, _)) => Err(ApiError::unauthorized("a token is needed: Authorization: Bearer …")),
         Ok((Caller::Person(person), _)) if let Access::Person(permission) = gate.access => {
             Err(not_permitted(&person, permission))
         }
         Ok(_) => Err(ApiError::forbidden("this token may not do that")),
+        // Its token was known, so nobody is guessing.
+        Err(error) if error.code == ROBOT_REVOKED => Err(error),
         Err(error) if error.status == StatusCode::UNAUTHORIZED => {
             let is_too_many = gate.app.attempts.record(peer.ip(), gate.app.clock.now_ms());
             Err(if is_too_many { ApiError::too_many("too many wrong tokens from this address") } else { error })
@@ -173,6 +188,15 @@ pub(super) fn not_permitted(person: &Person, permission: Permission) -> ApiError
     })
 }
 
+/// Who calls. If it is a robot, its connection is cut when it is put out.
+async fn identify_on_line(app: &App, showing: &Showing<'_>) -> Result<(Caller, TokenNumber), ApiError> {
+    let &Showing { method, headers, line } = showing;
+    let arrival = app.visits.arrival();
+    let identified = identify(app, method, headers).await?;
+    let ((Caller::Robot(robot), _), Some(line)) = (&identified, line) else { return Ok(identified) };
+    if arrival.enter(robot, line) { Ok(identified) } else { identify(app, method, headers).await }
+}
+
 /// Who sent these headers. `Anyone` if they don't say; an error if they say it wrongly.
 async fn identify(app: &App, method: &Method, headers: &HeaderMap) -> Result<(Caller, TokenNumber), ApiError> {
     let now_ms = app.clock.now_ms();
@@ -187,6 +211,9 @@ async fn identify(app: &App, method: &Method, headers: &HeaderMap) -> Result<(Ca
         return Ok((Caller::Anyone, TokenNumber(0)));
     };
     let Some(Admitted { holder, is_first_use }) = app.store.admit(&token, now_ms).await? else {
+        if app.store.is_of_revoked_robot(&token).await? {
+            return Err(ApiError::robot_revoked());
+        }
         return Err(ApiError::unauthorized("the token is unknown, expired or revoked"));
     };
     Ok(match holder {

@@ -12,6 +12,9 @@ use crate::person::Person;
 use crate::report_writer::ReportError;
 use crate::store::StoreError;
 
+/// The code of [`ApiError::robot_revoked`].
+pub(super) const ROBOT_REVOKED: &str = "robot_revoked";
+
 /// An answer that is not the one hoped for.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ApiError {
@@ -37,6 +40,12 @@ impl ApiError {
     /// 401: nobody known is asking.
     pub fn unauthorized(message: impl Into<String>) -> Self {
         Self::new(StatusCode::UNAUTHORIZED, "unauthorized", message)
+    }
+
+    /// 401: the robot was revoked.
+    pub fn robot_revoked() -> Self {
+        let message = "this robot was revoked: it comes back only by an enrolment with a token made for it";
+        Self::new(StatusCode::UNAUTHORIZED, ROBOT_REVOKED, message)
     }
 
     /// 403: whoever asks may not.
@@ -129,7 +138,8 @@ impl From<ActionError> for ApiError {
             ActionError::RobotNotFound(_)
             | ActionError::DeploymentNotFound(_)
             | ActionError::UserNotFound(_)
-            | ActionError::TokenNotFound(_) => StatusCode::NOT_FOUND,
+            | ActionError::TokenNotFound(_)
+            | ActionError::EnrolmentNotFound(_) => StatusCode::NOT_FOUND,
             ActionError::TooLargeForInline { .. } => StatusCode::UNPROCESSABLE_ENTITY,
             ActionError::NoRobotsMatch(_)
             | ActionError::IdempotencyKeyReused(_)

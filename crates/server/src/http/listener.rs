@@ -28,6 +28,7 @@ use tokio_util::task::TaskTracker;
 use tower::ServiceExt as _;
 
 use super::traffic::HttpTotals;
+use super::visits::Line;
 use crate::anteroom::{Anteroom, Place};
 use crate::tls::Tls;
 
@@ -147,8 +148,8 @@ impl Site {
     {
         let Guest { peer, silent, crowded } = guest;
         let (leave, spoken) = (silent.leave().clone(), CancellationToken::new());
-        let (router, traffic) = (self.router.clone(), self.traffic.clone());
-        let mut connection = pin!(connection(stream, peer, silent, spoken.clone(), router, traffic));
+        let (line, router, traffic) = (Line::default(), self.router.clone(), self.traffic.clone());
+        let mut connection = pin!(connection(stream, peer, silent, spoken.clone(), line.clone(), router, traffic));
         let ended = async {
             tokio::select! {
                 _ = connection.as_mut() => return,
@@ -160,6 +161,7 @@ impl Site {
         tokio::select! {
             () = ended => {}
             () = leave.cancelled() => {}
+            () = line.cut() => {}
             () = self.abort.cancelled() => {}
         }
     }
@@ -231,6 +233,7 @@ fn connection<S>(
     peer: SocketAddr,
     silent: Place,
     spoken: CancellationToken,
+    line: Line,
     router: Router,
     traffic: Arc<HttpTotals>,
 ) -> http1::UpgradeableConnection<
@@ -247,6 +250,7 @@ where
         traffic.request();
         let mut request = request.map(|body| Body::new(PatientBody::new(body)));
         request.extensions_mut().insert(ConnectInfo(peer));
+        request.extensions_mut().insert(line.clone());
         router.clone().oneshot(request)
     });
     http1::Builder::new()

@@ -25,6 +25,7 @@ pub mod session;
 mod tasks;
 pub mod traffic;
 mod views;
+pub mod visits;
 
 use std::net::IpAddr;
 use std::ops::Deref;
@@ -90,6 +91,8 @@ pub struct AppParts {
     pub transfers: Transfers,
     /// Who is signed in at the page.
     pub sessions: Arc<session::Sessions>,
+    /// Robots' requests that are under way.
+    pub visits: Arc<visits::Visits>,
     /// Failed authentications.
     pub attempts: Arc<attempts::FailedAttempts>,
     /// The event stream's source.
@@ -217,11 +220,14 @@ pub fn routes() -> Vec<Route> {
         Route::new(delete.clone(), "/api/v1/tokens/{token}", Person(Read), people::revoke_token),
         Route::new(get.clone(), "/api/v1/audit", Person(Administer), people::audit),
         Route::new(post.clone(), "/api/v1/enroll", Enrolment, enroll::enroll),
+        Route::new(get.clone(), "/api/v1/enrollment-tokens", Person(Administer), enroll::tokens),
         Route::new(post.clone(), "/api/v1/enrollment-tokens", Person(Administer), enroll::create_token),
+        Route::new(delete.clone(), "/api/v1/enrollment-tokens/{enrollment}", Person(Administer), enroll::revoke_token),
         Route::new(get.clone(), "/api/v1/robots", Person(Read), robots::list),
         Route::new(get.clone(), "/api/v1/robots/{robot}", Person(Read), robots::show),
         Route::new(patch, "/api/v1/robots/{robot}", Person(Maintain), robots::edit),
         Route::new(delete, "/api/v1/robots/{robot}", Person(Maintain), robots::remove),
+        Route::new(post.clone(), "/api/v1/robots/{robot}/revoke", Person(Maintain), robots::revoke),
         Route::new(get.clone(), "/api/v1/robots/{robot}/desired", OwnRobot, robots::desired),
         Route::new(get.clone(), "/api/v1/robots/{robot}/mqtt", OwnRobot, broker::endpoint),
         Route::new(post.clone(), "/api/v1/robots/{robot}/token", OwnRobot, robots::next_token),

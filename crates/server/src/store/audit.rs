@@ -28,10 +28,14 @@ pub enum Act {
     RobotEdit,
     /// A robot was removed.
     RobotRemove,
+    /// A robot's tokens were ended.
+    RobotRevoke,
     /// A robot was asked to change something at once, like a parameter.
     RobotAsk,
     /// An enrolment token was made.
     EnrolmentCreate,
+    /// An enrolment token was revoked.
+    EnrolmentRevoke,
     /// A package was ordered.
     DeploymentCreate,
     /// An order was taken back.
@@ -79,8 +83,10 @@ impl Act {
             Self::RobotEnroll => "robot.enroll",
             Self::RobotEdit => "robot.edit",
             Self::RobotRemove => "robot.remove",
+            Self::RobotRevoke => "robot.revoke",
             Self::RobotAsk => "robot.ask",
             Self::EnrolmentCreate => "enrolment_token.create",
+            Self::EnrolmentRevoke => "enrolment_token.revoke",
             Self::DeploymentCreate => "deployment.create",
             Self::DeploymentCancel => "deployment.cancel",
             Self::DeploymentResume => "deployment.resume",

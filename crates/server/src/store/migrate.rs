@@ -16,6 +16,7 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[
     (6, "delivery", include_str!("../migrations/0006_delivery.sql")),
     (7, "people", include_str!("../migrations/0007_people.sql")),
     (8, "direct_pushes", include_str!("../migrations/0008_direct_pushes.sql")),
+    (10, "robots", include_str!("../migrations/0010_robots.sql")),
 ];
 
 /// Applies what has not been applied yet.

@@ -125,13 +125,13 @@ impl Store {
         rows.iter().map(|row| id("robots.id", row)).collect()
     }
 
-    /// The robots' credentials at an external broker, sorted by robot.
+    /// The robots' credentials at an external broker, sorted by robot; those that were revoked have none.
     pub async fn broker_credentials(&self) -> Result<Vec<BrokerCredential>, StoreError> {
         let rows = sqlx::query(CREDENTIALS).bind("");
         rows.fetch_all(&self.reads).await?.iter().map(broker_credential).collect()
     }
 
-    /// One robot's; `None` if it is not registered.
+    /// One robot's; `None` if it is not registered, or was revoked.
     pub async fn broker_credential(&self, robot: &RobotId) -> Result<Option<BrokerCredential>, StoreError> {
         let row = sqlx::query(CREDENTIALS).bind(robot.as_str());
         row.fetch_optional(&self.reads).await?.as_ref().map(broker_credential).transpose()
@@ -143,7 +143,7 @@ impl Store {
         rows.iter().map(|row| id("assignments.robot_id", row)).collect()
     }
 
-    /// What each of `robots` should have; those that are not registered are left out.
+    /// What each of `robots` should have; those that are not registered, or were revoked, are left out.
     pub async fn desired_tasks(&self, robots: &[RobotId]) -> Result<Vec<DesiredTasks>, StoreError> {
         let mut found: Vec<DesiredTasks> = Vec::with_capacity(robots.len());
         for group in groups(robots) {
@@ -154,7 +154,7 @@ impl Store {
                  FROM robots r
                  LEFT JOIN assignments a ON a.robot_id = r.id AND a.desired = 1
                  LEFT JOIN deployments d ON d.id = a.deployment_id
-                 WHERE r.removed_at_ms IS NULL AND r.id IN ({}) ORDER BY r.id, a.task",
+                 WHERE r.removed_at_ms IS NULL AND r.revoked_at_ms IS NULL AND r.id IN ({}) ORDER BY r.id, a.task",
                 values(1, group.len(), &["TEXT"])
             );
             let mut query = sqlx::query(AssertSqlSafe(sql));
@@ -304,13 +304,13 @@ impl Write {
     }
 }
 
-const CREDENTIALS: &str =
-    "SELECT id, broker_credential FROM robots WHERE removed_at_ms IS NULL AND (id = $1 OR $1 = '') ORDER BY id";
+const CREDENTIALS: &str = "SELECT id, broker_credential FROM robots
+     WHERE removed_at_ms IS NULL AND revoked_at_ms IS NULL AND (id = $1 OR $1 = '') ORDER BY id";
 
 const WITH_TASK: &str = "SELECT robot_id FROM assignments WHERE task = $1 AND desired = 1";
 
 const ROBOT_ROWS: &str = "SELECT r.id, r.name, r.mac, r.labels, r.enrolled_at_ms, r.generation, r.observed_generation,
-         r.report, r.link, r.last_seen_ms
+         r.report, r.link, r.last_seen_ms, r.revoked_at_ms
      FROM robots r WHERE r.removed_at_ms IS NULL";
 
 /// What each robot should have, and what it is still getting rid of. The first condition is that of an index, word for
@@ -383,6 +383,10 @@ fn robot_view(row: &sqlx::any::AnyRow, mut tasks: Vec<RobotTask>) -> Result<Robo
     let generation = Generation(number(row.try_get("generation")?));
     let observed_generation = Generation(number(row.try_get("observed_generation")?));
     let mut conditions = Vec::new();
+    if row.try_get::<Option<i64>, _>("revoked_at_ms")?.is_some() {
+        let text = "its tokens have ended; it comes back with an enrolment token made for it, or is removed".to_owned();
+        conditions.push(Condition { code: "revoked".to_owned(), text });
+    }
     if observed_generation > generation {
         let text = format!(
             "it reports generation {observed_generation}, the server knows {generation}; left alone until its next order"

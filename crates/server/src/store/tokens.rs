@@ -219,13 +219,16 @@ impl Write {
     }
 
     /// Forgets tokens that are good for nothing any more, and says whose they were if they were users'. The first token stays
-    /// when it was revoked: it is in the data directory, and must not come back to life at the next start.
+    /// when it was revoked: it is in the data directory, and must not come back to life at the next start. Those of a
+    /// revoked robot stay as well, so that it can be told.
     pub async fn forget_ended_tokens(&mut self, now_ms: u64) -> Result<BTreeSet<UserName>, StoreError> {
         let users: Vec<Option<String>> = sqlx::query_scalar(
             "DELETE FROM tokens
              WHERE (kind <> 'operator' OR user_name IS NOT NULL) AND (revoked_at_ms IS NOT NULL OR expires_at_ms <= $1
                  OR uses_left = 0 AND NOT EXISTS (SELECT 1 FROM tokens made
                      WHERE made.made_by = tokens.id AND made.used_at_ms IS NULL AND made.revoked_at_ms IS NULL))
+               AND NOT (kind = 'robot' AND EXISTS (SELECT 1 FROM robots r WHERE r.id = tokens.robot_id
+                   AND r.revoked_at_ms IS NOT NULL AND r.removed_at_ms IS NULL))
              RETURNING user_name",
         )
         .bind(stored(now_ms))

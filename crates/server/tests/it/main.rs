@@ -10,6 +10,7 @@ mod cli_people;
 mod database;
 mod deliveries;
 mod direct_push;
+mod enrolments;
 mod fleet;
 mod harness;
 mod logs;

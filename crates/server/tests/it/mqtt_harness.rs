@@ -18,14 +18,21 @@ use taskd::data_directory::DataDirectory;
 use taskd::tls::Tls;
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::TcpStream;
-use tokio::sync::{Mutex, mpsc};
+use tokio::sync::{Mutex, Notify, mpsc};
 use tokio::time::timeout;
 
 /// More than anything here takes, unless it hangs.
 pub const PATIENCE: Duration = Duration::from_secs(10);
 
 /// Lets robots in with `pw-<robot id>` and operators with `operator`; some passwords meet other ends.
-struct Door;
+#[derive(Default)]
+pub struct Door {
+    /// Says that somebody with `once-<robot id>` is being let in, for the first time, which [`Door::go_on`] ends. The second
+    /// time they are not.
+    pub asked: Notify,
+    pub go_on: Notify,
+    was_asked: AtomicBool,
+}
 
 impl Gatekeeper for Door {
     fn admit(&self, login: Login) -> BoxFuture<'_, Result<Principal, Refusal>> {
@@ -36,6 +43,15 @@ impl Gatekeeper for Door {
                 "revoked" => Err(Refusal::NotAuthorised),
                 "outage" => Err(Refusal::Unavailable),
                 "slow" => std::future::pending().await,
+                password if password.starts_with("once-") => {
+                    if self.was_asked.swap(true, Ordering::SeqCst) {
+                        return Err(Refusal::NotAuthorised);
+                    }
+                    self.asked.notify_one();
+                    self.go_on.notified().await;
+                    let robot = user.parse().expect("a robot's id");
+                    Ok(Principal::Robot { robot, token_number: 0 })
+                }
                 password => match password.strip_prefix("pw-").map(str::parse) {
                     Some(Ok(robot)) if !user.is_empty() => Ok(Principal::Robot { robot, token_number: 0 }),
                     _ => Err(Refusal::BadCredentials),
@@ -84,6 +100,7 @@ impl Inbox for Letterbox {
 pub struct TestBroker {
     pub broker: Broker,
     pub refuses: Arc<AtomicBool>,
+    pub door: Arc<Door>,
     seen: Mutex<mpsc::UnboundedReceiver<Seen>>,
 }
 
@@ -112,8 +129,9 @@ impl TestBroker {
         let (sender, receiver) = mpsc::unbounded_channel();
         let refuses = Arc::new(AtomicBool::new(false));
         let inbox = Letterbox { seen: sender, refuses: refuses.clone() };
-        let broker = Broker::start(config, Arc::new(Door), Arc::new(inbox)).await.unwrap();
-        Self { broker, refuses, seen: Mutex::new(receiver) }
+        let door = Arc::new(Door::default());
+        let broker = Broker::start(config, door.clone(), Arc::new(inbox)).await.unwrap();
+        Self { broker, refuses, door, seen: Mutex::new(receiver) }
     }
 
     pub fn address(&self) -> SocketAddr {

@@ -35,16 +35,24 @@ pub(super) struct Guest {
     /// What was sent after CONNECT already, without waiting for the answer.
     pub(super) input: BytesMut,
     login: Login,
+    /// How often a robot had been put out before it was asked who this is.
+    put_out: u64,
 }
 
 impl Guest {
-    /// Asks once more, now that the guest has a seat: a person whose rights ended on the way to it was not there yet to be
-    /// asked to leave. (A robot's session by a token that ended is taken over.)
+    /// Asks once more, now that the guest has a seat: whose rights ended on the way to it was not there yet to be asked to
+    /// leave. Of robots only if one was put out meanwhile: they come in thousands.
     pub(super) async fn check_again(&self, context: &Context) -> Result<(), Rejection> {
-        let Visitor::Operator(user) = &self.visitor else { return Ok(()) };
+        let before = match &self.visitor {
+            Visitor::Operator(user) => Principal::Operator(user.clone()),
+            Visitor::Robot { robot, token_number } if context.seats.put_out() != self.put_out => {
+                Principal::Robot { robot: robot.clone(), token_number: *token_number }
+            }
+            Visitor::Robot { .. } | Visitor::Canary => return Ok(()),
+        };
         let asked = context.gatekeeper.admit(self.login.clone());
         match timeout(context.limits.admit_timeout, asked).await {
-            Ok(Ok(Principal::Operator(again))) if again == *user => Ok(()),
+            Ok(Ok(again)) if again == before => Ok(()),
             _ => Err(answer(ConnectReturnCode::NotAuthorized, "credentials that have just ended")),
         }
     }
@@ -137,6 +145,7 @@ where
         password: connect.password.clone(),
         peer,
     };
+    let put_out = context.seats.put_out();
     let visitor = admit(context, &connect, login.clone()).await?;
     if let Some(will) = &connect.will
         && may_publish(&visitor, &context.prefix, &will.topic).is_none()
@@ -154,7 +163,7 @@ where
         0 => None,
         seconds => Some(Duration::from_millis(u64::from(seconds) * 1500)),
     };
-    Ok(Guest { visitor, seat_name, keep_alive, will: connect.will, input, login })
+    Ok(Guest { visitor, seat_name, keep_alive, will: connect.will, input, login, put_out })
 }
 
 /// A CONNACK.

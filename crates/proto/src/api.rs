@@ -1,6 +1,7 @@
 //! Bodies of the HTTP API under `/api/v1`. Times are milliseconds since the Unix epoch by the server's clock, sizes are
 //! bytes. Unknown fields are tolerated in answers; requests are checked by the server.
 
+mod conduct;
 mod delivery;
 mod enrolment;
 mod logs;
@@ -9,6 +10,7 @@ mod people;
 
 use serde::{Deserialize, Serialize};
 
+pub use self::conduct::ConductTotals;
 pub use self::delivery::{DeliveryChoice, DeliveryDecision, MAX_PRIORITY, MIN_PRIORITY};
 pub use self::enrolment::{EnrollmentTokenList, EnrollmentTokenView};
 pub use self::logs::{LogEvent, LogsFrom, LogsQuery, LogsView};
@@ -67,6 +69,9 @@ pub struct ServerInfo {
     /// What went over HTTP since then.
     #[serde(default)]
     pub http: HttpTraffic,
+    /// What was done about robots that misbehaved since then.
+    #[serde(default)]
+    pub conduct: ConductTotals,
 }
 
 /// What went over HTTP, all connections together, counted at the sockets. In is towards the server.

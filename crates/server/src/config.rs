@@ -20,6 +20,7 @@ use self::settings::{SETTINGS, Setting};
 pub use self::tables::{SiteLimits, TransferLimits};
 pub use self::tls::TlsSettings;
 use crate::broker_url::BrokerUrl;
+use crate::conduct::ConductLimits;
 use crate::delivery::{Rule, Rules};
 
 /// Everything `taskd serve` can be told.
@@ -69,6 +70,8 @@ pub struct Config {
     pub delivery: DeliverySettings,
     /// What bounds the transfers of packages over HTTP.
     pub transfers: TransferLimits,
+    /// What a robot may send.
+    pub robots: ConductLimits,
 }
 
 /// `[delivery]`: how packages travel to robots.
@@ -248,6 +251,7 @@ impl Config {
             max_blob_bytes: 16 << 30,
             delivery: DeliverySettings::default(),
             transfers: TransferLimits::default(),
+            robots: ConductLimits::default(),
         }
     }
 

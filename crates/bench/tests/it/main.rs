@@ -6,6 +6,7 @@ mod corridor;
 mod crash;
 mod delivery;
 mod direct_push;
+mod flood;
 mod harness;
 mod hostile;
 mod load;

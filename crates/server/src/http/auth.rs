@@ -17,6 +17,7 @@ use task_proto::person::Permission;
 use task_proto::token::Token;
 
 use super::App;
+use super::conduct::hold_up;
 use super::error::{ApiError, ROBOT_REVOKED};
 use super::visits::Line;
 use crate::person::Person;
@@ -125,6 +126,11 @@ pub(super) async fn guard(
         Ok((mut caller, token_number)) => {
             if let Caller::Person(person) = &mut caller {
                 person.address = Some(peer.ip().to_canonical());
+            }
+            if let (Access::OwnRobot, Caller::Robot(robot)) = (gate.access, &caller)
+                && let Err(error) = hold_up(&gate.app, robot, request.method()).await
+            {
+                return error.into_response();
             }
             request.extensions_mut().insert(caller);
             request.extensions_mut().insert(token_number);

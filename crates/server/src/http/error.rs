@@ -24,12 +24,17 @@ pub struct ApiError {
     pub code: &'static str,
     /// What went wrong, naming the caller's own key.
     pub message: String,
+    /// Where it makes sense to try again: when, in seconds.
+    pub retry_after_s: u64,
 }
+
+/// When to try again, where nothing better is known.
+const RETRY_AFTER_S: u64 = 5;
 
 impl ApiError {
     /// An error of any kind.
     pub fn new(status: StatusCode, code: &'static str, message: impl Into<String>) -> Self {
-        Self { status, code, message: message.into() }
+        Self { status, code, message: message.into(), retry_after_s: RETRY_AFTER_S }
     }
 
     /// 400: the request can't be understood.
@@ -106,7 +111,7 @@ impl ApiError {
             response.headers_mut().insert(header::WWW_AUTHENTICATE, HeaderValue::from_static(challenge));
         }
         if matches!(self.status, StatusCode::TOO_MANY_REQUESTS | StatusCode::SERVICE_UNAVAILABLE) {
-            response.headers_mut().insert(header::RETRY_AFTER, HeaderValue::from_static("5"));
+            response.headers_mut().insert(header::RETRY_AFTER, HeaderValue::from(self.retry_after_s));
         }
         response
     }

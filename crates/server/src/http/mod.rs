@@ -5,6 +5,7 @@ mod ask;
 pub mod attempts;
 pub mod auth;
 mod broker;
+mod conduct;
 mod deployments;
 pub mod drain;
 mod enroll;
@@ -50,6 +51,7 @@ use crate::blobs::Blobs;
 use crate::broker::Broker;
 use crate::changes::Changes;
 use crate::clock::Clock;
+use crate::conduct::Conduct;
 use crate::mqtt_access::MqttAccess;
 use crate::presence::Presence;
 use crate::report_writer::ReportWriter;
@@ -93,6 +95,8 @@ pub struct AppParts {
     pub sessions: Arc<session::Sessions>,
     /// Robots' requests that are under way.
     pub visits: Arc<visits::Visits>,
+    /// How robots behave.
+    pub conduct: Arc<Conduct>,
     /// Failed authentications.
     pub attempts: Arc<attempts::FailedAttempts>,
     /// The event stream's source.

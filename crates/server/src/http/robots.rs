@@ -40,7 +40,7 @@ pub(super) async fn list(
         robots.retain(|robot| selector.matches(&robot.id, &robot.name, &robot.labels));
     }
     let now_ms = app.clock.now_ms();
-    robots.iter_mut().for_each(|robot| complete_robot(robot, &app.presence, now_ms));
+    robots.iter_mut().for_each(|robot| complete_robot(robot, &app.presence, &app.conduct, now_ms));
     Ok(Json(RobotList { robots }))
 }
 
@@ -169,6 +169,6 @@ pub(super) async fn find(app: &App, by: &Person, id_or_name: &RobotName) -> Resu
 async fn view(app: &App, id: &RobotId) -> Result<RobotView, ApiError> {
     let found = app.store.robot(id).await?;
     let mut view = found.ok_or_else(|| ApiError::not_found(format!("there is no robot {id}")))?;
-    complete_robot(&mut view, &app.presence, app.clock.now_ms());
+    complete_robot(&mut view, &app.presence, &app.conduct, app.clock.now_ms());
     Ok(view)
 }

@@ -7,6 +7,7 @@ mod auth;
 mod browser;
 mod cli;
 mod cli_people;
+mod conduct;
 mod database;
 mod deliveries;
 mod direct_push;

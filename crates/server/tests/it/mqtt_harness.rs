@@ -13,6 +13,7 @@ use taskd::broker::{
     Broker, BrokerConfig, Gatekeeper, Inbox, Limits, Login, NotStored, Principal, Refusal, RobotMessage,
 };
 use taskd::clock::Clock;
+use taskd::conduct::{Conduct, ConductLimits};
 use taskd::config::TlsSettings;
 use taskd::data_directory::DataDirectory;
 use taskd::tls::Tls;
@@ -96,11 +97,17 @@ impl Inbox for Letterbox {
     fn everyone_may_be_there(&self) {}
 }
 
+/// Nobody is slowed or kept away.
+fn lenient() -> ConductLimits {
+    ConductLimits { messages_per_s: 1 << 40, bytes_per_s: 1 << 40, backoff: Duration::ZERO, ..ConductLimits::default() }
+}
+
 /// A running broker.
 pub struct TestBroker {
     pub broker: Broker,
     pub refuses: Arc<AtomicBool>,
     pub door: Arc<Door>,
+    pub conduct: Arc<Conduct>,
     seen: Mutex<mpsc::UnboundedReceiver<Seen>>,
 }
 
@@ -109,8 +116,13 @@ impl TestBroker {
         Self::with(|_| {}).await
     }
 
+    /// Nobody is slowed or kept away.
     pub async fn with(change: impl FnOnce(&mut Limits)) -> Self {
-        Self::start_with(None, change).await
+        Self::start_with(None, change, lenient()).await
+    }
+
+    pub async fn with_conduct(change: impl FnOnce(&mut Limits), conduct: ConductLimits) -> Self {
+        Self::start_with(None, change, conduct).await
     }
 
     /// One that speaks TLS, by an authority of its own.
@@ -118,20 +130,26 @@ impl TestBroker {
         let directory = tempfile::TempDir::new().unwrap();
         let data = DataDirectory::open(directory.path()).unwrap();
         let tls = Tls::open(TlsSettings::default(), &data, Clock::system()).unwrap();
-        Self::start_with(Some(tls), change).await
+        Self::start_with(Some(tls), change, lenient()).await
     }
 
-    async fn start_with(tls: Option<Tls>, change: impl FnOnce(&mut Limits)) -> Self {
+    async fn start_with(tls: Option<Tls>, change: impl FnOnce(&mut Limits), conduct: ConductLimits) -> Self {
+        let conduct = Conduct::new(conduct);
         let mut limits = Limits { canary_interval: Duration::from_secs(3600), ..Limits::default() };
         change(&mut limits);
-        let config =
-            BrokerConfig { listen: "127.0.0.1:0".parse().unwrap(), tls, prefix: TopicPrefix::default(), limits };
+        let config = BrokerConfig {
+            listen: "127.0.0.1:0".parse().unwrap(),
+            tls,
+            prefix: TopicPrefix::default(),
+            limits,
+            conduct: conduct.clone(),
+        };
         let (sender, receiver) = mpsc::unbounded_channel();
         let refuses = Arc::new(AtomicBool::new(false));
         let inbox = Letterbox { seen: sender, refuses: refuses.clone() };
         let door = Arc::new(Door::default());
         let broker = Broker::start(config, door.clone(), Arc::new(inbox)).await.unwrap();
-        Self { broker, refuses, door, seen: Mutex::new(receiver) }
+        Self { broker, refuses, door, conduct, seen: Mutex::new(receiver) }
     }
 
     pub fn address(&self) -> SocketAddr {

@@ -5,6 +5,7 @@
 
 use std::fmt::Write as _;
 use std::path::Path;
+use std::time::Duration;
 
 use reqwest::Method;
 use serde_json::{Value, json};
@@ -82,7 +83,9 @@ struct Town {
 
 impl Town {
     async fn new() -> Self {
-        let server = TestServer::start().await;
+        // The same robot does what it may not again and again.
+        let directory = tempfile::TempDir::new().expect("a directory");
+        let server = TestServer::start_in(directory, |config| config.robots.backoff = Duration::ZERO).await;
         let store = Store::open(&sqlite_url(&server.data().join("taskd.sqlite"))).await.expect("opens");
         let (robot, other_robot) = (server.enroll("atlas").await, server.enroll("boreas").await);
         let (talker, package) = (server.push("talker", "1.0.0").await, server.push("walker", "1.0.0").await);

@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 use bytes::BytesMut;
 use rumqttd::protocol::{ConnAck, ConnectReturnCode, Packet};
 use subtle::ConstantTimeEq;
+use task_proto::RobotId;
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::time::{timeout, timeout_at};
 
@@ -18,6 +19,7 @@ use super::codec::{Connect, DecodeError, Received, Will, decode, encode};
 use super::takeover::SeatName;
 use crate::anteroom::Place;
 use crate::broker::{Login, Principal, Refusal};
+use crate::conduct::{SESSION_COST, Verdict, Watched, Way};
 
 /// The largest CONNECT, in bytes after the fixed header.
 const MAX_CONNECT_BYTES: usize = 4 * 1024;
@@ -34,6 +36,8 @@ pub(super) struct Guest {
     pub(super) will: Option<Will>,
     /// What was sent after CONNECT already, without waiting for the answer.
     pub(super) input: BytesMut,
+    /// How it behaves, if it is a robot.
+    pub(super) watched: Option<Watched>,
     login: Login,
     /// How often a robot had been put out before it was asked who this is.
     put_out: u64,
@@ -152,6 +156,10 @@ where
     {
         return Err(answer(ConnectReturnCode::NotAuthorized, "a will on a topic that is not its own"));
     }
+    let watched = match &visitor {
+        Visitor::Robot { robot, .. } => Some(watch(context, robot)?),
+        Visitor::Operator(_) | Visitor::Canary => None,
+    };
     let seat_name = match &visitor {
         Visitor::Robot { robot, .. } => SeatName::Robot(robot.clone()),
         Visitor::Canary => SeatName::Canary,
@@ -163,7 +171,18 @@ where
         0 => None,
         seconds => Some(Duration::from_millis(u64::from(seconds) * 1500)),
     };
-    Ok(Guest { visitor, seat_name, keep_alive, will: connect.will, input, login, put_out })
+    Ok(Guest { visitor, seat_name, keep_alive, will: connect.will, input, watched, login, put_out })
+}
+
+/// The robot, unless it was cut off and has to stay away for longer.
+fn watch(context: &Context, robot: &RobotId) -> Result<Watched, Rejection> {
+    let now = tokio::time::Instant::now();
+    let watched = context.conduct.watch(robot, Way::Mqtt, now);
+    let may_come = watched.barred_until(now).is_none();
+    if may_come && !matches!(watched.sent(SESSION_COST, 0, now), Verdict::Cut(_)) {
+        return Ok(watched);
+    }
+    Err(answer(ConnectReturnCode::ServiceUnavailable, "a robot that was cut off and comes back too early"))
 }
 
 /// A CONNACK.

@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 
 pub use self::conduct::ConductTotals;
 pub use self::delivery::{DeliveryChoice, DeliveryDecision, MAX_PRIORITY, MIN_PRIORITY};
-pub use self::enrolment::{EnrollmentTokenList, EnrollmentTokenView};
+pub use self::enrolment::{AWAITS_APPROVAL, EnrollmentTokenList, EnrollmentTokenView, PendingRobot, PendingRobotList};
 pub use self::logs::{LogEvent, LogsFrom, LogsQuery, LogsView};
 pub use self::mqtt::{BrokerFiles, ExternalBroker, MqttEndpoint};
 pub use self::people::{
@@ -153,6 +153,9 @@ pub struct EnrollResponse {
     pub token: String,
     /// How to reach MQTT.
     pub mqtt: MqttEndpoint,
+    /// Whether it waits to be approved: until then it is refused everything with the code [`AWAITS_APPROVAL`].
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub awaits_approval: bool,
 }
 
 /// Answer to a robot's `POST /robots/{robot}/token`. The token is shown this once; its first use ends the one before.
@@ -177,6 +180,9 @@ pub struct CreateEnrollmentToken {
     /// Labels each robot that uses it gets.
     #[serde(default)]
     pub labels: Labels,
+    /// Whether a robot that comes by it waits to be approved, also where the server does not ask that of all.
+    #[serde(default)]
+    pub approval: bool,
 }
 
 /// A new enrolment token. The secret is shown this once.

@@ -72,6 +72,8 @@ pub struct Config {
     pub transfers: TransferLimits,
     /// What a robot may send.
     pub robots: ConductLimits,
+    /// Whether every new robot waits to be approved.
+    pub enrolment_approval: bool,
 }
 
 /// `[delivery]`: how packages travel to robots.
@@ -252,6 +254,7 @@ impl Config {
             delivery: DeliverySettings::default(),
             transfers: TransferLimits::default(),
             robots: ConductLimits::default(),
+            enrolment_approval: false,
         }
     }
 

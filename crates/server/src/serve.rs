@@ -348,6 +348,7 @@ fn action_settings(config: &Config, tls: Option<&Tls>) -> ActionSettings {
         ca_pin: tls.and_then(Tls::told_pin),
         assignment_lifetime_ms: milliseconds(config.assignment_expiry),
         desired_lifetime_ms: milliseconds(config.desired_lifetime),
+        enrolment_approval: config.enrolment_approval,
         ..ActionSettings::default()
     }
 }

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use anyhow::ensure;
 use task_proto::CaPin;
 
+mod approval;
 pub mod configure;
 pub mod enroll;
 pub mod hold;

@@ -38,7 +38,12 @@ impl<E: Effects> Driver<E> {
                     self.dirty = true;
                 }
             }
-            Heard::Withheld { code, text } => self.withheld = Some(Condition { code, text }),
+            Heard::Withheld { code, text } => {
+                if self.withheld.as_ref().is_none_or(|known| known.code != code) {
+                    tracing::info!(code, text, "the server sends no state");
+                }
+                self.withheld = Some(Condition { code, text });
+            }
         }
     }
 

@@ -336,6 +336,11 @@ impl Robot {
         robot
     }
 
+    /// One that enrols by itself in the directory `name` below `dir`. Its agent does not run yet.
+    pub fn enrolled(dir: &Path, name: &str, id: RobotId) -> Self {
+        Self { process: None, data: dir.join(name), environment: Vec::new(), name: name.to_owned(), id }
+    }
+
     /// Starts the agent, which must not be running.
     pub fn restart(&mut self) {
         assert!(self.process.is_none(), "the agent of {} already runs", self.name);

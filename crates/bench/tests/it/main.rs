@@ -1,5 +1,6 @@
 //! The end-to-end tests: the real programs, started as processes, and the rules all of the source keeps.
 
+mod approval;
 mod broker;
 mod confinement;
 mod corridor;

@@ -348,6 +348,7 @@ fn documents_of_the_api() {
             name: parsed("atlas"),
             token: "tskr_…".to_owned(),
             mqtt: MqttEndpoint { host: None, port: 1883, prefix: TopicPrefix::default(), tls: true, external: None },
+            awaits_approval: false,
         },
     );
     let external = Some(ExternalBroker { password: "…".to_owned() });

@@ -11,6 +11,7 @@ use task_proto::selector::Selector;
 use task_proto::token::{Token, TokenKind};
 use task_proto::{MacAddress, RobotId, RobotName, TokenId};
 
+use super::approval::check_room;
 use super::{ActionError, Actions, MAX_LIFETIME_MS, check_scope, quoted};
 use crate::advance::advance;
 use crate::changes::{Change, Consequences};
@@ -29,6 +30,8 @@ pub struct Enrolled {
     pub name: RobotName,
     /// Its token, shown this once.
     pub token: Token,
+    /// Whether it waits to be approved.
+    pub awaits_approval: bool,
 }
 
 impl Actions {
@@ -62,18 +65,28 @@ impl Actions {
                 known
             }
             Some(known) => return Err(ActionError::MacKnown { mac: known.mac, name: known.name }),
-            None => register(&mut write, terms, request, now_ms).await?,
+            None => {
+                let awaits_approval = self.settings.enrolment_approval || terms.approval;
+                let robot = register(&mut write, terms, request, now_ms).await?;
+                if awaits_approval {
+                    check_room(&mut write).await?;
+                }
+                write.note_enrolment(&robot.id, token, address, awaits_approval).await?;
+                robot
+            }
         };
+        let awaits_approval = write.is_pending(&robot.id).await?;
         if !is_retry {
             write.use_enrolment_token(token).await?;
         }
         let robot_token = Token::random(TokenKind::Robot);
         write.offer_robot_token(&robot_token, &robot.id, Some(token), now_ms).await?;
         let deed = Deed::new("enrolment".to_owned(), token.id().parse().ok(), address, Act::RobotEnroll, &robot.id);
-        write.audit(&deed.with("name", &robot.name).with("mac", robot.mac), now_ms).await?;
+        let deed = deed.with("name", &robot.name).with("mac", robot.mac);
+        write.audit(&deed.with_some("awaits_approval", awaits_approval.then_some(true)), now_ms).await?;
         write.commit().await?;
         self.changes.announce(Change::Robot(robot.id.clone()));
-        Ok(Enrolled { robot_id: robot.id, name: robot.name, token: robot_token })
+        Ok(Enrolled { robot_id: robot.id, name: robot.name, token: robot_token, awaits_approval })
     }
 
     /// Makes a token that `robot` may go over to. The one it uses ends when that one is first used.
@@ -110,13 +123,15 @@ impl Actions {
             None => None,
         };
         let expires_at_ms = now_ms + lifetime_ms;
-        let terms = EnrolmentTerms { robot, labels: order.labels.clone(), uses_left: order.uses, expires_at_ms };
+        let (labels, approval) = (order.labels.clone(), order.approval);
+        let terms = EnrolmentTerms { robot, labels, uses_left: order.uses, expires_at_ms, approval };
         let token = Token::random_enrolment(self.key.public_key(), self.settings.ca_pin);
         write.create_enrolment_token(&token, &terms, now_ms).await?;
         let deed = Deed::by(by, Act::EnrolmentCreate, token.id())
             .with_some("robot", terms.robot.as_ref())
             .with_some("uses", terms.uses_left)
             .with("labels", shown_labels(&terms.labels))
+            .with_some("approval", terms.approval.then_some(true))
             .with("expires_at_ms", expires_at_ms);
         write.audit(&deed, now_ms).await?;
         write.commit().await?;
@@ -301,7 +316,7 @@ fn check_labels(labels: &Labels) -> Result<(), ActionError> {
 }
 
 /// The robot with this id or name, or the error that there is none.
-async fn known_robot(write: &mut Write, id_or_name: &str) -> Result<KnownRobot, ActionError> {
+pub(super) async fn known_robot(write: &mut Write, id_or_name: &str) -> Result<KnownRobot, ActionError> {
     // An id has the form of a name. What has not is no matter for the database, which might not even take the text.
     let robot = match id_or_name.parse::<RobotName>() {
         Ok(name) => write.known_robot(name.as_str()).await?,

@@ -28,6 +28,9 @@ pub enum Action {
         /// A label that each robot that uses it gets; may be repeated
         #[arg(long = "label", value_name = "KEY=VALUE", value_parser = label)]
         labels: Vec<(LabelKey, LabelValue)>,
+        /// Let each new robot that uses it wait until an administrator approves it (taskd robot approve)
+        #[arg(long)]
+        approval: bool,
     },
     /// List those that are still good for something
     List,
@@ -40,9 +43,9 @@ pub enum Action {
 
 pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, CommandError> {
     match action {
-        Action::Create { robot, uses, ttl, labels } => {
+        Action::Create { robot, uses, ttl, labels, approval } => {
             let ttl_s = ttl.map(|ttl| ttl.as_secs());
-            let request = CreateEnrollmentToken { robot, uses, ttl_s, labels: labels.into_iter().collect() };
+            let request = CreateEnrollmentToken { robot, uses, ttl_s, labels: labels.into_iter().collect(), approval };
             let key = super::client::random_key();
             let token: EnrollmentToken = session.client.order("/enrollment-tokens", &request, &key).await?;
             session.output.described(&token, |token| token.token.clone())?;
@@ -50,7 +53,7 @@ pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, Co
         }
         Action::List => {
             let list: EnrollmentTokenList = session.client.get("/enrollment-tokens", &[]).await?;
-            let header = ["id", "robot", "labels", "uses left", "made", "ends"];
+            let header = ["id", "robot", "labels", "uses left", "approval", "made", "ends"];
             session.output.result(&list, &header, |list| list.tokens.iter().map(row).collect())?;
         }
         Action::Revoke { id } => {
@@ -68,6 +71,7 @@ fn row(token: &EnrollmentTokenView) -> Vec<String> {
         token.robot.as_ref().map_or_else(|| "any new one".to_owned(), ToString::to_string),
         if labels.is_empty() { "-".to_owned() } else { labels.join(" ") },
         token.uses_left.map_or_else(|| "any number".to_owned(), |uses| uses.to_string()),
+        if token.approval { "yes" } else { "-" }.to_owned(),
         time(token.created_at_ms),
         time(token.expires_at_ms),
     ]

@@ -40,7 +40,7 @@ mod wait;
 /// The operator's commands; `main` adds `serve` to them.
 #[derive(Debug, Subcommand)]
 pub enum Command {
-    /// Look at robots, revoke or remove one
+    /// Look at robots, let them in, revoke or remove one
     Robot {
         /// What to do.
         #[command(subcommand)]

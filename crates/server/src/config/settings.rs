@@ -257,6 +257,12 @@ pub(super) const SETTINGS: &[Setting] = &[
         set: |config, text| size_within(text, 1024, 1 << 50).map(|n| config.transfers.all.bytes_per_s = Some(n)),
     },
     Setting {
+        name: "enrolment-approval",
+        value_name: "BOOL",
+        help: "Let every new robot wait until an administrator approves it",
+        set: |config, text| boolean(text).map(|approval| config.enrolment_approval = approval),
+    },
+    Setting {
         name: "robots-messages-per-s",
         value_name: "N",
         help: "MQTT messages a second of one robot, beyond which it is slowed; ten seconds' worth may come at once [default: 100]",

@@ -45,7 +45,7 @@ struct Wrong {
 
 /// Whether the file may have a table of this name.
 pub(super) fn is_known(name: &str) -> bool {
-    matches!(name, "delivery" | "robots" | "tls" | "transfers")
+    matches!(name, "delivery" | "enrolment" | "robots" | "tls" | "transfers")
 }
 
 impl Config {

@@ -225,6 +225,7 @@ async fn identify(app: &App, method: &Method, headers: &HeaderMap) -> Result<(Ca
     Ok(match holder {
         TokenHolder::Person(person) => (Caller::Person(person), TokenNumber(0)),
         TokenHolder::Enrolment => (Caller::Enrolment(Box::new(token)), TokenNumber(0)),
+        TokenHolder::Pending(_) => return Err(ApiError::awaits_approval()),
         TokenHolder::Robot { robot, token_number } => {
             if is_first_use {
                 // Whoever is connected came in by the token that has just ended.

@@ -53,6 +53,12 @@ impl ApiError {
         Self::new(StatusCode::UNAUTHORIZED, ROBOT_REVOKED, message)
     }
 
+    /// 403: the robot waits to be approved.
+    pub fn awaits_approval() -> Self {
+        let message = "this robot waits to be approved: an administrator does that with taskd robot approve";
+        Self::new(StatusCode::FORBIDDEN, api::AWAITS_APPROVAL, message)
+    }
+
     /// 403: whoever asks may not.
     pub fn forbidden(message: impl Into<String>) -> Self {
         Self::new(StatusCode::FORBIDDEN, "forbidden", message)
@@ -139,7 +145,9 @@ impl From<ActionError> for ApiError {
             ActionError::TokenForOther { .. } | ActionError::OutOfScope { .. } | ActionError::NotPermitted(_) => {
                 StatusCode::FORBIDDEN
             }
-            ActionError::SignInBlocked { .. } | ActionError::TooManySignIns => StatusCode::TOO_MANY_REQUESTS,
+            ActionError::SignInBlocked { .. } | ActionError::TooManySignIns | ActionError::TooManyPending(_) => {
+                StatusCode::TOO_MANY_REQUESTS
+            }
             ActionError::RobotNotFound(_)
             | ActionError::DeploymentNotFound(_)
             | ActionError::UserNotFound(_)
@@ -151,6 +159,7 @@ impl From<ActionError> for ApiError {
             | ActionError::MacKnown { .. }
             | ActionError::NameTaken(_)
             | ActionError::EnrolledAnew(_)
+            | ActionError::NotPending(_)
             | ActionError::DeploymentCancelled(_)
             | ActionError::UserExists(_)
             | ActionError::LastAdministrator(_)

@@ -24,6 +24,10 @@ const MOST_CHARACTERS: usize = 1_000;
 pub enum Act {
     /// A robot came, or came back.
     RobotEnroll,
+    /// A robot that waited was let in.
+    RobotApprove,
+    /// A robot that waited was turned away.
+    RobotReject,
     /// A robot's name or labels were changed.
     RobotEdit,
     /// A robot was removed.
@@ -81,6 +85,8 @@ impl Act {
     pub fn as_str(self) -> &'static str {
         match self {
             Self::RobotEnroll => "robot.enroll",
+            Self::RobotApprove => "robot.approve",
+            Self::RobotReject => "robot.reject",
             Self::RobotEdit => "robot.edit",
             Self::RobotRemove => "robot.remove",
             Self::RobotRevoke => "robot.revoke",

@@ -30,6 +30,8 @@ pub enum TokenHolder {
         /// The number of its token: a later one has a higher number.
         token_number: u64,
     },
+    /// A robot that waits to be approved, which may nothing yet.
+    Pending(RobotId),
 }
 
 /// A token that was shown and is good.
@@ -52,6 +54,8 @@ pub struct EnrolmentTerms {
     pub uses_left: Option<u64>,
     /// When it ends.
     pub expires_at_ms: u64,
+    /// Whether a new robot that comes by it waits to be approved.
+    pub approval: bool,
 }
 
 struct TokenRow {
@@ -61,6 +65,9 @@ struct TokenRow {
     uses_left: Option<u64>,
     expires_at_ms: Option<u64>,
     is_used: bool,
+    approval: bool,
+    /// Of a robot's token: whether the robot waits to be approved.
+    is_pending: bool,
     number: u64,
     user: Option<UserPart>,
 }
@@ -78,8 +85,9 @@ struct UserPart {
 /// An enrolment token without a use left is still good while a token that it made was never used: the answer with that
 /// one may have been lost.
 const VALID_TOKEN: &str = "SELECT t.digest, t.robot_id, t.labels, t.uses_left, t.expires_at_ms, t.used_at_ms, t.number,
-         t.user_name, t.roles, t.scope, t.origin, u.roles AS user_roles, u.scope AS user_scope
-     FROM tokens t LEFT JOIN users u ON u.name = t.user_name
+         t.user_name, t.roles, t.scope, t.origin, t.approval, u.roles AS user_roles, u.scope AS user_scope,
+         r.awaits_approval
+     FROM tokens t LEFT JOIN users u ON u.name = t.user_name LEFT JOIN robots r ON r.id = t.robot_id
      WHERE t.id = $1 AND t.kind = $2 AND t.revoked_at_ms IS NULL AND (t.expires_at_ms IS NULL OR t.expires_at_ms > $3)
        AND (t.uses_left IS NULL OR t.uses_left > 0 OR EXISTS (SELECT 1 FROM tokens made
             WHERE made.made_by = t.id AND made.used_at_ms IS NULL AND made.revoked_at_ms IS NULL))";
@@ -149,6 +157,7 @@ impl Write {
             labels: row.labels,
             uses_left: row.uses_left,
             expires_at_ms: row.expires_at_ms.unwrap_or(u64::MAX),
+            approval: row.approval,
         }))
     }
 
@@ -169,11 +178,12 @@ impl Write {
         now_ms: u64,
     ) -> Result<(), StoreError> {
         self.insert_token(token, terms.robot.as_ref(), None, now_ms).await?;
-        sqlx::query("UPDATE tokens SET labels = $2, uses_left = $3, expires_at_ms = $4 WHERE id = $1")
+        sqlx::query("UPDATE tokens SET labels = $2, uses_left = $3, expires_at_ms = $4, approval = $5 WHERE id = $1")
             .bind(token.id())
             .bind(json(&terms.labels))
             .bind(terms.uses_left.map(stored))
             .bind(stored(terms.expires_at_ms))
+            .bind(i64::from(terms.approval))
             .execute(self.connection())
             .await?;
         Ok(())
@@ -267,6 +277,7 @@ impl TokenRow {
         match token.kind() {
             TokenKind::Operator => self.person(token).map(TokenHolder::Person),
             TokenKind::Enrolment => Some(TokenHolder::Enrolment),
+            TokenKind::Robot if self.is_pending => self.robot.map(TokenHolder::Pending),
             TokenKind::Robot => self.robot.map(|robot| TokenHolder::Robot { robot, token_number: self.number }),
         }
     }
@@ -297,6 +308,8 @@ fn token_row(row: sqlx::any::AnyRow) -> Result<TokenRow, StoreError> {
         uses_left: row.try_get::<Option<i64>, _>("uses_left")?.map(number),
         expires_at_ms: row.try_get::<Option<i64>, _>("expires_at_ms")?.map(number),
         is_used: row.try_get::<Option<i64>, _>("used_at_ms")?.is_some(),
+        approval: row.try_get::<i64, _>("approval")? != 0,
+        is_pending: row.try_get::<Option<i64>, _>("awaits_approval")?.is_some_and(|awaits| awaits != 0),
         number: number(row.try_get("number")?),
         user: user_part(&row)?,
     })

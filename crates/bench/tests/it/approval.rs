@@ -50,7 +50,7 @@ async fn a_robot_waits_for_its_approval_over_restarts_and_goes_on_by_itself() {
     until_it_waits(&data).await;
     // An agent that is started meanwhile has nothing, and keeps asking.
     let id = server.robot("atlas").await.expect("listed").id;
-    let mut robot = Robot::enrolled(dir.path(), "atlas", id);
+    let mut robot = Robot::enrolled(dir.path(), "atlas", id, &[]);
     robot.restart();
     eventually("the agent to be told", async || {
         let log = std::fs::read_to_string(data.with_extension("agent.log")).unwrap_or_default();

@@ -337,8 +337,9 @@ impl Robot {
     }
 
     /// One that enrols by itself in the directory `name` below `dir`. Its agent does not run yet.
-    pub fn enrolled(dir: &Path, name: &str, id: RobotId) -> Self {
-        Self { process: None, data: dir.join(name), environment: Vec::new(), name: name.to_owned(), id }
+    pub fn enrolled(dir: &Path, name: &str, id: RobotId, environment: &[(&str, &str)]) -> Self {
+        let environment = environment.iter().map(|(k, v)| ((*k).to_owned(), (*v).to_owned())).collect();
+        Self { process: None, data: dir.join(name), environment, name: name.to_owned(), id }
     }
 
     /// Starts the agent, which must not be running.

@@ -21,6 +21,7 @@ mod revoked;
 mod ros;
 mod ros1;
 mod scenarios;
+mod secrets;
 mod talker;
 mod tidy;
 mod tls;

@@ -6,10 +6,11 @@ use task_proto::api::{CreateDeployment, DeliveryChoice, MAX_PRIORITY, MIN_PRIORI
 use task_proto::report::Phase;
 use task_proto::{DeploymentId, RobotId, UserName};
 
+use super::approval::give_up_pending;
 use super::robots::lifetime_ms;
 use super::{ActionError, Actions, DAY_MS, IdempotencyKey, check_scope, quoted};
 use crate::advance::advance;
-use crate::changes::Consequences;
+use crate::changes::{Change, Consequences};
 use crate::chooser::{Chooser, travelling_bytes};
 use crate::delivery::shown_bytes;
 use crate::person::Person;

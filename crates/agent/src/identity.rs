@@ -45,6 +45,9 @@ pub struct Identity {
     pub mqtt: MqttEndpoint,
     /// The MAC it was registered by.
     pub mac: MacAddress,
+    /// Whether it had to wait to be approved when `enroll` was last heard of.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub awaits_approval: bool,
 }
 
 /// The identity can't be read or written.
@@ -186,6 +189,7 @@ mod tests {
             client_key: None,
             mqtt: MqttEndpoint { host: None, port: 1883, prefix: Default::default(), tls: false, external: None },
             mac: "02:00:00:00:00:01".parse().expect("valid"),
+            awaits_approval: false,
         };
         identity.write(&path).expect("written");
         assert_eq!(std::fs::metadata(&path).expect("there").permissions().mode() & 0o777, 0o600);

@@ -38,8 +38,11 @@ pub struct Ledger {
     pub boot_id: String,
     /// The last desired state that was accepted.
     pub accepted: Option<Accepted>,
-    /// The server does not know this robot's token: it was removed there.
+    /// The server does not accept this robot's token: it was removed or revoked there.
     pub removed: bool,
+    /// The server's reason for that; empty if it is not known.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub removed_because: String,
     /// The tasks on this robot.
     pub tasks: BTreeMap<TaskName, TaskRecord>,
 }
@@ -259,7 +262,25 @@ impl Ledger {
     /// The ledger of a robot that was never started, or whose ledger was lost. A start counter above all earlier ones
     /// makes the server take this agent's reports for newer than those before the loss.
     pub fn new(start: u64) -> Self {
-        Self { format: FORMAT, start, boot_id: String::new(), accepted: None, removed: false, tasks: BTreeMap::new() }
+        Self {
+            format: FORMAT,
+            start,
+            boot_id: String::new(),
+            accepted: None,
+            removed: false,
+            removed_because: String::new(),
+            tasks: BTreeMap::new(),
+        }
+    }
+
+    /// What a person is told while the server does not accept the robot's token.
+    pub fn removal(&self) -> Option<String> {
+        let because = match self.removed_because.as_str() {
+            "" => String::new(),
+            because => format!(" ({because})"),
+        };
+        let text = || format!("the server does not accept this robot's token{because}: nothing new is begun");
+        self.removed.then(text)
     }
 
     /// Reads the ledger at `path`; one that can't be understood is moved aside, not deleted.

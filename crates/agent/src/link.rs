@@ -48,8 +48,8 @@ pub enum Heard {
         /// What the server said, if it was asked over HTTP.
         reply: Option<ReportReply>,
     },
-    /// The server does not know this robot's token.
-    TokenRefused,
+    /// The server does not accept this robot's token, for the reason that it gives.
+    TokenRefused(String),
     /// The server knows the robot and sends it no state now.
     Withheld {
         /// The server's code.
@@ -179,7 +179,8 @@ pub async fn poll(server: Server, shared: Shared, intervals: Intervals, heard: m
             shared.meter.round_trip(begun.elapsed());
         }
         let least = match &outcome {
-            Err(ServerError::TokenRefused(_)) => REFUSED_POLL.min(intervals.slow),
+            // Spread like all else: whoever was put out together does not ask together.
+            Err(ServerError::TokenRefused(_)) => REFUSED_POLL.min(intervals.slow).mul_f64(spread()),
             Err(ServerError::Busy { retry_after: Some(wait), .. }) => (*wait).min(intervals.slow),
             _ => Duration::ZERO,
         };
@@ -224,7 +225,7 @@ fn heard_of(outcome: Result<Option<Sent>, ServerError>) -> Heard {
     match outcome {
         Ok(Some(sent)) => Heard::Desired { envelope: Box::new(sent.envelope), inline: Inline::default() },
         Ok(None) => Heard::Unchanged,
-        Err(ServerError::TokenRefused(_)) => Heard::TokenRefused,
+        Err(ServerError::TokenRefused(why)) => Heard::TokenRefused(why),
         Err(ServerError::Refused { code, message }) => Heard::Withheld { code, text: message },
         Err(error) => {
             tracing::info!(error = %chain(&error), "no desired state over HTTP");
@@ -260,12 +261,17 @@ pub async fn post(server: Server, shared: Shared, heard: mpsc::Sender<Heard>) {
                 Err(error) => {
                     tracing::info!(error = %chain(&error), "no report over HTTP");
                     failures += 1;
-                    if matches!(error, ServerError::TokenRefused(_)) && heard.send(Heard::TokenRefused).await.is_err() {
-                        return;
-                    }
                     retry = Duration::from_millis(backoff_ms(failures, MAX_POST_BACKOFF_MS, rand::random()).max(100));
-                    if let ServerError::Busy { retry_after: Some(wait), .. } = error {
-                        retry = retry.max(wait.min(REFUSED_POLL));
+                    match error {
+                        ServerError::Busy { retry_after: Some(wait), .. } => retry = retry.max(wait.min(REFUSED_POLL)),
+                        ServerError::TokenRefused(why) => {
+                            // What changes that is noticed by polling.
+                            retry = REFUSED_POLL.mul_f64(spread());
+                            if heard.send(Heard::TokenRefused(why)).await.is_err() {
+                                return;
+                            }
+                        }
+                        _ => {}
                     }
                 }
             }

@@ -44,6 +44,8 @@ const CONNECT_TIMEOUT: Duration = Duration::from_secs(10);
 const MAX_BACKOFF_MS: u64 = 60 * 1000;
 /// The longest wait after the broker refused this robot.
 const MAX_REFUSED_BACKOFF_MS: u64 = 5 * 60 * 1000;
+/// The shortest; up to half as much is added.
+const MIN_REFUSED_BACKOFF_MS: u64 = 10 * 1000;
 /// A session that lasted this long shows that the way is good: the backoff begins anew.
 const GOOD_SESSION: Duration = Duration::from_secs(60);
 /// Requests between this task and rumqttc.
@@ -128,7 +130,7 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
         // Whoever waits for parts need not give up if the next session comes at once.
         shared.listening.session(matches!(ended, Ended::TooNarrow));
         failures = if begun.elapsed() >= GOOD_SESSION { 1 } else { failures.saturating_add(1) };
-        let max_ms = match ended {
+        let (min_ms, max_ms) = match ended {
             Ended::Closed => return,
             Ended::TooNarrow => {
                 sends_large = true;
@@ -143,21 +145,21 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
                 tracing::warn!("the MQTT broker refuses this robot");
                 // Whether the robot was removed is asked over HTTP, whose answer is the server's own.
                 shared.poll.notify_one();
-                MAX_REFUSED_BACKOFF_MS
+                (MIN_REFUSED_BACKOFF_MS + rand::random_range(0..=MIN_REFUSED_BACKOFF_MS / 2), MAX_REFUSED_BACKOFF_MS)
             }
             Ended::Unreachable(error) => {
                 tracing::info!(error = %chain(&error), "no MQTT session");
-                MAX_BACKOFF_MS
+                (0, MAX_BACKOFF_MS)
             }
             Ended::Lost(error) => {
                 tracing::info!(%error, "no MQTT session");
                 if was_up {
                     shared.meter.reconnected(Instant::now());
                 }
-                MAX_BACKOFF_MS
+                (0, MAX_BACKOFF_MS)
             }
         };
-        let wait = Duration::from_millis(backoff_ms(failures, max_ms, rand::random()));
+        let wait = Duration::from_millis(backoff_ms(failures, max_ms, rand::random()).max(min_ms));
         tokio::select! {
             // Cancel-safe: a timer that is made anew each time.
             () = tokio::time::sleep(wait) => {}

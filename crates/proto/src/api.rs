@@ -1,14 +1,18 @@
 //! Bodies of the HTTP API under `/api/v1`. Times are milliseconds since the Unix epoch by the server's clock, sizes are
 //! bytes. Unknown fields are tolerated in answers; requests are checked by the server.
 
+mod conduct;
 mod delivery;
+mod enrolment;
 mod logs;
 mod mqtt;
 mod people;
 
 use serde::{Deserialize, Serialize};
 
+pub use self::conduct::ConductTotals;
 pub use self::delivery::{DeliveryChoice, DeliveryDecision, MAX_PRIORITY, MIN_PRIORITY};
+pub use self::enrolment::{AWAITS_APPROVAL, EnrollmentTokenList, EnrollmentTokenView, PendingRobot, PendingRobotList};
 pub use self::logs::{LogEvent, LogsFrom, LogsQuery, LogsView};
 pub use self::mqtt::{BrokerFiles, ExternalBroker, MqttEndpoint};
 pub use self::people::{
@@ -65,6 +69,9 @@ pub struct ServerInfo {
     /// What went over HTTP since then.
     #[serde(default)]
     pub http: HttpTraffic,
+    /// What was done about robots that misbehaved since then.
+    #[serde(default)]
+    pub conduct: ConductTotals,
 }
 
 /// What went over HTTP, all connections together, counted at the sockets. In is towards the server.
@@ -149,6 +156,9 @@ pub struct EnrollResponse {
     pub token: String,
     /// How to reach MQTT.
     pub mqtt: MqttEndpoint,
+    /// Whether it waits to be approved: until then it is refused everything with the code [`AWAITS_APPROVAL`].
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub awaits_approval: bool,
 }
 
 /// Answer to a robot's `POST /robots/{robot}/token`. The token is shown this once; its first use ends the one before.
@@ -173,6 +183,9 @@ pub struct CreateEnrollmentToken {
     /// Labels each robot that uses it gets.
     #[serde(default)]
     pub labels: Labels,
+    /// Whether a robot that comes by it waits to be approved, also where the server does not ask that of all.
+    #[serde(default)]
+    pub approval: bool,
 }
 
 /// A new enrolment token. The secret is shown this once.

@@ -15,6 +15,7 @@ use task_proto::topic::TopicPrefix;
 use taskd::broker::{
     Broker, BrokerConfig, Gatekeeper, Inbox, Limits, Login, NotStored, Principal, Refusal, RobotMessage,
 };
+use taskd::conduct::{Conduct, ConductLimits};
 
 /// As taskd itself has it.
 #[global_allocator]
@@ -58,6 +59,7 @@ fn main() -> anyhow::Result<()> {
         tls: None,
         prefix: TopicPrefix::default(),
         limits: Limits { max_silent_per_address: 20_000, ..Limits::default() },
+        conduct: Conduct::new(ConductLimits::default()),
     };
     let runtime = tokio::runtime::Runtime::new()?;
     let broker = runtime.block_on(Broker::start(config, Arc::new(Open), connected.clone()))?;

@@ -21,6 +21,7 @@ use self::settings::{SETTINGS, Setting};
 pub use self::tables::{SiteLimits, TransferLimits};
 pub use self::tls::TlsSettings;
 use crate::broker_url::BrokerUrl;
+use crate::conduct::ConductLimits;
 use crate::delivery::{Rule, Rules};
 
 /// Everything `taskd serve` can be told.
@@ -72,6 +73,10 @@ pub struct Config {
     pub delivery: DeliverySettings,
     /// What bounds the transfers of packages over HTTP.
     pub transfers: TransferLimits,
+    /// What a robot may send.
+    pub robots: ConductLimits,
+    /// Whether every new robot waits to be approved.
+    pub enrolment_approval: bool,
 }
 
 /// `[delivery]`: how packages travel to robots.
@@ -181,12 +186,15 @@ pub enum ConfigError {
     /// No data directory is given and there is no home to put it in.
     #[error("--data: no directory is given, and neither XDG_DATA_HOME nor HOME says where to put one")]
     NoDataDirectory,
-    /// The broker's password stands where every user of the machine can read it.
+    /// A password stands where every user of the machine can read it.
     #[error(
-        "--broker: everybody on this machine can read a command line, so the broker's URL with its password belongs in \
-         the configuration file (broker = \"mqtt://…\") or in TASKD_BROKER"
+        "--{name}: everybody on this machine can read a command line, so a URL with a password belongs in the \
+         configuration file ({name} = \"…\") or in TASKD_{upper}", upper = name.to_uppercase()
     )]
-    PasswordInSight,
+    PasswordInSight {
+        /// Which setting.
+        name: &'static str,
+    },
     /// The broker's password would cross the network readable.
     #[error(
         "broker = {address}: an unencrypted connection to another machine is refused; use mqtts://, a broker on this machine or \
@@ -257,6 +265,8 @@ impl Config {
             max_blob_bytes: 16 << 30,
             delivery: DeliverySettings::default(),
             transfers: TransferLimits::default(),
+            robots: ConductLimits::default(),
+            enrolment_approval: false,
         }
     }
 
@@ -274,8 +284,10 @@ impl Config {
         }
         config.apply_environment(&environment)?;
         for (name, text) in &flags.settings {
-            if *name == "broker" && text != "embedded" {
-                return Err(ConfigError::PasswordInSight);
+            // A broker's URL always has a password. A file's name may hold an '@', but is no one else's secret.
+            let has_password = text.split_once("://").is_some_and(|(_, rest)| rest.contains('@'));
+            if *name == "broker" && text != "embedded" || *name == "database" && has_password {
+                return Err(ConfigError::PasswordInSight { name });
             }
             config.apply(&name.replace('-', "_"), text, Origin::Flag(format!("--{name}")))?;
         }
@@ -334,7 +346,12 @@ impl Config {
             return Err(syntax(format!("it has more than {MAX_FILE_BYTES} bytes")));
         }
         let text = std::fs::read_to_string(path).map_err(unreadable)?;
-        let table: toml::Table = text.parse().map_err(|error: toml::de::Error| syntax(error.to_string()))?;
+        let table: toml::Table = text.parse().map_err(|error: toml::de::Error| {
+            // Not the line itself, which may hold a password.
+            let line = error.span().map(|span| text[..span.start.min(text.len())].matches('\n').count() + 1);
+            let line = line.map(|line| format!("line {line}: ")).unwrap_or_default();
+            syntax(format!("{line}{}", error.message()))
+        })?;
         for (key, value) in table {
             match value {
                 toml::Value::Table(table) if tables::is_known(&key) => self.apply_table(path, &key, table)?,

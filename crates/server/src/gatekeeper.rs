@@ -9,7 +9,7 @@ use task_proto::token::Token;
 
 use crate::broker::{Gatekeeper, Login, Principal, Refusal};
 use crate::clock::Clock;
-use crate::store::{Store, TokenHolder};
+use crate::store::{Store, StoreError, TokenHolder};
 
 /// Answers by the tokens in the database.
 pub struct StoreGatekeeper {
@@ -23,10 +23,11 @@ impl StoreGatekeeper {
     async fn decide(&self, login: Login) -> Result<Principal, Refusal> {
         let password = login.password.as_deref().ok_or(Refusal::BadCredentials)?;
         let token: Token = password.parse().map_err(|_| Refusal::BadCredentials)?;
-        let admitted = self.store.admit(&token, &login.proof, self.clock.now_ms()).await.map_err(|error| {
+        let unchecked = |error: StoreError| {
             tracing::warn!(error = &error as &dyn std::error::Error, "a login over MQTT could not be checked");
             Refusal::Unavailable
-        })?;
+        };
+        let admitted = self.store.admit(&token, &login.proof, self.clock.now_ms()).await.map_err(unchecked)?;
         match admitted.map(|admitted| admitted.holder) {
             Some(TokenHolder::Robot { robot, token_number, .. }) => {
                 let is_itself = login.client_id == robot.as_str() && login.user_name.as_deref() == Some(robot.as_str());
@@ -37,7 +38,8 @@ impl StoreGatekeeper {
                 Ok(Principal::Operator(person.name))
             }
             Some(TokenHolder::Person(_)) => Err(Refusal::NotAuthorised),
-            Some(TokenHolder::Enrolment) => Err(Refusal::NotAuthorised),
+            Some(TokenHolder::Enrolment | TokenHolder::Pending(_)) => Err(Refusal::NotAuthorised),
+            None if self.store.is_of_revoked_robot(&token).await.map_err(unchecked)? => Err(Refusal::NotAuthorised),
             None => Err(Refusal::BadCredentials),
         }
     }

@@ -12,6 +12,7 @@ pub mod chooser;
 pub mod clock;
 pub mod collector;
 pub mod commands;
+pub mod conduct;
 pub mod config;
 pub mod data_directory;
 pub mod delivery;

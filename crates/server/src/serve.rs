@@ -19,6 +19,7 @@ use crate::changes::{Change, Changes};
 use crate::chooser::{Chooser, ServerLoad};
 use crate::clock::Clock;
 use crate::collector;
+use crate::conduct::Conduct;
 use crate::config::{Config, TlsSettings};
 use crate::data_directory::{Addresses, DataDirectory, DataError};
 use crate::downlink::Downlink;
@@ -51,6 +52,8 @@ const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
 const EXPIRY_INTERVAL: Duration = Duration::from_secs(30);
 /// How often it looks for robots that have fallen silent.
 const SILENCE_INTERVAL: Duration = Duration::from_secs(5);
+/// How often it looks for robots that misbehave no longer.
+const FORGIVING_INTERVAL: Duration = Duration::from_secs(1);
 /// How often it looks at how busy it is.
 const LOAD_INTERVAL: Duration = Duration::from_secs(1);
 
@@ -121,8 +124,10 @@ impl Server {
         let (heard, said) = (requests.clone(), logs.clone());
         let uplink = Uplink::new(writer.clone(), heard, said, presence.clone(), changes.clone(), clock.clone());
         let gatekeeper = StoreGatekeeper { store: store.clone(), clock: clock.clone() };
+        let conduct = Conduct::new(config.robots);
+        let broker = broker_config(&config, tls.clone(), conduct.clone());
         let (broker, mqtt) =
-            start_broker(&config, &data, &public_key, tls.clone(), Arc::new(gatekeeper), Arc::new(uplink)).await?;
+            start_broker(&config, broker, &data, &public_key, Arc::new(gatekeeper), Arc::new(uplink)).await?;
 
         let transfers = Transfers::new(&config.transfers, config.delivery.site_label.clone());
         let (stop, tasks) = (CancellationToken::new(), TaskTracker::new());
@@ -140,6 +145,8 @@ impl Server {
             blobs,
             transfers,
             sessions: Arc::default(),
+            visits: Arc::default(),
+            conduct,
             attempts: Arc::default(),
             events: EventFeed::new(),
             key: public_key,
@@ -230,7 +237,12 @@ fn start_tasks(tasks: &TaskTracker, app: &App, config: &Config) {
         clock: app.clock.clone(),
     };
     tasks.spawn(downlink.run(app.changes.clone(), app.stop.clone()));
-    let source = EventSource { store: app.store.clone(), presence: app.presence.clone(), clock: app.clock.clone() };
+    let source = EventSource {
+        store: app.store.clone(),
+        presence: app.presence.clone(),
+        conduct: app.conduct.clone(),
+        clock: app.clock.clone(),
+    };
     tasks.spawn(app.events.clone().run(source, app.changes.clone(), app.stop.clone()));
     let (store, blobs, clock, stop) = (app.store.clone(), app.blobs.clone(), app.clock.clone(), app.stop.clone());
     tasks.spawn(collector::run(store, blobs, clock, config.blob_grace, stop));
@@ -245,6 +257,7 @@ fn start_tasks(tasks: &TaskTracker, app: &App, config: &Config) {
     };
     tasks.spawn(worker.run(app.stop.clone()));
     tasks.spawn(notice_silence(app.clone()));
+    tasks.spawn(show_conduct(app.clone()));
 }
 
 async fn expire_assignments(app: App) {
@@ -258,6 +271,22 @@ async fn expire_assignments(app: App) {
                 "assignments could not be looked through for expired ones"
             ),
         }
+    }
+}
+
+/// Shows that robots misbehave, and that they do so no longer.
+async fn show_conduct(app: App) {
+    let mut ticks = ticks(FORGIVING_INTERVAL);
+    loop {
+        let news = tokio::select! {
+            () = app.stop.cancelled() => return,
+            _ = ticks.tick() => {
+                app.conduct.forgive(tokio::time::Instant::now());
+                continue;
+            }
+            news = app.conduct.news() => news,
+        };
+        news.into_iter().for_each(|robot| app.changes.announce(Change::Robot(robot)));
     }
 }
 
@@ -319,6 +348,7 @@ fn action_settings(config: &Config, tls: Option<&Tls>) -> ActionSettings {
         ca_pin: tls.and_then(Tls::told_pin),
         assignment_lifetime_ms: milliseconds(config.assignment_expiry),
         desired_lifetime_ms: milliseconds(config.desired_lifetime),
+        enrolment_approval: config.enrolment_approval,
         ..ActionSettings::default()
     }
 }
@@ -345,16 +375,16 @@ fn http_limits(config: &Config) -> listener::Limits {
 /// The broker, and what robots and an external broker are told about each other.
 async fn start_broker(
     config: &Config,
+    embedded: BrokerConfig,
     data: &DataDirectory,
     key: &PublicKey,
-    tls: Option<Tls>,
     gatekeeper: Arc<dyn Gatekeeper>,
     inbox: Arc<dyn Inbox>,
 ) -> Result<(Broker, MqttAccess), ServeError> {
     let (host, prefix) = (config.public_mqtt_host.clone(), config.topic_prefix.clone());
     let Some(url) = &config.broker else {
-        let encrypts = tls.is_some();
-        let broker = Broker::start(broker_config(config, tls), gatekeeper, inbox).await?;
+        let encrypts = embedded.tls.is_some();
+        let broker = Broker::start(embedded, gatekeeper, inbox).await?;
         let bound = broker.local_addr().map_or(0, |bound| bound.port());
         let port = config.public_mqtt_port.unwrap_or(bound);
         return Ok((broker, MqttAccess::embedded(host, port, prefix, encrypts)));
@@ -372,13 +402,13 @@ async fn start_broker(
     Ok((Broker::connect(ExternalConfig { url: url.clone(), pin: config.broker_pin, client_id, prefix }, inbox), access))
 }
 
-fn broker_config(config: &Config, tls: Option<Tls>) -> BrokerConfig {
+fn broker_config(config: &Config, tls: Option<Tls>, conduct: Arc<Conduct>) -> BrokerConfig {
     let limits = Limits {
         max_connections: config.max_mqtt_connections,
         max_silent_per_address: config.max_silent_per_address,
         ..Limits::default()
     };
-    BrokerConfig { listen: config.mqtt, tls, prefix: config.topic_prefix.clone(), limits }
+    BrokerConfig { listen: config.mqtt, tls, prefix: config.topic_prefix.clone(), limits, conduct }
 }
 
 /// An address that works from this machine: "all interfaces" is none that one could connect to.

@@ -5,13 +5,12 @@ use std::time::Duration;
 
 use anyhow::{Context as _, bail};
 use task_proto::api::{EnrollRequest, EnrollResponse};
-use task_proto::envelope::PublicKey;
 use task_proto::id::{LabelKey, LabelValue};
 use task_proto::token::{Token, TokenKind};
 use task_proto::{MacAddress, RobotName};
 use task_transport::ClientKey;
 
-use super::{DataDir, refuse_plain_text, say, tls};
+use super::{DataDir, approval, refuse_plain_text, say, tls};
 use crate::admission;
 use crate::clock;
 use crate::config::{Config, Settings, parse_server};
@@ -19,7 +18,7 @@ use crate::durable;
 use crate::identity::{self, Identity};
 use crate::layout::DataDir as Layout;
 use crate::plan::backoff_ms;
-use crate::server::{self, Server, ServerError};
+use crate::server::{self, Sent, Server, ServerError};
 
 /// How often the server is asked.
 const TRIES: u32 = 4;
@@ -32,9 +31,10 @@ pub struct Arguments {
     /// The server's URL [default: the one in the property file]
     #[arg(long, value_name = "URL")]
     server: Option<String>,
-    /// The enrolment token: `taskd enroll-token create` makes one
+    /// The enrolment token: `taskd enroll-token create` makes one. Other users of the machine can read it here, but not in
+    /// the variable
     #[arg(long, value_name = "TOKEN", env = "TASK_AGENT_ENROLL_TOKEN", hide_env_values = true)]
-    token: String,
+    token: Option<String>,
     /// The robot's name
     #[arg(long)]
     name: Option<RobotName>,
@@ -68,9 +68,15 @@ async fn enroll(arguments: Arguments) -> anyhow::Result<ExitCode> {
     let data = Layout::new(&arguments.data.data)?;
     if data.identity().exists() && !arguments.force {
         let known = Identity::read(&data.identity())?;
+        if known.awaits_approval {
+            return go_on_waiting(&data, known).await;
+        }
         bail!("this robot is registered as {} at {}: use --force to register it anew", known.robot_id, known.server);
     }
-    let token: Token = arguments.token.parse().context("--token")?;
+    let Some(shown_token) = &arguments.token else {
+        bail!("--token: no enrolment token is given, here or in TASK_AGENT_ENROLL_TOKEN");
+    };
+    let token: Token = shown_token.parse().context("--token")?;
     let (TokenKind::Enrolment, Some(key)) = (token.kind(), token.server_key()) else {
         bail!("--token: this is no enrolment token; taskd enroll-token create makes one");
     };
@@ -97,7 +103,7 @@ async fn enroll(arguments: Arguments) -> anyhow::Result<ExitCode> {
         client_key: Some(client_key.public_key()),
     };
     let client = server::client(tls(token.ca_pin(), Some(&client_key))?)?;
-    let response = match register(&client, &server, &arguments.token, &request).await {
+    let response = match register(&client, &server, shown_token, &request).await {
         Ok(response) => response,
         Err(error) => return Err(anyhow::Error::new(error).context(format!("{server} did not register the robot"))),
     };
@@ -113,19 +119,34 @@ async fn enroll(arguments: Arguments) -> anyhow::Result<ExitCode> {
         client_key: Some(client_key),
         mqtt: response.mqtt.clone(),
         mac,
+        awaits_approval: response.awaits_approval,
     };
     // Written before the token is used: once it was, the server gives no other for the same enrolment token.
     let before = Identity::read(&data.identity()).ok();
     robot.write(&data.identity())?;
     let registered = Server::new(client, server.clone(), response.robot_id.clone(), response.token.clone());
-    if let Err(error) = check_key(&registered, &response, key).await {
-        match before {
-            Some(before) => before.write(&data.identity())?,
-            None => durable::remove_file(&data.identity()).context("cannot remove the identity")?,
-        }
+    if response.awaits_approval {
+        approval::wait(&data, &registered, robot, before).await?;
+    } else if let Ok(Some(sent)) = registered.desired(None).await
+        // Without that answer the robot is registered all the same and must not forget who it is: every state is verified
+        // before it is obeyed.
+        && let Err(error) = check_key(&sent, &robot)
+    {
+        approval::forget(&data, before)?;
         return Err(error);
     }
     say(format_args!("{} is registered at {server} as {}, by {mac}", response.name, response.robot_id));
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Waits on for what an earlier call of the command waited for.
+async fn go_on_waiting(data: &Layout, robot: Identity) -> anyhow::Result<ExitCode> {
+    let (server, id) = (parse_server(&robot.server)?, robot.robot_id.clone());
+    refuse_plain_text(robot.ca_pin, &server, "server")?;
+    let client = server::client(tls(robot.ca_pin, robot.client_key.as_ref())?)?;
+    let asked = Server::new(client, server.clone(), id.clone(), robot.token.clone());
+    approval::wait(data, &asked, robot, None).await?;
+    say(format_args!("this robot is registered at {server} as {id}"));
     Ok(ExitCode::SUCCESS)
 }
 
@@ -149,17 +170,10 @@ async fn register(
 }
 
 /// The server must hold the key that the token pins: a desired state that it signed shows it.
-async fn check_key(server: &Server, response: &EnrollResponse, key: &PublicKey) -> anyhow::Result<()> {
-    match server.desired(None).await {
-        Ok(Some(sent)) => {
-            admission::open(&sent.envelope, key, &response.robot_id)
-                .context("the server does not hold the key that the enrolment token names")?;
-            Ok(())
-        }
-        // The robot is registered there and must not forget who it is because this answer was lost or withheld: every
-        // state is verified before it is obeyed.
-        Ok(None) | Err(_) => Ok(()),
-    }
+pub(super) fn check_key(sent: &Sent, robot: &Identity) -> anyhow::Result<()> {
+    admission::open(&sent.envelope, &robot.server_key, &robot.robot_id)
+        .context("the server does not hold the key that the enrolment token names")?;
+    Ok(())
 }
 
 /// Keeps in the property file what was given on the command line.

@@ -10,6 +10,7 @@ use task_transport::{ClientKey, Trust};
 
 use crate::clock;
 
+mod approval;
 pub mod configure;
 pub mod enroll;
 pub mod hold;

@@ -47,6 +47,7 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
                 "agent_running": agent,
                 "held": held,
                 "removed": ledger.removed,
+                "removed_because": ledger.removed_because,
                 "generation": ledger.accepted.as_ref().map(|accepted| accepted.generation),
                 "tasks": ledger.tasks.values().map(task_json).collect::<Vec<_>>(),
             });
@@ -58,8 +59,8 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
             if held {
                 say(format_args!("held     nothing is started or switched until task-agent release"));
             }
-            if ledger.removed {
-                say(format_args!("removed  the server does not accept this robot's token: nothing new is begun"));
+            if let Some(text) = ledger.removal() {
+                say(format_args!("removed  {}", text));
             }
             say(format_args!("{:<24} {:<14} {:<11} {:<9} FAILURE", "TASK", "VERSION", "PHASE", "PID"));
             for record in ledger.tasks.values() {

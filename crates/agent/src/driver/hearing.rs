@@ -13,6 +13,9 @@ use crate::effects::{Effects, chain};
 use crate::ledger::Accepted;
 use crate::link::Heard;
 
+/// How much of the server's reason for refusing the token is kept.
+const MOST_REASON_CHARS: usize = 300;
+
 impl<E: Effects> Driver<E> {
     pub(super) fn hear(&mut self, message: Heard) {
         match message {
@@ -27,21 +30,27 @@ impl<E: Effects> Driver<E> {
                     self.settle_settings(&reply);
                 }
             }
-            Heard::TokenRefused => {
-                if !self.ledger.removed {
-                    tracing::warn!("the server does not know this robot any more: nothing new is begun");
-                    self.ledger.removed = true;
+            Heard::TokenRefused(why) => {
+                let why: String = why.chars().filter(|c| !c.is_control()).take(MOST_REASON_CHARS).collect();
+                if !self.ledger.removed || self.ledger.removed_because != why {
+                    tracing::warn!(why, "the server does not accept this robot's token: nothing new is begun");
+                    (self.ledger.removed, self.ledger.removed_because) = (true, why);
                     self.dirty = true;
                 }
             }
-            Heard::Withheld { code, text } => self.withheld = Some(Condition { code, text }),
+            Heard::Withheld { code, text } => {
+                if self.withheld.as_ref().is_none_or(|known| known.code != code) {
+                    tracing::info!(code, text, "the server sends no state");
+                }
+                self.withheld = Some(Condition { code, text });
+            }
         }
     }
 
     fn known_by_server(&mut self) {
         self.withheld = None;
         if self.ledger.removed {
-            self.ledger.removed = false;
+            (self.ledger.removed, self.ledger.removed_because) = (false, String::new());
             self.dirty = true;
         }
     }

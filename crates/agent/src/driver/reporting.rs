@@ -55,10 +55,7 @@ impl<E: Effects> Driver<E> {
         if self.held {
             conditions.push(condition("held", "a person at the robot said hold: nothing is started or switched"));
         }
-        if self.ledger.removed {
-            conditions
-                .push(condition("removed", "the server does not accept this robot's token: nothing new is begun"));
-        }
+        conditions.extend(self.ledger.removal().map(|text| condition("removed", &text)));
         if let Some(text) = &self.robot.no_task_user {
             conditions.push(condition(FailureCode::NO_TASK_USER.as_str(), text));
         }

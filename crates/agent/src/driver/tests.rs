@@ -318,9 +318,10 @@ async fn a_removed_robot_goes_on_and_begins_nothing_new() {
     let bench = Bench::new().await;
     bench.order(1, vec![order("1.0")]).await;
     bench.phase(Phase::Running).await;
-    bench.say(Heard::TokenRefused).await;
+    bench.say(Heard::TokenRefused("this robot was revoked".to_owned())).await;
     let report = bench.report(|report| has(report, "removed")).await;
     assert_eq!(report.tasks[0].phase, Phase::Running);
+    assert!(report.conditions[0].text.contains("(this robot was revoked)"), "{:?}", report.conditions);
     let ledger = bench.end().await;
     assert!(ledger.removed, "it is remembered over a restart");
 }
@@ -331,7 +332,7 @@ async fn a_removed_robot_begins_nothing_after_a_restart_until_it_is_known_again(
     bench.fake.state(|state| state.held = true);
     bench.order(1, vec![order("1.0")]).await;
     bench.phase(Phase::Deferred).await;
-    bench.say(Heard::TokenRefused).await;
+    bench.say(Heard::TokenRefused(String::new())).await;
     bench.report(|report| has(report, "removed")).await;
     let (fake, key, robot) = (bench.fake.clone(), SigningKey::from_bytes(bench.key.to_bytes()), bench.robot.clone());
     let ledger = bench.end().await;

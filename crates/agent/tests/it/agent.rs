@@ -132,6 +132,7 @@ async fn a_new_token_is_on_the_disk_before_it_is_used_and_the_old_one_until_it_w
             external: None,
         },
         mac: "02:00:00:00:00:01".parse().unwrap(),
+        awaits_approval: false,
     };
     identity.write(&path).unwrap();
     let credential = Credential::from("old".to_owned());
@@ -239,7 +240,7 @@ async fn polling_goes_on_after_every_kind_of_answer() {
     let polling = tokio::spawn(link::poll(server(&url, &robot), shared.clone(), intervals, heard));
     let answers = [(200, "text/html", "<html>".to_owned()), sealed(&state(&robot, 1), &key)];
     let mut next = async || tokio::time::timeout(PATIENCE, messages.recv()).await.unwrap().unwrap();
-    assert!(matches!(next().await, Heard::TokenRefused));
+    assert!(matches!(next().await, Heard::TokenRefused(_)));
     for (answer, is_state) in answers.into_iter().zip([false, true]) {
         fake.set(answer);
         loop {

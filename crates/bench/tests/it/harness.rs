@@ -348,6 +348,12 @@ impl Robot {
         thief
     }
 
+    /// One that enrols by itself in the directory `name` below `dir`. Its agent does not run yet.
+    pub fn enrolled(dir: &Path, name: &str, id: RobotId, environment: &[(&str, &str)]) -> Self {
+        let environment = environment.iter().map(|(k, v)| ((*k).to_owned(), (*v).to_owned())).collect();
+        Self { process: None, data: dir.join(name), environment, name: name.to_owned(), id }
+    }
+
     /// Starts the agent, which must not be running.
     pub fn restart(&mut self) {
         assert!(self.process.is_none(), "the agent of {} already runs", self.name);

@@ -1,11 +1,13 @@
 //! The end-to-end tests: the real programs, started as processes, and the rules all of the source keeps.
 
+mod approval;
 mod broker;
 mod confinement;
 mod corridor;
 mod crash;
 mod delivery;
 mod direct_push;
+mod flood;
 mod harness;
 mod hostile;
 mod load;
@@ -15,9 +17,11 @@ mod proxy;
 mod questions;
 mod registry;
 mod restore;
+mod revoked;
 mod ros;
 mod ros1;
 mod scenarios;
+mod secrets;
 mod signing;
 mod talker;
 mod theft;

@@ -9,7 +9,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 use task_proto::api::{
-    CreateDeployment, DeliveryChoice, DeliveryDecision, EnrollRequest, EnrollResponse, ErrorBody, Event,
+    ConductTotals, CreateDeployment, DeliveryChoice, DeliveryDecision, EnrollRequest, EnrollResponse, ErrorBody, Event,
     ExternalBroker, HttpTraffic, LogEvent, LogsFrom, LogsView, MqttConnection, MqttEndpoint, MqttTraffic, OutputList,
     OutputView, ReportReply, RobotToken, ServerInfo, Traffic,
 };
@@ -381,6 +381,7 @@ fn documents_of_the_api() {
             name: parsed("atlas"),
             token: "tskr_…".to_owned(),
             mqtt: MqttEndpoint { host: None, port: 1883, prefix: TopicPrefix::default(), tls: true, external: None },
+            awaits_approval: false,
         },
     );
     let external =
@@ -503,6 +504,7 @@ fn documents_about_the_traffic() {
             all: traffic,
         },
         http: HttpTraffic { connections: 6, requests: 7, bytes_in: 8, bytes_out: 9 },
+        conduct: ConductTotals { slowed: 3, cut: 2, turned_away: 1 },
     };
     check_text("server_info.json", &info);
 }

@@ -6,10 +6,11 @@ use task_proto::api::{CreateDeployment, DeliveryChoice, MAX_PRIORITY, MIN_PRIORI
 use task_proto::report::Phase;
 use task_proto::{DeploymentId, RobotId, UserName};
 
+use super::approval::give_up_pending;
 use super::robots::lifetime_ms;
 use super::{ActionError, Actions, DAY_MS, IdempotencyKey, check_scope, quoted};
 use crate::advance::advance;
-use crate::changes::Consequences;
+use crate::changes::{Change, Consequences};
 use crate::chooser::{Chooser, travelling_bytes};
 use crate::delivery::shown_bytes;
 use crate::person::Person;
@@ -141,17 +142,19 @@ impl Actions {
         Ok(())
     }
 
-    /// Ends what was not done in time, and forgets old idempotency keys and tokens that have ended. To be called about once
+    /// Ends what was not done in time, and forgets old idempotency keys, tokens that have ended and robots that nobody approved. To be called about once
     /// a minute. Gives the users whose tokens those were.
     pub async fn expire(&self) -> Result<BTreeSet<UserName>, ActionError> {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
         write.forget_orders(now_ms.saturating_sub(KEY_LIFETIME_MS)).await?;
         let users = write.forget_ended_tokens(now_ms).await?;
+        let given_up = give_up_pending(&mut write, now_ms).await?;
         let overdue = write.overdue(now_ms).await?;
         let consequences = take_back(&mut write, &self.chooser, &overdue, Phase::Expired, now_ms).await?;
         write.commit().await?;
         self.changes.publish(consequences);
+        given_up.into_iter().for_each(|robot| self.changes.announce(Change::RobotRemoved(Box::new(robot))));
         Ok(users)
     }
 }

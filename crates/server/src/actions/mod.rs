@@ -1,6 +1,7 @@
 //! What people and robots may order. Each order is one write to the store; after its commit the change is announced and
 //! the robots concerned are rung. No HTTP and no MQTT here, and no SQL.
 
+mod approval;
 mod deployments;
 mod desired;
 mod fallen_behind;
@@ -55,6 +56,8 @@ pub struct ActionSettings {
     pub enrolment_token_lifetime_ms: u64,
     /// The certificate authority that robots are told to trust, if they are to trust the server's own.
     pub ca_pin: Option<CaPin>,
+    /// Whether every new robot waits to be approved.
+    pub enrolment_approval: bool,
 }
 
 const DAY_MS: u64 = 24 * 60 * 60 * 1000;
@@ -68,6 +71,7 @@ impl Default for ActionSettings {
             desired_lifetime_ms: 30 * DAY_MS,
             enrolment_token_lifetime_ms: DAY_MS,
             ca_pin: None,
+            enrolment_approval: false,
         }
     }
 }
@@ -243,6 +247,15 @@ pub enum ActionError {
     /// Someone has this name.
     #[error("a robot named {0} exists")]
     NameTaken(RobotName),
+    /// It was approved before, or never had to be.
+    #[error("robot {0} does not wait to be approved; taskd robot rm removes it")]
+    NotPending(RobotName),
+    /// So many wait that no other may.
+    #[error("{0} robots wait to be approved: approve or reject some of them first")]
+    TooManyPending(u64),
+    /// No such enrolment token, or it has ended.
+    #[error("there is no enrolment token {0}")]
+    EnrolmentNotFound(TokenId),
     /// The enrolment token is unknown, used up, expired or revoked.
     #[error("the enrolment token is unknown, used up, expired or revoked")]
     TokenRefused,
@@ -273,7 +286,8 @@ impl ActionError {
             Self::NoRobotsMatch(_) => "no_robots_match",
             Self::OutOfScope { .. } => "out_of_scope",
             Self::NotPermitted(_) => "forbidden",
-            Self::SignInBlocked { .. } | Self::TooManySignIns => "too_many_requests",
+            Self::SignInBlocked { .. } | Self::TooManySignIns | Self::TooManyPending(_) => "too_many_requests",
+            Self::NotPending(_) => "not_pending",
             Self::UserExists(_) => "user_exists",
             Self::LastAdministrator(_) => "last_administrator",
             Self::IdempotencyKeyReused(_) => "idempotency_key_reused",
@@ -284,9 +298,11 @@ impl ActionError {
             Self::NameTaken(_) => "name_taken",
             Self::TokenRefused | Self::SignInRefused => "unauthorized",
             Self::EnrolledAnew(_) => "enrolled_anew",
-            Self::RobotNotFound(_) | Self::DeploymentNotFound(_) | Self::UserNotFound(_) | Self::TokenNotFound(_) => {
-                "not_found"
-            }
+            Self::RobotNotFound(_)
+            | Self::DeploymentNotFound(_)
+            | Self::UserNotFound(_)
+            | Self::TokenNotFound(_)
+            | Self::EnrolmentNotFound(_) => "not_found",
             Self::DeploymentCancelled(_) => "deployment_cancelled",
             Self::Diverged(_) => "diverged",
             Self::Store(_) | Self::PasswordFailed => "internal",

@@ -2,13 +2,16 @@
 
 use std::net::IpAddr;
 
-use task_proto::api::{CreateEnrollmentToken, EditRobot, EnrollRequest, EnrollmentToken, MatchedRobot};
+use task_proto::api::{
+    CreateEnrollmentToken, EditRobot, EnrollRequest, EnrollmentToken, EnrollmentTokenList, MatchedRobot,
+};
 use task_proto::id::Labels;
 use task_proto::request::Ask;
 use task_proto::selector::Selector;
 use task_proto::token::{Token, TokenKind};
-use task_proto::{MacAddress, RobotId, RobotName};
+use task_proto::{MacAddress, RobotId, RobotName, TokenId};
 
+use super::approval::check_room;
 use super::{ActionError, Actions, MAX_LIFETIME_MS, check_scope, quoted};
 use crate::advance::advance;
 use crate::changes::{Change, Consequences};
@@ -27,6 +30,8 @@ pub struct Enrolled {
     pub name: RobotName,
     /// Its token, shown this once.
     pub token: Token,
+    /// Whether it waits to be approved.
+    pub awaits_approval: bool,
 }
 
 impl Actions {
@@ -56,11 +61,21 @@ impl Actions {
             Some(known) if is_retry || terms.robot.as_ref() == Some(&known.id) => {
                 // A disk that was lost or copied holds the old one.
                 write.renew_broker_credential(&known.id).await?;
+                write.readmit(&known.id).await?;
                 known
             }
             Some(known) => return Err(ActionError::MacKnown { mac: known.mac, name: known.name }),
-            None => register(&mut write, terms, request, now_ms).await?,
+            None => {
+                let awaits_approval = self.settings.enrolment_approval || terms.approval;
+                let robot = register(&mut write, terms, request, now_ms).await?;
+                if awaits_approval {
+                    check_room(&mut write).await?;
+                }
+                write.note_enrolment(&robot.id, token, address, awaits_approval).await?;
+                robot
+            }
         };
+        let awaits_approval = write.is_pending(&robot.id).await?;
         if !is_retry {
             write.use_enrolment_token(token).await?;
         }
@@ -68,10 +83,11 @@ impl Actions {
         let key = request.client_key.as_ref();
         write.offer_robot_token(&robot_token, &robot.id, Some(token), key, now_ms).await?;
         let deed = Deed::new("enrolment".to_owned(), token.id().parse().ok(), address, Act::RobotEnroll, &robot.id);
-        write.audit(&deed.with("name", &robot.name).with("mac", robot.mac), now_ms).await?;
+        let deed = deed.with("name", &robot.name).with("mac", robot.mac);
+        write.audit(&deed.with_some("awaits_approval", awaits_approval.then_some(true)), now_ms).await?;
         write.commit().await?;
         self.changes.announce(Change::Robot(robot.id.clone()));
-        Ok(Enrolled { robot_id: robot.id, name: robot.name, token: robot_token })
+        Ok(Enrolled { robot_id: robot.id, name: robot.name, token: robot_token, awaits_approval })
     }
 
     /// Makes a token that `robot` may go over to. The one it uses ends when that one is first used.
@@ -109,17 +125,35 @@ impl Actions {
             None => None,
         };
         let expires_at_ms = now_ms + lifetime_ms;
-        let terms = EnrolmentTerms { robot, labels: order.labels.clone(), uses_left: order.uses, expires_at_ms };
+        let (labels, approval) = (order.labels.clone(), order.approval);
+        let terms = EnrolmentTerms { robot, labels, uses_left: order.uses, expires_at_ms, approval };
         let token = Token::random_enrolment(self.key.public_key(), self.settings.ca_pin);
         write.create_enrolment_token(&token, &terms, now_ms).await?;
         let deed = Deed::by(by, Act::EnrolmentCreate, token.id())
             .with_some("robot", terms.robot.as_ref())
             .with_some("uses", terms.uses_left)
             .with("labels", shown_labels(&terms.labels))
+            .with_some("approval", terms.approval.then_some(true))
             .with("expires_at_ms", expires_at_ms);
         write.audit(&deed, now_ms).await?;
         write.commit().await?;
         Ok(EnrollmentToken { id: token.id(), token: token.reveal(), expires_at_ms })
+    }
+
+    /// The enrolment tokens that are good for something.
+    pub async fn enrollment_tokens(&self) -> Result<EnrollmentTokenList, ActionError> {
+        Ok(EnrollmentTokenList { tokens: self.store.enrolment_tokens(self.clock.now_ms()).await? })
+    }
+
+    /// Ends an enrolment token now. Robots that came by it stay.
+    pub async fn revoke_enrollment_token(&self, by: &Person, id: &TokenId) -> Result<(), ActionError> {
+        let now_ms = self.clock.now_ms();
+        let mut write = self.store.begin().await?;
+        if !write.revoke_enrolment_token(id, now_ms).await? {
+            return Err(ActionError::EnrolmentNotFound(id.clone()));
+        }
+        write.audit(&Deed::by(by, Act::EnrolmentRevoke, id), now_ms).await?;
+        Ok(write.commit().await?)
     }
 
     /// Changes a robot's name or labels. Before and after it has to be one of the person's.
@@ -166,6 +200,23 @@ impl Actions {
         self.envelopes.forget(robot);
         self.changes.announce(Change::RobotRemoved(Box::new(known)));
         self.changes.publish(consequences);
+        Ok(())
+    }
+
+    /// Ends all tokens of a robot and those made for it, now; its name, its history and what is ordered of it stay. There is no
+    /// way back by the same tokens, for who has them is in doubt: it has to be registered anew. Doing it twice is harmless.
+    pub async fn revoke_robot(&self, by: &Person, robot: &RobotId) -> Result<(), ActionError> {
+        let now_ms = self.clock.now_ms();
+        let mut write = self.store.begin().await?;
+        let known = known_robot(&mut write, robot.as_str()).await?;
+        check_scope(by, std::slice::from_ref(&known), || known.name.to_string())?;
+        if !write.revoke_robot(robot, now_ms).await? {
+            return Ok(());
+        }
+        let deed = Deed::by(by, Act::RobotRevoke, robot).with("name", &known.name).with("mac", known.mac);
+        write.audit(&deed, now_ms).await?;
+        write.commit().await?;
+        self.changes.announce(Change::Robot(known.id));
         Ok(())
     }
 
@@ -267,7 +318,7 @@ fn check_labels(labels: &Labels) -> Result<(), ActionError> {
 }
 
 /// The robot with this id or name, or the error that there is none.
-async fn known_robot(write: &mut Write, id_or_name: &str) -> Result<KnownRobot, ActionError> {
+pub(super) async fn known_robot(write: &mut Write, id_or_name: &str) -> Result<KnownRobot, ActionError> {
     // An id has the form of a name. What has not is no matter for the database, which might not even take the text.
     let robot = match id_or_name.parse::<RobotName>() {
         Ok(name) => write.known_robot(name.as_str()).await?,

@@ -23,6 +23,7 @@ use task_proto::{Digest, RobotId, UserName};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::watch;
 
+use crate::conduct::Conduct;
 use crate::tls::{ClientProof, Tls};
 pub use external::{CANARY_LEVEL, ExternalConfig};
 use external::{Crowd, External};
@@ -134,6 +135,8 @@ pub struct BrokerConfig {
     pub prefix: TopicPrefix,
     /// The bounds.
     pub limits: Limits,
+    /// How robots behave.
+    pub conduct: Arc<Conduct>,
 }
 
 /// Bounds on everything a client may take up.

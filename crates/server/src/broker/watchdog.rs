@@ -204,6 +204,7 @@ mod tests {
 
     use super::super::{BrokerConfig, Gatekeeper, Inbox, NotStored, Principal, Refusal, RobotMessage};
     use super::*;
+    use crate::conduct::{Conduct, ConductLimits};
 
     const PATIENCE: Duration = Duration::from_secs(10);
 
@@ -228,7 +229,9 @@ mod tests {
         let mut limits = Limits { canary_interval: Duration::from_millis(20), ..Limits::default() };
         change(&mut limits);
         let listen = "127.0.0.1:0".parse().expect("an address");
-        let config = BrokerConfig { listen, tls: None, prefix: TopicPrefix::default(), limits: limits.clone() };
+        let conduct = Conduct::new(ConductLimits::default());
+        let config =
+            BrokerConfig { listen, tls: None, prefix: TopicPrefix::default(), limits: limits.clone(), conduct };
         let router = Router::start(&config.prefix, 4).await.expect("a router");
         let front =
             Front::start(config, Arc::new(Nobody), Arc::new(Nobody), router.clone()).await.expect("a free port");

@@ -194,6 +194,12 @@ impl Client {
         self.send(|| self.request(Method::DELETE, &path)).await.map(drop)
     }
 
+    /// Does something that may be done twice; the answer's body does not matter.
+    pub(crate) async fn act(&self, path: &str) -> Result<(), ClientError> {
+        let path = format!("{BASE}{path}");
+        self.send(|| self.request(Method::POST, &path)).await.map(drop)
+    }
+
     /// Replaces something; the answer's body does not matter.
     pub(crate) async fn put<B: Serialize>(&self, path: &str, body: &B) -> Result<(), ClientError> {
         let path = format!("{BASE}{path}");

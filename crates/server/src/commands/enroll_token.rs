@@ -1,9 +1,10 @@
-//! `taskd enroll-token`: makes the tokens that robots enrol with.
+//! `taskd enroll-token`: the tokens that robots enrol with.
 
 use std::time::Duration;
 
 use clap::Subcommand;
-use task_proto::api::{CreateEnrollmentToken, EnrollmentToken};
+use task_proto::TokenId;
+use task_proto::api::{CreateEnrollmentToken, EnrollmentToken, EnrollmentTokenList, EnrollmentTokenView};
 use task_proto::id::{LabelKey, LabelValue};
 
 use super::output::{say, time};
@@ -27,22 +28,53 @@ pub enum Action {
         /// A label that each robot that uses it gets; may be repeated
         #[arg(long = "label", value_name = "KEY=VALUE", value_parser = label)]
         labels: Vec<(LabelKey, LabelValue)>,
+        /// Let each new robot that uses it wait until an administrator approves it (taskd robot approve)
+        #[arg(long)]
+        approval: bool,
+    },
+    /// List those that are still good for something
+    List,
+    /// End one now; robots that came by it stay
+    Revoke {
+        /// Its id
+        id: TokenId,
     },
 }
 
 pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, CommandError> {
-    let Action::Create { robot, uses, ttl, labels } = action;
-    let request = CreateEnrollmentToken {
-        robot,
-        uses,
-        ttl_s: ttl.map(|ttl| ttl.as_secs()),
-        labels: labels.into_iter().collect(),
-    };
-    let key = super::client::random_key();
-    let token: EnrollmentToken = session.client.order("/enrollment-tokens", &request, &key).await?;
-    session.output.described(&token, |token| token.token.clone())?;
-    say(&format!("valid until {}; it is not shown again", time(token.expires_at_ms)));
+    match action {
+        Action::Create { robot, uses, ttl, labels, approval } => {
+            let ttl_s = ttl.map(|ttl| ttl.as_secs());
+            let request = CreateEnrollmentToken { robot, uses, ttl_s, labels: labels.into_iter().collect(), approval };
+            let key = super::client::random_key();
+            let token: EnrollmentToken = session.client.order("/enrollment-tokens", &request, &key).await?;
+            session.output.described(&token, |token| token.token.clone())?;
+            say(&format!("{}, valid until {}; it is not shown again", token.id, time(token.expires_at_ms)));
+        }
+        Action::List => {
+            let list: EnrollmentTokenList = session.client.get("/enrollment-tokens", &[]).await?;
+            let header = ["id", "robot", "labels", "uses left", "approval", "made", "ends"];
+            session.output.result(&list, &header, |list| list.tokens.iter().map(row).collect())?;
+        }
+        Action::Revoke { id } => {
+            session.client.delete(&format!("/enrollment-tokens/{id}")).await?;
+            say(&format!("revoked {id}"));
+        }
+    }
     Ok(Outcome::Succeeded)
+}
+
+fn row(token: &EnrollmentTokenView) -> Vec<String> {
+    let labels: Vec<_> = token.labels.iter().map(|(key, value)| format!("{key}={value}")).collect();
+    vec![
+        token.id.to_string(),
+        token.robot.as_ref().map_or_else(|| "any new one".to_owned(), ToString::to_string),
+        if labels.is_empty() { "-".to_owned() } else { labels.join(" ") },
+        token.uses_left.map_or_else(|| "any number".to_owned(), |uses| uses.to_string()),
+        if token.approval { "yes" } else { "-" }.to_owned(),
+        time(token.created_at_ms),
+        time(token.expires_at_ms),
+    ]
 }
 
 fn label(text: &str) -> Result<(LabelKey, LabelValue), String> {

@@ -42,7 +42,7 @@ mod wait;
 /// The operator's commands; `main` adds `serve` to them.
 #[derive(Debug, Subcommand)]
 pub enum Command {
-    /// Look at robots, or remove one
+    /// Look at robots, let them in, revoke or remove one
     Robot {
         /// What to do.
         #[command(subcommand)]
@@ -80,7 +80,7 @@ pub enum Command {
         #[command(subcommand)]
         action: broker::Action,
     },
-    /// Make the tokens that robots enrol with
+    /// Make, list or revoke the tokens that robots enrol with
     EnrollToken {
         /// What to do.
         #[command(subcommand)]

@@ -1,8 +1,9 @@
-//! `taskd robot`: shows robots and removes them.
+//! `taskd robot`: shows robots, lets them in, puts them out and removes them.
 
 use clap::Subcommand;
 use task_proto::RobotName;
-use task_proto::api::{RobotList, RobotTask, RobotView};
+use task_proto::api::{PendingRobot, PendingRobotList, RobotList, RobotTask, RobotView};
+use task_proto::id::Labels;
 use task_proto::report::{Isolation, LinkFacts, RosFacts};
 use task_proto::selector::Selector;
 
@@ -22,6 +23,24 @@ pub enum Action {
     },
     /// Show everything about one robot
     Info {
+        /// Its name or id
+        robot: RobotName,
+    },
+    /// List robots that wait to be approved
+    Pending,
+    /// Let robots in that wait
+    Approve {
+        /// Their names or ids
+        #[arg(required = true)]
+        robots: Vec<RobotName>,
+    },
+    /// Turn away a robot that waits, and forget it
+    Reject {
+        /// Its name or id
+        robot: RobotName,
+    },
+    /// End a robot's tokens and whatever it does by them, now; it comes back only by enrolling with a token made for it
+    Revoke {
         /// Its name or id
         robot: RobotName,
     },
@@ -45,6 +64,29 @@ pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, Co
             let robot = one(session, &robot).await?.id;
             let robot: RobotView = session.client.get(&format!("/robots/{robot}"), &[]).await?;
             session.output.described(&robot, describe)?;
+        }
+        Action::Pending => {
+            let list: PendingRobotList = session.client.get("/pending-robots", &[]).await?;
+            let header = ["id", "name", "mac", "labels", "address", "token", "since"];
+            session.output.result(&list, &header, |list| list.robots.iter().map(pending_row).collect())?;
+        }
+        Action::Approve { robots } => {
+            for robot in robots {
+                let robot = one(session, &robot).await?;
+                session.client.act(&format!("/robots/{}/approve", robot.id)).await?;
+                say(&format!("approved {} ({})", robot.name, robot.id));
+            }
+        }
+        Action::Reject { robot } => {
+            let robot = one(session, &robot).await?;
+            session.client.act(&format!("/robots/{}/reject", robot.id)).await?;
+            say(&format!("rejected {} ({})", robot.name, robot.id));
+        }
+        Action::Revoke { robot } => {
+            let robot = one(session, &robot).await?;
+            session.client.act(&format!("/robots/{}/revoke", robot.id)).await?;
+            say(&format!("revoked {} ({})", robot.name, robot.id));
+            say(&format!("it comes back with: taskd enroll-token create --uses 1 --robot {}", robot.name));
         }
         Action::Rm { robot, yes } => {
             let robot = one(session, &robot).await?;
@@ -86,6 +128,23 @@ fn row(robot: &RobotView) -> Vec<String> {
     ]
 }
 
+fn pending_row(robot: &PendingRobot) -> Vec<String> {
+    vec![
+        robot.id.to_string(),
+        robot.name.to_string(),
+        robot.mac.to_string(),
+        shown_labels(&robot.labels),
+        robot.address.clone().unwrap_or_else(|| "-".to_owned()),
+        robot.token.as_ref().map_or_else(|| "-".to_owned(), ToString::to_string),
+        time(robot.since_ms),
+    ]
+}
+
+fn shown_labels(labels: &Labels) -> String {
+    let labels: Vec<_> = labels.iter().map(|(key, value)| format!("{key}={value}")).collect();
+    if labels.is_empty() { "-".to_owned() } else { labels.join(" ") }
+}
+
 /// A task and where it stands, in a word or two.
 fn standing(task: &RobotTask) -> String {
     let health = if task.degraded.is_some() { "/degraded" } else { "" };
@@ -100,7 +159,6 @@ fn state(robot: &RobotView) -> String {
 }
 
 fn describe(robot: &RobotView) -> String {
-    let labels: Vec<_> = robot.labels.iter().map(|(key, value)| format!("{key}={value}")).collect();
     let mut facts = vec![
         ("id", robot.id.to_string()),
         ("name", robot.name.to_string()),
@@ -109,7 +167,7 @@ fn describe(robot: &RobotView) -> String {
         ("address", robot.address.clone().unwrap_or_else(|| "-".to_owned())),
         ("last seen", robot.last_seen_ms.map_or_else(|| "never".to_owned(), time)),
         ("enrolled", time(robot.enrolled_at_ms)),
-        ("labels", if labels.is_empty() { "-".to_owned() } else { labels.join(" ") }),
+        ("labels", shown_labels(&robot.labels)),
         ("generation", format!("{} ordered, {} observed", robot.generation, robot.observed_generation)),
     ];
     if let Some(host) = &robot.host {

@@ -24,7 +24,7 @@ pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, Co
 }
 
 fn describe(info: &ServerInfo) -> String {
-    let (traffic, http) = (&info.traffic, &info.http);
+    let (traffic, http, conduct) = (&info.traffic, &info.http, &info.conduct);
     let facts = [
         ("version", info.version.clone()),
         ("time", time(info.now_ms)),
@@ -35,6 +35,10 @@ fn describe(info: &ServerInfo) -> String {
         ("messages", format!("{} refused, {} dropped", traffic.messages_refused, traffic.messages_dropped)),
         ("in", inward(&traffic.all)),
         ("out", outward(&traffic.all)),
+        (
+            "misbehaved",
+            format!("{} slowed, {} cut off, {} turned away", conduct.slowed, conduct.cut, conduct.turned_away),
+        ),
         ("http", format!("{} connections, {} requests", http.connections, http.requests)),
         ("http in", bytes(http.bytes_in)),
         ("http out", bytes(http.bytes_out)),

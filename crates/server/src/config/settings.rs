@@ -269,6 +269,48 @@ pub(super) const SETTINGS: &[Setting] = &[
         help: "Most bytes per second that all of them get together [default: no limit]",
         set: |config, text| size_within(text, 1024, 1 << 50).map(|n| config.transfers.all.bytes_per_s = Some(n)),
     },
+    Setting {
+        name: "enrolment-approval",
+        value_name: "BOOL",
+        help: "Let every new robot wait until an administrator approves it",
+        set: |config, text| boolean(text).map(|approval| config.enrolment_approval = approval),
+    },
+    Setting {
+        name: "robots-messages-per-s",
+        value_name: "N",
+        help: "MQTT messages a second of one robot, beyond which it is slowed; ten seconds' worth may come at once [default: 100]",
+        set: |config, text| count(text, 1_000_000).map(|n| config.robots.messages_per_s = n),
+    },
+    Setting {
+        name: "robots-bytes-per-s",
+        value_name: "SIZE",
+        help: "The same in bytes [default: 1 MB]",
+        set: |config, text| size_within(text, 64 << 10, 1 << 40).map(|n| config.robots.bytes_per_s = n),
+    },
+    Setting {
+        name: "robots-requests-per-s",
+        value_name: "N",
+        help: "The same of reports and questions over HTTP [default: 20]",
+        set: |config, text| count(text, 1_000_000).map(|n| config.robots.requests_per_s = n),
+    },
+    Setting {
+        name: "robots-patience",
+        value_name: "TIME",
+        help: "How long a robot is slowed before it is cut off [default: 30s]",
+        set: |config, text| lifetime(text).map(|time| config.robots.patience = time),
+    },
+    Setting {
+        name: "robots-backoff",
+        value_name: "TIME",
+        help: "How long a robot that was cut off has to stay away; doubles up to six times [default: 10s]",
+        set: |config, text| lifetime(text).map(|time| config.robots.backoff = time),
+    },
+    Setting {
+        name: "robots-forgive-after",
+        value_name: "TIME",
+        help: "How long it has to behave to be like any other again [default: 10m]",
+        set: |config, text| lifetime(text).map(|time| config.robots.forgive_after = time),
+    },
 ];
 
 /// The most that may ride inside an announcement: in base64 it still fits, beside a state of a few tasks.

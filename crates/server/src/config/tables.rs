@@ -1,5 +1,6 @@
 //! The tables of the configuration file: `[delivery]` with the operator's rules, `[transfers]` with the limits of each
-//! site, `[tls]`. What has one value is a setting like any other; the rest is read here. Every error names the key it is about.
+//! site, `[robots]` with what one may send, `[tls]`. What has one value is a setting like any other; the rest is read here.
+//! Every error names the key it is about.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -44,7 +45,7 @@ struct Wrong {
 
 /// Whether the file may have a table of this name.
 pub(super) fn is_known(name: &str) -> bool {
-    matches!(name, "delivery" | "tls" | "transfers")
+    matches!(name, "delivery" | "enrolment" | "robots" | "tls" | "transfers")
 }
 
 impl Config {

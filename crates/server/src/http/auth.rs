@@ -17,7 +17,9 @@ use task_proto::person::Permission;
 use task_proto::token::Token;
 
 use super::App;
-use super::error::ApiError;
+use super::conduct::hold_up;
+use super::error::{ApiError, ROBOT_REVOKED};
+use super::visits::Line;
 use crate::person::Person;
 use crate::store::{Admitted, TokenHolder};
 use crate::tls::ClientProof;
@@ -110,14 +112,6 @@ pub(super) struct Gate {
     pub(super) deadline: Option<Duration>,
 }
 
-/// By what a request shows whose it is.
-#[derive(Clone, Copy)]
-struct Shown<'a> {
-    method: &'a Method,
-    headers: &'a HeaderMap,
-    proof: &'a ClientProof,
-}
-
 /// Stands before every handler: finds the caller, refuses whoever may not, and ends what takes too long.
 pub(super) async fn guard(
     State(gate): State<Gate>,
@@ -130,11 +124,15 @@ pub(super) async fn guard(
     // A path that is no text names nobody; the handler says that there is no such thing.
     let own = params.iter().flatten().find(|(name, _)| *name == "robot").map(|(_, value)| value);
     let proof = request.extensions().get::<ClientProof>().cloned().unwrap_or_default();
-    let shown = Shown { method: request.method(), headers: request.headers(), proof: &proof };
-    match admit(&gate, peer, own, shown).await {
+    match admit(&gate, peer, own, Showing::of(&request, &proof)).await {
         Ok((mut caller, token_number)) => {
             if let Caller::Person(person) = &mut caller {
                 person.address = Some(peer.ip().to_canonical());
+            }
+            if let (Access::OwnRobot, Caller::Robot(robot)) = (gate.access, &caller)
+                && let Err(error) = hold_up(&gate.app, robot, request.method()).await
+            {
+                return error.into_response();
             }
             request.extensions_mut().insert(caller);
             request.extensions_mut().insert(token_number);
@@ -149,22 +147,38 @@ pub(super) async fn guard(
     })
 }
 
+/// What a request shows of who sent it.
+struct Showing<'a> {
+    method: &'a Method,
+    headers: &'a HeaderMap,
+    proof: &'a ClientProof,
+    line: Option<&'a Line>,
+}
+
+impl<'a> Showing<'a> {
+    fn of(request: &'a Request, proof: &'a ClientProof) -> Self {
+        Self { method: request.method(), headers: request.headers(), proof, line: request.extensions().get() }
+    }
+}
+
 async fn admit(
     gate: &Gate,
     peer: SocketAddr,
     own: Option<&str>,
-    shown: Shown<'_>,
+    showing: Showing<'_>,
 ) -> Result<(Caller, TokenNumber), ApiError> {
     if gate.access == Access::Anyone {
         return Ok((Caller::Anyone, TokenNumber(0)));
     }
-    match identify(&gate.app, shown).await {
+    match identify_on_line(&gate.app, &showing).await {
         Ok((caller, token_number)) if caller.may(gate.access, own) => Ok((caller, token_number)),
         Ok((Caller::Anyone, _)) => Err(ApiError::unauthorized("a token is needed: Authorization: Bearer …")),
         Ok((Caller::Person(person), _)) if let Access::Person(permission) = gate.access => {
             Err(not_permitted(&person, permission))
         }
         Ok(_) => Err(ApiError::forbidden("this token may not do that")),
+        // Its token was known, so nobody is guessing.
+        Err(error) if error.code == ROBOT_REVOKED => Err(error),
         Err(error) if error.status == StatusCode::UNAUTHORIZED => {
             let is_too_many = gate.app.attempts.record(peer.ip(), gate.app.clock.now_ms());
             Err(if is_too_many { ApiError::too_many("too many wrong tokens from this address") } else { error })
@@ -183,9 +197,17 @@ pub(super) fn not_permitted(person: &Person, permission: Permission) -> ApiError
     })
 }
 
+/// Who calls. If it is a robot, its connection is cut when it is put out.
+async fn identify_on_line(app: &App, showing: &Showing<'_>) -> Result<(Caller, TokenNumber), ApiError> {
+    let arrival = app.visits.arrival();
+    let identified = identify(app, showing).await?;
+    let ((Caller::Robot(robot), _), Some(line)) = (&identified, showing.line) else { return Ok(identified) };
+    if arrival.enter(robot, line) { Ok(identified) } else { identify(app, showing).await }
+}
+
 /// Who sent this request. `Anyone` if it does not say; an error if it says it wrongly.
-async fn identify(app: &App, shown: Shown<'_>) -> Result<(Caller, TokenNumber), ApiError> {
-    let Shown { method, headers, proof } = shown;
+async fn identify(app: &App, showing: &Showing<'_>) -> Result<(Caller, TokenNumber), ApiError> {
+    let &Showing { method, headers, proof, .. } = showing;
     let now_ms = app.clock.now_ms();
     let token = if let Some(value) = headers.get(header::AUTHORIZATION) {
         token_of(value)?
@@ -198,11 +220,15 @@ async fn identify(app: &App, shown: Shown<'_>) -> Result<(Caller, TokenNumber), 
         return Ok((Caller::Anyone, TokenNumber(0)));
     };
     let Some(Admitted { holder, is_first_use }) = app.store.admit(&token, proof, now_ms).await? else {
+        if app.store.is_of_revoked_robot(&token).await? {
+            return Err(ApiError::robot_revoked());
+        }
         return Err(ApiError::unauthorized("the token is unknown, expired or revoked"));
     };
     Ok(match holder {
         TokenHolder::Person(person) => (Caller::Person(person), TokenNumber(0)),
         TokenHolder::Enrolment => (Caller::Enrolment(Box::new(token)), TokenNumber(0)),
+        TokenHolder::Pending(_) => return Err(ApiError::awaits_approval()),
         TokenHolder::Robot { robot, token_number, .. } => {
             if is_first_use {
                 // Whoever is connected came in by the token that has just ended.

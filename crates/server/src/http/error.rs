@@ -12,6 +12,9 @@ use crate::person::Person;
 use crate::report_writer::ReportError;
 use crate::store::StoreError;
 
+/// The code of [`ApiError::robot_revoked`].
+pub(super) const ROBOT_REVOKED: &str = "robot_revoked";
+
 /// An answer that is not the one hoped for.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ApiError {
@@ -21,12 +24,17 @@ pub struct ApiError {
     pub code: &'static str,
     /// What went wrong, naming the caller's own key.
     pub message: String,
+    /// Where it makes sense to try again: when, in seconds.
+    pub retry_after_s: u64,
 }
+
+/// When to try again, where nothing better is known.
+const RETRY_AFTER_S: u64 = 5;
 
 impl ApiError {
     /// An error of any kind.
     pub fn new(status: StatusCode, code: &'static str, message: impl Into<String>) -> Self {
-        Self { status, code, message: message.into() }
+        Self { status, code, message: message.into(), retry_after_s: RETRY_AFTER_S }
     }
 
     /// 400: the request can't be understood.
@@ -37,6 +45,18 @@ impl ApiError {
     /// 401: nobody known is asking.
     pub fn unauthorized(message: impl Into<String>) -> Self {
         Self::new(StatusCode::UNAUTHORIZED, "unauthorized", message)
+    }
+
+    /// 401: the robot was revoked.
+    pub fn robot_revoked() -> Self {
+        let message = "this robot was revoked: it comes back only by an enrolment with a token made for it";
+        Self::new(StatusCode::UNAUTHORIZED, ROBOT_REVOKED, message)
+    }
+
+    /// 403: the robot waits to be approved.
+    pub fn awaits_approval() -> Self {
+        let message = "this robot waits to be approved: an administrator does that with taskd robot approve";
+        Self::new(StatusCode::FORBIDDEN, api::AWAITS_APPROVAL, message)
     }
 
     /// 403: whoever asks may not.
@@ -97,7 +117,7 @@ impl ApiError {
             response.headers_mut().insert(header::WWW_AUTHENTICATE, HeaderValue::from_static(challenge));
         }
         if matches!(self.status, StatusCode::TOO_MANY_REQUESTS | StatusCode::SERVICE_UNAVAILABLE) {
-            response.headers_mut().insert(header::RETRY_AFTER, HeaderValue::from_static("5"));
+            response.headers_mut().insert(header::RETRY_AFTER, HeaderValue::from(self.retry_after_s));
         }
         response
     }
@@ -125,17 +145,21 @@ impl From<ActionError> for ApiError {
             ActionError::TokenForOther { .. } | ActionError::OutOfScope { .. } | ActionError::NotPermitted(_) => {
                 StatusCode::FORBIDDEN
             }
-            ActionError::SignInBlocked { .. } | ActionError::TooManySignIns => StatusCode::TOO_MANY_REQUESTS,
+            ActionError::SignInBlocked { .. } | ActionError::TooManySignIns | ActionError::TooManyPending(_) => {
+                StatusCode::TOO_MANY_REQUESTS
+            }
             ActionError::RobotNotFound(_)
             | ActionError::DeploymentNotFound(_)
             | ActionError::UserNotFound(_)
-            | ActionError::TokenNotFound(_) => StatusCode::NOT_FOUND,
+            | ActionError::TokenNotFound(_)
+            | ActionError::EnrolmentNotFound(_) => StatusCode::NOT_FOUND,
             ActionError::TooLargeForInline { .. } => StatusCode::UNPROCESSABLE_ENTITY,
             ActionError::NoRobotsMatch(_)
             | ActionError::IdempotencyKeyReused(_)
             | ActionError::MacKnown { .. }
             | ActionError::NameTaken(_)
             | ActionError::EnrolledAnew(_)
+            | ActionError::NotPending(_)
             | ActionError::DeploymentCancelled(_)
             | ActionError::UserExists(_)
             | ActionError::LastAdministrator(_)

@@ -23,6 +23,7 @@ use super::error::ApiError;
 use super::views::{complete_robot, narrowed};
 use crate::changes::{Change, Changes};
 use crate::clock::Clock;
+use crate::conduct::Conduct;
 use crate::person::{Person, Scope};
 use crate::presence::Presence;
 use crate::store::{KnownRobot, Store, StoreError, TokenHolder};
@@ -104,6 +105,8 @@ pub struct EventSource {
     pub store: Store,
     /// Who is there.
     pub presence: Arc<Presence>,
+    /// How robots behave.
+    pub conduct: Arc<Conduct>,
     /// The time.
     pub clock: Clock,
 }
@@ -184,7 +187,7 @@ impl EventFeed {
         let now_ms = source.clock.now_ms();
         let robots: Vec<RobotId> = robots.into_iter().collect();
         for mut robot in source.store.robots_among(&robots).await? {
-            complete_robot(&mut robot, &source.presence, now_ms);
+            complete_robot(&mut robot, &source.presence, &source.conduct, now_ms);
             let RobotView { id, name, mac, labels, .. } = &robot;
             let known = KnownRobot { id: id.clone(), name: name.clone(), mac: *mac, labels: labels.clone() };
             self.send(&Event::Robot { robot: Box::new(robot) }, Audience::Robot(Arc::new(known)));

@@ -65,5 +65,6 @@ pub(super) async fn server(State(app): State<App>) -> Json<ServerInfo> {
         now_ms: app.clock.now_ms(),
         traffic: app.broker.traffic(),
         http: app.http_traffic.read(),
+        conduct: app.conduct.totals(),
     })
 }

@@ -28,6 +28,7 @@ use tokio_util::task::TaskTracker;
 use tower::ServiceExt as _;
 
 use super::traffic::HttpTotals;
+use super::visits::Line;
 use crate::anteroom::{Anteroom, Place};
 use crate::tls::{ClientProof, Tls};
 
@@ -150,8 +151,9 @@ impl Site {
     {
         let Guest { peer, silent, proof, crowded } = guest;
         let (leave, spoken) = (silent.leave().clone(), CancellationToken::new());
-        let (router, traffic) = (self.router.clone(), self.traffic.clone());
-        let mut connection = pin!(connection(stream, peer, proof, silent, spoken.clone(), router, traffic));
+        let (line, router, traffic) = (Line::default(), self.router.clone(), self.traffic.clone());
+        let connection = connection(stream, peer, proof, silent, spoken.clone(), line.clone(), router, traffic);
+        let mut connection = pin!(connection);
         let ended = async {
             tokio::select! {
                 _ = connection.as_mut() => return,
@@ -163,6 +165,7 @@ impl Site {
         tokio::select! {
             () = ended => {}
             () = leave.cancelled() => {}
+            () = line.cut() => {}
             () = self.abort.cancelled() => {}
         }
     }
@@ -235,6 +238,7 @@ fn connection<S>(
     proof: ClientProof,
     silent: Place,
     spoken: CancellationToken,
+    line: Line,
     router: Router,
     traffic: Arc<HttpTotals>,
 ) -> http1::UpgradeableConnection<
@@ -252,6 +256,7 @@ where
         let mut request = request.map(|body| Body::new(PatientBody::new(body)));
         request.extensions_mut().insert(ConnectInfo(peer));
         request.extensions_mut().insert(proof.clone());
+        request.extensions_mut().insert(line.clone());
         router.clone().oneshot(request)
     });
     http1::Builder::new()

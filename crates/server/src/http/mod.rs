@@ -5,6 +5,7 @@ mod ask;
 pub mod attempts;
 pub mod auth;
 mod broker;
+mod conduct;
 mod deployments;
 pub mod drain;
 mod enroll;
@@ -25,6 +26,7 @@ pub mod session;
 mod tasks;
 pub mod traffic;
 mod views;
+pub mod visits;
 
 use std::net::IpAddr;
 use std::ops::Deref;
@@ -49,6 +51,7 @@ use crate::blobs::Blobs;
 use crate::broker::Broker;
 use crate::changes::Changes;
 use crate::clock::Clock;
+use crate::conduct::Conduct;
 use crate::mqtt_access::MqttAccess;
 use crate::presence::Presence;
 use crate::report_writer::ReportWriter;
@@ -90,6 +93,10 @@ pub struct AppParts {
     pub transfers: Transfers,
     /// Who is signed in at the page.
     pub sessions: Arc<session::Sessions>,
+    /// Robots' requests that are under way.
+    pub visits: Arc<visits::Visits>,
+    /// How robots behave.
+    pub conduct: Arc<Conduct>,
     /// Failed authentications.
     pub attempts: Arc<attempts::FailedAttempts>,
     /// The event stream's source.
@@ -218,11 +225,17 @@ pub fn routes() -> Vec<Route> {
         Route::new(delete.clone(), "/api/v1/tokens/{token}", Person(Read), people::revoke_token),
         Route::new(get.clone(), "/api/v1/audit", Person(Administer), people::audit),
         Route::new(post.clone(), "/api/v1/enroll", Enrolment, enroll::enroll),
+        Route::new(get.clone(), "/api/v1/enrollment-tokens", Person(Administer), enroll::tokens),
         Route::new(post.clone(), "/api/v1/enrollment-tokens", Person(Administer), enroll::create_token),
+        Route::new(delete.clone(), "/api/v1/enrollment-tokens/{enrollment}", Person(Administer), enroll::revoke_token),
         Route::new(get.clone(), "/api/v1/robots", Person(Read), robots::list),
         Route::new(get.clone(), "/api/v1/robots/{robot}", Person(Read), robots::show),
         Route::new(patch, "/api/v1/robots/{robot}", Person(Maintain), robots::edit),
         Route::new(delete, "/api/v1/robots/{robot}", Person(Maintain), robots::remove),
+        Route::new(get.clone(), "/api/v1/pending-robots", Person(Administer), enroll::pending),
+        Route::new(post.clone(), "/api/v1/robots/{robot}/approve", Person(Administer), enroll::approve),
+        Route::new(post.clone(), "/api/v1/robots/{robot}/reject", Person(Administer), enroll::reject),
+        Route::new(post.clone(), "/api/v1/robots/{robot}/revoke", Person(Maintain), robots::revoke),
         Route::new(get.clone(), "/api/v1/robots/{robot}/desired", OwnRobot, robots::desired),
         Route::new(get.clone(), "/api/v1/robots/{robot}/mqtt", OwnRobot, broker::endpoint),
         Route::new(post.clone(), "/api/v1/robots/{robot}/token", OwnRobot, robots::next_token),

@@ -17,6 +17,7 @@ use super::auth::TokenNumber;
 use super::error::ApiError;
 use super::extract::{JsonBody, PathParam, QueryParams, TolerantJson};
 use super::views::complete_robot;
+use crate::changes::Change;
 use crate::person::Person;
 use crate::uplink;
 
@@ -39,7 +40,7 @@ pub(super) async fn list(
         robots.retain(|robot| selector.matches(&robot.id, &robot.name, &robot.labels));
     }
     let now_ms = app.clock.now_ms();
-    robots.iter_mut().for_each(|robot| complete_robot(robot, &app.presence, now_ms));
+    robots.iter_mut().for_each(|robot| complete_robot(robot, &app.presence, &app.conduct, now_ms));
     Ok(Json(RobotList { robots }))
 }
 
@@ -77,10 +78,31 @@ pub(super) async fn remove(
 ) -> Result<StatusCode, ApiError> {
     let id = find(&app, &by, &robot).await?;
     app.actions.remove_robot(&by, &id).await?;
+    put_out(&app, &id);
     app.logs.forget(&id);
-    app.broker.disconnect(&id);
     app.presence.forget(&id);
     Ok(StatusCode::NO_CONTENT)
+}
+
+/// `POST /robots/{robot}/revoke`: ends its tokens, and whatever is under way by them.
+pub(super) async fn revoke(
+    State(app): State<App>,
+    by: Person,
+    PathParam(robot): PathParam<RobotName>,
+) -> Result<StatusCode, ApiError> {
+    let id = find(&app, &by, &robot).await?;
+    app.actions.revoke_robot(&by, &id).await?;
+    put_out(&app, &id);
+    // One that polled would count as there for a while.
+    app.presence.forget(&id);
+    app.changes.announce(Change::Robot(id));
+    Ok(StatusCode::NO_CONTENT)
+}
+
+/// Ends a robot's session and its requests. To be called once its tokens have ended.
+fn put_out(app: &App, robot: &RobotId) {
+    app.broker.disconnect(robot);
+    app.visits.end(robot);
 }
 
 /// `GET /robots/{robot}/desired` (that robot): its signed desired state. Asking counts as being there.
@@ -147,6 +169,6 @@ pub(super) async fn find(app: &App, by: &Person, id_or_name: &RobotName) -> Resu
 async fn view(app: &App, id: &RobotId) -> Result<RobotView, ApiError> {
     let found = app.store.robot(id).await?;
     let mut view = found.ok_or_else(|| ApiError::not_found(format!("there is no robot {id}")))?;
-    complete_robot(&mut view, &app.presence, app.clock.now_ms());
+    complete_robot(&mut view, &app.presence, &app.conduct, app.clock.now_ms());
     Ok(view)
 }

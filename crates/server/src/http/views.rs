@@ -6,11 +6,15 @@ use task_proto::RobotId;
 use task_proto::api::{DeploymentState, DeploymentView, MatchedRobot, PhaseCount, RobotView};
 use task_proto::report::{Condition, Phase};
 
+use crate::conduct::Conduct;
 use crate::deployment;
 use crate::presence::Presence;
 
-/// Adds where a robot is and what is wrong with its identity.
-pub fn complete_robot(view: &mut RobotView, presence: &Presence, now_ms: u64) {
+/// Adds where a robot is, how it behaves, and what is wrong with its identity.
+pub fn complete_robot(view: &mut RobotView, presence: &Presence, conduct: &Conduct, now_ms: u64) {
+    if let Some(text) = conduct.trouble(&view.id) {
+        view.conditions.insert(0, Condition { code: "misbehaves".to_owned(), text });
+    }
     let Some(sighting) = presence.get(&view.id, now_ms) else { return };
     view.online = sighting.online;
     view.address = sighting.address.map(|address| address.to_string());

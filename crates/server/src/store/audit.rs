@@ -24,14 +24,22 @@ const MOST_CHARACTERS: usize = 1_000;
 pub enum Act {
     /// A robot came, or came back.
     RobotEnroll,
+    /// A robot that waited was let in.
+    RobotApprove,
+    /// A robot that waited was turned away.
+    RobotReject,
     /// A robot's name or labels were changed.
     RobotEdit,
     /// A robot was removed.
     RobotRemove,
+    /// A robot's tokens were ended.
+    RobotRevoke,
     /// A robot was asked to change something at once, like a parameter.
     RobotAsk,
     /// An enrolment token was made.
     EnrolmentCreate,
+    /// An enrolment token was revoked.
+    EnrolmentRevoke,
     /// A package was ordered.
     DeploymentCreate,
     /// An order was taken back.
@@ -77,10 +85,14 @@ impl Act {
     pub fn as_str(self) -> &'static str {
         match self {
             Self::RobotEnroll => "robot.enroll",
+            Self::RobotApprove => "robot.approve",
+            Self::RobotReject => "robot.reject",
             Self::RobotEdit => "robot.edit",
             Self::RobotRemove => "robot.remove",
+            Self::RobotRevoke => "robot.revoke",
             Self::RobotAsk => "robot.ask",
             Self::EnrolmentCreate => "enrolment_token.create",
+            Self::EnrolmentRevoke => "enrolment_token.revoke",
             Self::DeploymentCreate => "deployment.create",
             Self::DeploymentCancel => "deployment.cancel",
             Self::DeploymentResume => "deployment.resume",

@@ -17,7 +17,9 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[
     (7, "people", include_str!("../migrations/0007_people.sql")),
     (8, "direct_pushes", include_str!("../migrations/0008_direct_pushes.sql")),
     (9, "publishers", include_str!("../migrations/0009_publishers.sql")),
+    (10, "robots", include_str!("../migrations/0010_robots.sql")),
     (11, "client_keys", include_str!("../migrations/0011_client_keys.sql")),
+    (13, "approval", include_str!("../migrations/0013_approval.sql")),
 ];
 
 /// Applies what has not been applied yet.

@@ -9,6 +9,7 @@ mod assignments;
 mod audit;
 mod deliveries;
 mod deployments;
+mod enrolments;
 mod fan_outs;
 mod first_use;
 mod migrate;

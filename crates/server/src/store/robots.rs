@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use sqlx::{AssertSqlSafe, Row as _};
-use task_proto::api::{RobotTask, RobotView};
+use task_proto::api::{AWAITS_APPROVAL, RobotTask, RobotView};
 use task_proto::desired::{BlobRef, Delivery, DesiredTask, Evidence, PackageRef};
 use task_proto::id::Labels;
 use task_proto::report::{Condition, Phase, Report};
@@ -68,6 +68,9 @@ pub struct FetchedBy {
 
 const KNOWN: &str = "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL";
 
+/// Those that can be ordered something.
+const ORDERABLE: &str = "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL AND awaits_approval = 0";
+
 const KNOWN_BY_ID_OR_NAME: &str =
     "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL AND (id = $1 OR name = $1)";
 
@@ -107,9 +110,9 @@ impl Store {
         row.map(|row| known_robot(&row)).transpose()
     }
 
-    /// The robots that `selector` means now, sorted by name.
+    /// The robots that `selector` means now, sorted by name; none that waits to be approved.
     pub async fn matching_robots(&self, selector: &Selector) -> Result<Vec<KnownRobot>, StoreError> {
-        matching(sqlx::query(KNOWN).fetch_all(&self.reads).await?, selector)
+        matching(sqlx::query(ORDERABLE).fetch_all(&self.reads).await?, selector)
     }
 
     /// The robots in a scope.
@@ -127,13 +130,15 @@ impl Store {
         rows.iter().map(|row| id("robots.id", row)).collect()
     }
 
-    /// The robots' credentials at an external broker, sorted by robot.
+    /// The robots' credentials at an external broker, sorted by robot; those that were revoked or wait to be approved have
+    /// none there.
     pub async fn broker_credentials(&self) -> Result<Vec<BrokerCredential>, StoreError> {
-        let rows = sqlx::query(CREDENTIALS).bind("");
+        let approved = format!("{CREDENTIALS} AND awaits_approval = 0 ORDER BY id");
+        let rows = sqlx::query(AssertSqlSafe(approved)).bind("");
         rows.fetch_all(&self.reads).await?.iter().map(broker_credential).collect()
     }
 
-    /// One robot's; `None` if it is not registered.
+    /// One robot's; `None` if it is not registered, or was revoked.
     pub async fn broker_credential(&self, robot: &RobotId) -> Result<Option<BrokerCredential>, StoreError> {
         let row = sqlx::query(CREDENTIALS).bind(robot.as_str());
         row.fetch_optional(&self.reads).await?.as_ref().map(broker_credential).transpose()
@@ -145,7 +150,7 @@ impl Store {
         rows.iter().map(|row| id("assignments.robot_id", row)).collect()
     }
 
-    /// What each of `robots` should have; those that are not registered are left out.
+    /// What each of `robots` should have; those that are not registered, were revoked or wait to be approved are left out.
     pub async fn desired_tasks(&self, robots: &[RobotId]) -> Result<Vec<DesiredTasks>, StoreError> {
         let mut found: Vec<DesiredTasks> = Vec::with_capacity(robots.len());
         for group in groups(robots) {
@@ -156,7 +161,8 @@ impl Store {
                  FROM robots r
                  LEFT JOIN assignments a ON a.robot_id = r.id AND a.desired = 1
                  LEFT JOIN deployments d ON d.id = a.deployment_id
-                 WHERE r.removed_at_ms IS NULL AND r.id IN ({}) ORDER BY r.id, a.task",
+                 WHERE r.removed_at_ms IS NULL AND r.revoked_at_ms IS NULL AND r.awaits_approval = 0 AND r.id IN ({})
+                 ORDER BY r.id, a.task",
                 values(1, group.len(), &["TEXT"])
             );
             let mut query = sqlx::query(AssertSqlSafe(sql));
@@ -216,9 +222,9 @@ impl Store {
 }
 
 impl Write {
-    /// The robots that `selector` means now, sorted by name.
+    /// The robots that `selector` means now, sorted by name; none that waits to be approved.
     pub async fn matching_robots(&mut self, selector: &Selector) -> Result<Vec<KnownRobot>, StoreError> {
-        matching(sqlx::query(KNOWN).fetch_all(self.connection()).await?, selector)
+        matching(sqlx::query(ORDERABLE).fetch_all(self.connection()).await?, selector)
     }
 
     /// The robots that should have `task`.
@@ -308,13 +314,13 @@ impl Write {
     }
 }
 
-const CREDENTIALS: &str =
-    "SELECT id, broker_credential FROM robots WHERE removed_at_ms IS NULL AND (id = $1 OR $1 = '') ORDER BY id";
+const CREDENTIALS: &str = "SELECT id, broker_credential FROM robots
+     WHERE removed_at_ms IS NULL AND revoked_at_ms IS NULL AND (id = $1 OR $1 = '')";
 
 const WITH_TASK: &str = "SELECT robot_id FROM assignments WHERE task = $1 AND desired = 1";
 
 const ROBOT_ROWS: &str = "SELECT r.id, r.name, r.mac, r.labels, r.enrolled_at_ms, r.generation, r.observed_generation,
-         r.report, r.link, r.last_seen_ms
+         r.report, r.link, r.last_seen_ms, r.revoked_at_ms, r.awaits_approval
      FROM robots r WHERE r.removed_at_ms IS NULL";
 
 /// What each robot should have, and what it is still getting rid of. The first condition is that of an index, word for
@@ -331,7 +337,7 @@ fn matching(rows: Vec<sqlx::any::AnyRow>, selector: &Selector) -> Result<Vec<Kno
     Ok(robots)
 }
 
-fn known_robot(row: &sqlx::any::AnyRow) -> Result<KnownRobot, StoreError> {
+pub(super) fn known_robot(row: &sqlx::any::AnyRow) -> Result<KnownRobot, StoreError> {
     Ok(KnownRobot {
         id: id("robots.id", row.try_get("id")?)?,
         name: id("robots.name", row.try_get("name")?)?,
@@ -387,6 +393,14 @@ fn robot_view(row: &sqlx::any::AnyRow, mut tasks: Vec<RobotTask>) -> Result<Robo
     let generation = Generation(number(row.try_get("generation")?));
     let observed_generation = Generation(number(row.try_get("observed_generation")?));
     let mut conditions = Vec::new();
+    if row.try_get::<Option<i64>, _>("revoked_at_ms")?.is_some() {
+        let text = "its tokens have ended; it comes back with an enrolment token made for it, or is removed".to_owned();
+        conditions.push(Condition { code: "revoked".to_owned(), text });
+    }
+    if row.try_get::<i64, _>("awaits_approval")? != 0 {
+        let text = "it gets nothing until an administrator approves it (taskd robot approve)".to_owned();
+        conditions.push(Condition { code: AWAITS_APPROVAL.to_owned(), text });
+    }
     if observed_generation > generation {
         let text = format!(
             "it reports generation {observed_generation}, the server knows {generation}; left alone until its next order"

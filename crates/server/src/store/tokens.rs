@@ -34,13 +34,15 @@ pub enum TokenHolder {
         /// The key that it registered when it was given the token.
         key: Option<PublicKey>,
     },
+    /// A robot that waits to be approved, which may nothing yet.
+    Pending(RobotId),
 }
 
 impl TokenHolder {
     fn is_proven_by(&self, proof: &ClientProof) -> bool {
         match self {
             Self::Robot { key, .. } => proof.suffices(key.as_ref()),
-            Self::Person(_) | Self::Enrolment => true,
+            Self::Person(_) | Self::Enrolment | Self::Pending(_) => true,
         }
     }
 }
@@ -65,6 +67,8 @@ pub struct EnrolmentTerms {
     pub uses_left: Option<u64>,
     /// When it ends.
     pub expires_at_ms: u64,
+    /// Whether a new robot that comes by it waits to be approved.
+    pub approval: bool,
 }
 
 struct TokenRow {
@@ -74,6 +78,9 @@ struct TokenRow {
     uses_left: Option<u64>,
     expires_at_ms: Option<u64>,
     is_used: bool,
+    approval: bool,
+    /// Of a robot's token: whether the robot waits to be approved.
+    is_pending: bool,
     number: u64,
     user: Option<UserPart>,
     key: Option<PublicKey>,
@@ -92,8 +99,9 @@ struct UserPart {
 /// An enrolment token without a use left is still good while a token that it made was never used: the answer with that
 /// one may have been lost.
 const VALID_TOKEN: &str = "SELECT t.digest, t.robot_id, t.labels, t.uses_left, t.expires_at_ms, t.used_at_ms, t.number,
-         t.client_key, t.user_name, t.roles, t.scope, t.origin, u.roles AS user_roles, u.scope AS user_scope
-     FROM tokens t LEFT JOIN users u ON u.name = t.user_name
+         t.client_key, t.user_name, t.roles, t.scope, t.origin, t.approval, u.roles AS user_roles, u.scope AS user_scope,
+         r.awaits_approval
+     FROM tokens t LEFT JOIN users u ON u.name = t.user_name LEFT JOIN robots r ON r.id = t.robot_id
      WHERE t.id = $1 AND t.kind = $2 AND t.revoked_at_ms IS NULL AND (t.expires_at_ms IS NULL OR t.expires_at_ms > $3)
        AND (t.uses_left IS NULL OR t.uses_left > 0 OR EXISTS (SELECT 1 FROM tokens made
             WHERE made.made_by = t.id AND made.used_at_ms IS NULL AND made.revoked_at_ms IS NULL))";
@@ -166,6 +174,7 @@ impl Write {
             labels: row.labels,
             uses_left: row.uses_left,
             expires_at_ms: row.expires_at_ms.unwrap_or(u64::MAX),
+            approval: row.approval,
         }))
     }
 
@@ -186,11 +195,12 @@ impl Write {
         now_ms: u64,
     ) -> Result<(), StoreError> {
         self.insert_token(token, terms.robot.as_ref(), None, now_ms).await?;
-        sqlx::query("UPDATE tokens SET labels = $2, uses_left = $3, expires_at_ms = $4 WHERE id = $1")
+        sqlx::query("UPDATE tokens SET labels = $2, uses_left = $3, expires_at_ms = $4, approval = $5 WHERE id = $1")
             .bind(token.id())
             .bind(json(&terms.labels))
             .bind(terms.uses_left.map(stored))
             .bind(stored(terms.expires_at_ms))
+            .bind(i64::from(terms.approval))
             .execute(self.connection())
             .await?;
         Ok(())
@@ -255,13 +265,16 @@ impl Write {
     }
 
     /// Forgets tokens that are good for nothing any more, and says whose they were if they were users'. The first token stays
-    /// when it was revoked: it is in the data directory, and must not come back to life at the next start.
+    /// when it was revoked: it is in the data directory, and must not come back to life at the next start. Those of a
+    /// revoked robot stay as well, so that it can be told.
     pub async fn forget_ended_tokens(&mut self, now_ms: u64) -> Result<BTreeSet<UserName>, StoreError> {
         let users: Vec<Option<String>> = sqlx::query_scalar(
             "DELETE FROM tokens
              WHERE (kind <> 'operator' OR user_name IS NOT NULL) AND (revoked_at_ms IS NOT NULL OR expires_at_ms <= $1
                  OR uses_left = 0 AND NOT EXISTS (SELECT 1 FROM tokens made
                      WHERE made.made_by = tokens.id AND made.used_at_ms IS NULL AND made.revoked_at_ms IS NULL))
+               AND NOT (kind = 'robot' AND EXISTS (SELECT 1 FROM robots r WHERE r.id = tokens.robot_id
+                   AND r.revoked_at_ms IS NOT NULL AND r.removed_at_ms IS NULL))
              RETURNING user_name",
         )
         .bind(stored(now_ms))
@@ -300,6 +313,7 @@ impl TokenRow {
         match token.kind() {
             TokenKind::Operator => self.person(token).map(TokenHolder::Person),
             TokenKind::Enrolment => Some(TokenHolder::Enrolment),
+            TokenKind::Robot if self.is_pending => self.robot.map(TokenHolder::Pending),
             TokenKind::Robot => {
                 self.robot.map(|robot| TokenHolder::Robot { robot, token_number: self.number, key: self.key })
             }
@@ -332,6 +346,8 @@ fn token_row(row: sqlx::any::AnyRow) -> Result<TokenRow, StoreError> {
         uses_left: row.try_get::<Option<i64>, _>("uses_left")?.map(number),
         expires_at_ms: row.try_get::<Option<i64>, _>("expires_at_ms")?.map(number),
         is_used: row.try_get::<Option<i64>, _>("used_at_ms")?.is_some(),
+        approval: row.try_get::<i64, _>("approval")? != 0,
+        is_pending: row.try_get::<Option<i64>, _>("awaits_approval")?.is_some_and(|awaits| awaits != 0),
         number: number(row.try_get("number")?),
         key: client_key(&row)?,
         user: user_part(&row)?,

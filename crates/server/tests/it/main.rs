@@ -3,13 +3,16 @@
 #![expect(clippy::unwrap_used, reason = "a test that can't go on should panic where it stands")]
 
 mod api;
+mod approval;
 mod auth;
 mod browser;
 mod cli;
 mod cli_people;
+mod conduct;
 mod database;
 mod deliveries;
 mod direct_push;
+mod enrolments;
 mod fleet;
 mod harness;
 mod logs;

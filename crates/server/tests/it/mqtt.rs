@@ -318,3 +318,17 @@ async fn revoked_and_stopped_sessions_end() {
     tokio::join!(broker.shutdown(PATIENCE), closed);
     assert_eq!(broker.connected_count(), 0);
 }
+
+#[tokio::test]
+async fn who_is_put_out_on_the_way_to_its_seat_gets_none() {
+    let broker = TestBroker::start().await;
+    let robot = RobotId::random();
+    let connect = Connect { password: Some(format!("once-{robot}")), ..Connect::robot(&robot) };
+    let mut raw = broker.raw_with(&connect.packet()).await;
+    timeout(PATIENCE, broker.door.asked.notified()).await.expect("the door is asked");
+    // There is no session yet that could be ended.
+    broker.broker.disconnect(&robot);
+    broker.door.go_on.notify_one();
+    raw.expect(&[0x20, 2, 0, 5]).await;
+    raw.expect_close().await;
+}

@@ -13,19 +13,27 @@ use taskd::broker::{
     Broker, BrokerConfig, Gatekeeper, Inbox, Limits, Login, NotStored, Principal, Refusal, RobotMessage,
 };
 use taskd::clock::Clock;
+use taskd::conduct::{Conduct, ConductLimits};
 use taskd::config::TlsSettings;
 use taskd::data_directory::DataDirectory;
 use taskd::tls::Tls;
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::TcpStream;
-use tokio::sync::{Mutex, mpsc};
+use tokio::sync::{Mutex, Notify, mpsc};
 use tokio::time::timeout;
 
 /// More than anything here takes, unless it hangs.
 pub const PATIENCE: Duration = Duration::from_secs(10);
 
 /// Lets robots in with `pw-<robot id>` and operators with `operator`; some passwords meet other ends.
-struct Door;
+#[derive(Default)]
+pub struct Door {
+    /// Says that somebody with `once-<robot id>` is being let in, for the first time, which [`Door::go_on`] ends. The second
+    /// time they are not.
+    pub asked: Notify,
+    pub go_on: Notify,
+    was_asked: AtomicBool,
+}
 
 impl Gatekeeper for Door {
     fn admit(&self, login: Login) -> BoxFuture<'_, Result<Principal, Refusal>> {
@@ -36,6 +44,15 @@ impl Gatekeeper for Door {
                 "revoked" => Err(Refusal::NotAuthorised),
                 "outage" => Err(Refusal::Unavailable),
                 "slow" => std::future::pending().await,
+                password if password.starts_with("once-") => {
+                    if self.was_asked.swap(true, Ordering::SeqCst) {
+                        return Err(Refusal::NotAuthorised);
+                    }
+                    self.asked.notify_one();
+                    self.go_on.notified().await;
+                    let robot = user.parse().expect("a robot's id");
+                    Ok(Principal::Robot { robot, token_number: 0 })
+                }
                 password => match password.strip_prefix("pw-").map(str::parse) {
                     Some(Ok(robot)) if !user.is_empty() => Ok(Principal::Robot { robot, token_number: 0 }),
                     _ => Err(Refusal::BadCredentials),
@@ -80,10 +97,17 @@ impl Inbox for Letterbox {
     fn everyone_may_be_there(&self) {}
 }
 
+/// Nobody is slowed or kept away.
+fn lenient() -> ConductLimits {
+    ConductLimits { messages_per_s: 1 << 40, bytes_per_s: 1 << 40, backoff: Duration::ZERO, ..ConductLimits::default() }
+}
+
 /// A running broker.
 pub struct TestBroker {
     pub broker: Broker,
     pub refuses: Arc<AtomicBool>,
+    pub door: Arc<Door>,
+    pub conduct: Arc<Conduct>,
     seen: Mutex<mpsc::UnboundedReceiver<Seen>>,
 }
 
@@ -92,8 +116,13 @@ impl TestBroker {
         Self::with(|_| {}).await
     }
 
+    /// Nobody is slowed or kept away.
     pub async fn with(change: impl FnOnce(&mut Limits)) -> Self {
-        Self::start_with(None, change).await
+        Self::start_with(None, change, lenient()).await
+    }
+
+    pub async fn with_conduct(change: impl FnOnce(&mut Limits), conduct: ConductLimits) -> Self {
+        Self::start_with(None, change, conduct).await
     }
 
     /// One that speaks TLS, by an authority of its own.
@@ -101,19 +130,26 @@ impl TestBroker {
         let directory = tempfile::TempDir::new().unwrap();
         let data = DataDirectory::open(directory.path()).unwrap();
         let tls = Tls::open(TlsSettings::default(), &data, Clock::system()).unwrap();
-        Self::start_with(Some(tls), change).await
+        Self::start_with(Some(tls), change, lenient()).await
     }
 
-    async fn start_with(tls: Option<Tls>, change: impl FnOnce(&mut Limits)) -> Self {
+    async fn start_with(tls: Option<Tls>, change: impl FnOnce(&mut Limits), conduct: ConductLimits) -> Self {
+        let conduct = Conduct::new(conduct);
         let mut limits = Limits { canary_interval: Duration::from_secs(3600), ..Limits::default() };
         change(&mut limits);
-        let config =
-            BrokerConfig { listen: "127.0.0.1:0".parse().unwrap(), tls, prefix: TopicPrefix::default(), limits };
+        let config = BrokerConfig {
+            listen: "127.0.0.1:0".parse().unwrap(),
+            tls,
+            prefix: TopicPrefix::default(),
+            limits,
+            conduct: conduct.clone(),
+        };
         let (sender, receiver) = mpsc::unbounded_channel();
         let refuses = Arc::new(AtomicBool::new(false));
         let inbox = Letterbox { seen: sender, refuses: refuses.clone() };
-        let broker = Broker::start(config, Arc::new(Door), Arc::new(inbox)).await.unwrap();
-        Self { broker, refuses, seen: Mutex::new(receiver) }
+        let door = Arc::new(Door::default());
+        let broker = Broker::start(config, door.clone(), Arc::new(inbox)).await.unwrap();
+        Self { broker, refuses, door, conduct, seen: Mutex::new(receiver) }
     }
 
     pub fn address(&self) -> SocketAddr {

@@ -5,6 +5,7 @@
 
 use std::fmt::Write as _;
 use std::path::Path;
+use std::time::Duration;
 
 use reqwest::Method;
 use serde_json::{Value, json};
@@ -82,7 +83,9 @@ struct Town {
 
 impl Town {
     async fn new() -> Self {
-        let server = TestServer::start().await;
+        // The same robot does what it may not again and again.
+        let directory = tempfile::TempDir::new().expect("a directory");
+        let server = TestServer::start_in(directory, |config| config.robots.backoff = Duration::ZERO).await;
         let store = Store::open(&sqlite_url(&server.data().join("taskd.sqlite"))).await.expect("opens");
         let (robot, other_robot) = (server.enroll("atlas").await, server.enroll("boreas").await);
         let (talker, package) = (server.push("talker", "1.0.0").await, server.push("walker", "1.0.0").await);
@@ -129,11 +132,15 @@ impl Town {
     async fn path(&self, probe: &Probe) -> String {
         let mut path = probe.path.replace("{deployment}", self.deployment.id.as_str());
         if path.contains("{robot}") {
-            let robot = match probe.method == Method::DELETE {
+            let robot = match probe.method == Method::DELETE || path.ends_with("/revoke") {
                 true => self.server.enroll(&format!("gone-{:08x}", rand::random::<u32>())).await.id,
                 false => self.robot.id.clone(),
             };
             path = path.replace("{robot}", robot.as_str());
+        }
+        if path.contains("{enrollment}") {
+            let token: EnrollmentToken = self.server.post("/api/v1/enrollment-tokens", &json!({})).await;
+            path = path.replace("{enrollment}", &token.id);
         }
         if path.contains("{user}") || path.contains("{token}") {
             let token = self.sign_in("bob", Role::Viewer, None).await;
@@ -214,7 +221,7 @@ impl Town {
 
 impl Raw {
     /// So many bytes; `None` if the other side closes before.
-    async fn read(&mut self, count: usize) -> Option<Vec<u8>> {
+    pub async fn read(&mut self, count: usize) -> Option<Vec<u8>> {
         use tokio::io::AsyncReadExt as _;
         let mut bytes = vec![0; count];
         let read = tokio::time::timeout(PATIENCE, self.stream.read_exact(&mut bytes));

@@ -21,6 +21,7 @@ on_both_databases! {
     a_first_use_by_two_at_once_is_one,
     a_fleet_that_comes_at_once_is_let_in_whole,
     a_lost_answer_to_an_enrolment_is_mended_by_asking_again,
+    a_revoked_robots_tokens_end_and_its_late_reports_come_too_late,
 }
 
 async fn enrolment_gives_identities_by_mac(database: TestDatabase) {
@@ -230,4 +231,45 @@ async fn a_lost_answer_to_an_enrolment_is_mended_by_asking_again(database: TestD
     let first = fleet.try_enroll(&many, mac(3), None).await.map(|_| first).expect("mended");
     assert_eq!(robot_of(&store, &first.token).await, None);
     assert_eq!(code(fleet.try_enroll(&many, mac(1), None).await), "mac_known");
+}
+
+async fn a_revoked_robots_tokens_end_and_its_late_reports_come_too_late(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let store = fleet.database.store.clone();
+    let order = || CreateEnrollmentToken { robot: Some("atlas".to_owned()), ..Default::default() };
+    let token = fleet.enrolment_token(CreateEnrollmentToken::default()).await;
+    let came = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("enrols");
+    let admitted = store.admit(&came.token, 1_000_000).await.expect("reads").expect("valid");
+    let TokenHolder::Robot { token_number, .. } = admitted.holder else { panic!("{admitted:?}") };
+    let next = fleet.actions.next_robot_token(&came.robot_id).await.expect("a token");
+    let before = fleet.enrolment_token(order()).await;
+    let mut robot = Robot::new(came.robot_id.clone());
+    fleet.writer.submit(robot.next_report(), token_number).await.expect("stored");
+
+    for _ in 0..2 {
+        fleet.actions.revoke_robot(&fleet.operator, &came.robot_id).await.expect("revoked");
+    }
+    let late = fleet.writer.submit(robot.next_report(), token_number).await;
+    assert!(matches!(late, Err(ReportError::TokenEnded(_))), "{late:?}");
+    assert!(fleet.desired(&robot).await.is_err(), "nothing is signed for it");
+    fleet.actions.expire().await.expect("forgets what has ended, but for these");
+    for token in [&came.token, &next] {
+        assert_eq!(store.admit(token, 1_000_000).await.expect("reads"), None);
+        assert!(store.is_of_revoked_robot(token).await.expect("reads"));
+    }
+    assert!(!store.is_of_revoked_robot(&Token::random(TokenKind::Robot)).await.expect("reads"));
+    assert!(!store.is_of_revoked_robot(&token).await.expect("reads"));
+    assert_eq!(code(fleet.try_enroll(&token, mac(1), None).await), "mac_known");
+    assert_eq!(code(fleet.try_enroll(&before, mac(1), None).await), "unauthorized");
+    assert_eq!(store.broker_credentials().await.expect("reads"), []);
+
+    let after = fleet.enrolment_token(order()).await;
+    let back = fleet.try_enroll(&after, mac(1), None).await.expect("enrols");
+    assert_eq!(back.robot_id, came.robot_id);
+    for token in [&came.token, &next] {
+        assert_eq!(store.admit(token, 1_000_000).await.expect("reads"), None);
+        assert!(!store.is_of_revoked_robot(token).await.expect("reads"));
+    }
+    assert_eq!(robot_of(&store, &back.token).await, Some(came.robot_id));
+    assert_eq!(store.broker_credentials().await.expect("reads").len(), 1);
 }

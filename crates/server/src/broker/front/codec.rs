@@ -21,6 +21,13 @@ pub(super) enum Received {
     Disconnect,
 }
 
+impl Received {
+    /// Whether it only answers what we sent.
+    pub(super) fn is_answer(&self) -> bool {
+        matches!(self, Self::PubAck(_) | Self::PubRec(_) | Self::PubRel(_) | Self::PubComp(_))
+    }
+}
+
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Connect {
     pub(super) client_id: String,

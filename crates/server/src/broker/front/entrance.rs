@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 use bytes::BytesMut;
 use rumqttd::protocol::{ConnAck, ConnectReturnCode, Packet};
 use subtle::ConstantTimeEq;
+use task_proto::RobotId;
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::time::{timeout, timeout_at};
 
@@ -18,6 +19,7 @@ use super::codec::{Connect, DecodeError, Received, Will, decode, encode};
 use super::takeover::SeatName;
 use crate::anteroom::Place;
 use crate::broker::{Login, Principal, Refusal};
+use crate::conduct::{SESSION_COST, Verdict, Watched, Way};
 use crate::tls::ClientProof;
 
 /// The largest CONNECT, in bytes after the fixed header.
@@ -35,17 +37,27 @@ pub(super) struct Guest {
     pub(super) will: Option<Will>,
     /// What was sent after CONNECT already, without waiting for the answer.
     pub(super) input: BytesMut,
+    /// How it behaves, if it is a robot.
+    pub(super) watched: Option<Watched>,
     login: Login,
+    /// How often a robot had been put out before it was asked who this is.
+    put_out: u64,
 }
 
 impl Guest {
-    /// Asks once more, now that the guest has a seat: a person whose rights ended on the way to it was not there yet to be
-    /// asked to leave. (A robot's session by a token that ended is taken over.)
+    /// Asks once more, now that the guest has a seat: whose rights ended on the way to it was not there yet to be asked to
+    /// leave. Of robots only if one was put out meanwhile: they come in thousands.
     pub(super) async fn check_again(&self, context: &Context) -> Result<(), Rejection> {
-        let Visitor::Operator(user) = &self.visitor else { return Ok(()) };
+        let before = match &self.visitor {
+            Visitor::Operator(user) => Principal::Operator(user.clone()),
+            Visitor::Robot { robot, token_number } if context.seats.put_out() != self.put_out => {
+                Principal::Robot { robot: robot.clone(), token_number: *token_number }
+            }
+            Visitor::Robot { .. } | Visitor::Canary => return Ok(()),
+        };
         let asked = context.gatekeeper.admit(self.login.clone());
         match timeout(context.limits.admit_timeout, asked).await {
-            Ok(Ok(Principal::Operator(again))) if again == *user => Ok(()),
+            Ok(Ok(again)) if again == before => Ok(()),
             _ => Err(answer(ConnectReturnCode::NotAuthorized, "credentials that have just ended")),
         }
     }
@@ -141,12 +153,17 @@ where
         peer,
         proof,
     };
+    let put_out = context.seats.put_out();
     let visitor = admit(context, &connect, login.clone()).await?;
     if let Some(will) = &connect.will
         && may_publish(&visitor, &context.prefix, &will.topic).is_none()
     {
         return Err(answer(ConnectReturnCode::NotAuthorized, "a will on a topic that is not its own"));
     }
+    let watched = match &visitor {
+        Visitor::Robot { robot, .. } => Some(watch(context, robot)?),
+        Visitor::Operator(_) | Visitor::Canary => None,
+    };
     let seat_name = match &visitor {
         Visitor::Robot { robot, .. } => SeatName::Robot(robot.clone()),
         Visitor::Canary => SeatName::Canary,
@@ -158,7 +175,18 @@ where
         0 => None,
         seconds => Some(Duration::from_millis(u64::from(seconds) * 1500)),
     };
-    Ok(Guest { visitor, seat_name, keep_alive, will: connect.will, input, login })
+    Ok(Guest { visitor, seat_name, keep_alive, will: connect.will, input, watched, login, put_out })
+}
+
+/// The robot, unless it was cut off and has to stay away for longer.
+fn watch(context: &Context, robot: &RobotId) -> Result<Watched, Rejection> {
+    let now = tokio::time::Instant::now();
+    let watched = context.conduct.watch(robot, Way::Mqtt, now);
+    let may_come = watched.barred_until(now).is_none();
+    if may_come && !matches!(watched.sent(SESSION_COST, 0, now), Verdict::Cut(_)) {
+        return Ok(watched);
+    }
+    Err(answer(ConnectReturnCode::ServiceUnavailable, "a robot that was cut off and comes back too early"))
 }
 
 /// A CONNACK.

@@ -4,6 +4,7 @@
 //! lasting session are ignored.
 
 mod access;
+mod attendance;
 mod codec;
 mod doorbell;
 mod entrance;
@@ -34,6 +35,7 @@ use super::router::Router;
 use super::{BrokerConfig, BrokerError, Gatekeeper, Inbox, Limits, NotAsked, NotConnected};
 use crate::anteroom::Anteroom;
 use crate::backlog::listen;
+use crate::conduct::Conduct;
 use crate::tls::{ClientProof, Tls};
 use entrance::Arrival;
 pub(super) use entrance::{CANARY_ID, CanaryPass};
@@ -53,6 +55,7 @@ pub(super) struct Front {
 struct Context {
     prefix: TopicPrefix,
     limits: Limits,
+    conduct: Arc<Conduct>,
     gatekeeper: Arc<dyn Gatekeeper>,
     inbox: Arc<dyn Inbox>,
     router: Arc<Router>,
@@ -86,6 +89,7 @@ impl Front {
             places: Arc::new(Semaphore::new(config.limits.max_connections)),
             limits: config.limits,
             tls: config.tls,
+            conduct: config.conduct,
             gatekeeper,
             inbox,
             router,

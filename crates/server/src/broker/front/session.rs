@@ -20,6 +20,7 @@ use tokio::time::{Instant, sleep_until, timeout};
 
 use super::Context;
 use super::access::{Hearing, Route, Visitor, may_publish};
+use super::attendance::Attendance;
 use super::codec::{DecodeError, Publish, Received, Will, decode, encode, encode_publish};
 use super::entrance::{Arrival, Guest, Rejection, connack, reject, welcome};
 use super::outgoing::Outgoing;
@@ -28,11 +29,14 @@ use super::parts::Due;
 use super::takeover::Seat;
 use super::traffic::{Count, Meter, Metered};
 use crate::broker::router::{Heard, Listener, Listening, RouterError};
-use crate::broker::{Inbox, NotStored, RobotMessage};
+use crate::broker::{NotStored, RobotMessage};
+use crate::conduct::Watched;
 
+mod conduct;
 mod parts;
 mod subscriptions;
 
+use conduct::until;
 use parts::{Parts, due};
 
 /// Answers a client may leave unread before nothing more is read from it.
@@ -60,6 +64,8 @@ enum End {
     Violation(&'static str),
     #[error("sent a message that could not be stored")]
     NotStored,
+    #[error("goes on sending more than it may")]
+    Flood,
     #[error("must leave: a newer session, or the server's decision")]
     Asked,
     /// In the middle of a part.
@@ -161,6 +167,9 @@ where
         is_flushed: true,
         listener,
         hearing: HashMap::new(),
+        watched: guest.watched.as_ref(),
+        slowed_until: None,
+        refused_filters: 0,
         parts: Parts::default(),
         outgoing: Outgoing::default(),
         unreleased: HashSet::new(),
@@ -170,6 +179,9 @@ where
         progress_at: now,
     };
     let end = session.run().await;
+    if let (Some(watched), Some(offence)) = (session.watched, end.offence()) {
+        watched.offends(offence, Instant::now());
+    }
     session.listener = None;
     if !matches!(end, End::Goodbye | End::Stopped)
         && let Some(will) = guest.will
@@ -191,27 +203,6 @@ async fn linger<S: AsyncRead + AsyncWrite + Unpin>(stream: &mut S) {
     let _ = timeout(LINGER, read_out).await;
 }
 
-/// Tells the inbox of a robot's session, and of its end even if the session's task should panic.
-struct Attendance<'a> {
-    inbox: &'a dyn Inbox,
-    robot: RobotId,
-    connection: u64,
-}
-
-impl<'a> Attendance<'a> {
-    fn begin(context: &'a Context, visitor: &Visitor, peer: SocketAddr, connection: u64) -> Option<Self> {
-        let Visitor::Robot { robot, .. } = visitor else { return None };
-        context.inbox.connected(robot, Some(peer), connection);
-        Some(Self { inbox: &*context.inbox, robot: robot.clone(), connection })
-    }
-}
-
-impl Drop for Attendance<'_> {
-    fn drop(&mut self) {
-        self.inbox.disconnected(&self.robot, self.connection);
-    }
-}
-
 struct Session<'a, S> {
     context: &'a Context,
     visitor: Visitor,
@@ -225,6 +216,11 @@ struct Session<'a, S> {
     is_flushed: bool,
     listener: Option<Listener>,
     hearing: HashMap<String, (Hearing, QoS)>,
+    /// How the robot behaves.
+    watched: Option<&'a Watched>,
+    /// Until when nothing more is taken from it.
+    slowed_until: Option<Instant>,
+    refused_filters: u32,
     parts: Parts,
     outgoing: Outgoing,
     unreleased: HashSet<u16>,
@@ -250,6 +246,8 @@ enum Woken {
     Rung(Bytes),
     Asked(Bytes),
     Heard(Result<Heard, RouterError>),
+    /// It is not slowed any more.
+    Due,
     PartDue(Digest, Due),
     Late(End),
 }
@@ -298,6 +296,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
             payload = self.seat.doorbell().question(), if may_send && hears_request => Woken::Asked(payload),
             (digest, due) = due(&self.parts, may_send_part) => Woken::PartDue(digest, due),
             heard = heard(&mut self.listener), if may_send => Woken::Heard(heard),
+            () = until(self.slowed_until) => Woken::Due,
             () = sleep_until(deadline) => Woken::Late(lateness),
         };
         if may_send {
@@ -331,9 +330,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         !self.is_busy() && self.output.own_bytes() < MAX_UNREAD_BYTES
     }
 
-    /// Whether what was read last is still being acted on.
+    /// Whether what was read last is still being acted on, or was more than may come.
     fn is_busy(&self) -> bool {
-        self.storing.is_some()
+        self.storing.is_some() || self.slowed_until.is_some()
     }
 
     fn act_on(&mut self, woken: Woken) -> Result<(), End> {
@@ -352,6 +351,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
             Woken::Asked(payload) => self.send_own(RobotTopic::Request, Hearing::Request, payload),
             Woken::PartDue(digest, due) => self.act_on_part(digest, due)?,
             Woken::Heard(heard) => self.pass_on(heard.map_err(|_| End::RouterLost)?),
+            // It could not be heard, so it was not silent.
+            Woken::Due => (self.slowed_until, self.heard_at) = (None, Instant::now()),
             Woken::Late(end) => return Err(end),
         }
         Ok(())
@@ -359,8 +360,10 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
 
     fn act_on_input(&mut self) -> Result<(), End> {
         while self.may_read() {
+            let before = self.input.len();
             let Some(received) = decode(&mut self.input, self.context.limits.max_packet_bytes)? else { break };
             self.heard_at = Instant::now();
+            self.weigh(&received, before - self.input.len())?;
             self.act_on_packet(received)?;
         }
         give_back(&mut self.input);

@@ -2,6 +2,7 @@
 //! after the session before it has fully ended. It never touches a socket.
 
 use std::collections::HashMap;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use task_proto::{RobotId, UserName};
@@ -24,6 +25,8 @@ pub(super) enum SeatName {
 #[derive(Default)]
 pub(super) struct Seats {
     table: Mutex<Table>,
+    /// How often a robot was put out.
+    put_out: AtomicU64,
 }
 
 #[derive(Default)]
@@ -87,8 +90,14 @@ impl Seats {
         self.table().occupants.get(&SeatName::Robot(robot.clone())).map(|occupant| occupant.meter.clone())
     }
 
+    /// How often a robot was put out so far. Who was let in before the number changed has to be asked again.
+    pub(super) fn put_out(&self) -> u64 {
+        self.put_out.load(Ordering::SeqCst)
+    }
+
     /// Asks the robot's session to leave.
     pub(super) fn ask_to_leave(&self, robot: &RobotId) {
+        self.put_out.fetch_add(1, Ordering::SeqCst);
         if let Some(occupant) = self.table().occupants.get(&SeatName::Robot(robot.clone())) {
             occupant.leave.cancel();
         }

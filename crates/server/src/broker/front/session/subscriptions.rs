@@ -21,7 +21,10 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
             let is_heard = match hearing {
                 Some(Hearing::Package(digest)) => self.join(digest),
                 Some(_) => true,
-                None => false,
+                None => {
+                    self.refuse_filter()?;
+                    false
+                }
             };
             return_codes.push(match hearing {
                 Some(hearing) if is_heard => {

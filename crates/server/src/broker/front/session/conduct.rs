@@ -1,0 +1,55 @@
+//! How a robot's session notices that it misbehaves: each packet is weighed, each end judged.
+
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::time::{Instant, sleep_until};
+
+use super::{End, Session};
+use crate::broker::front::codec::{DecodeError, Received};
+use crate::conduct::{Offence, Verdict};
+
+/// Subscriptions to what is not for it that a robot may try in one session.
+const MAX_REFUSED_FILTERS: u32 = 16;
+
+impl End {
+    /// What a robot did that ended like this, if none of ours would do that. (A flood has been noticed before.)
+    pub(super) fn offence(self) -> Option<Offence> {
+        match self {
+            Self::Malformed(DecodeError::TooLarge(bytes)) => Some(Offence::TooLarge(bytes)),
+            Self::Malformed(_) => Some(Offence::Violation("sends what is no MQTT")),
+            Self::Violation(what) => Some(Offence::Violation(what)),
+            _ => None,
+        }
+    }
+}
+
+impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
+    /// Counts a packet of the robot's. If it is more than may come now, it is the last one for a while; if that goes on, the
+    /// last one of the session.
+    pub(super) fn weigh(&mut self, received: &Received, bytes: usize) -> Result<(), End> {
+        let Some(watched) = self.watched else { return Ok(()) };
+        let messages = u64::from(!received.is_answer());
+        match watched.sent(messages, bytes as u64, self.heard_at) {
+            Verdict::Fine => {}
+            Verdict::Slow(until) => self.slowed_until = Some(until),
+            Verdict::Cut(_) => return Err(End::Flood),
+        }
+        Ok(())
+    }
+
+    /// A robot's subscription to what is not for it is refused.
+    pub(super) fn refuse_filter(&mut self) -> Result<(), End> {
+        self.refused_filters += 1;
+        if self.watched.is_some() && self.refused_filters > MAX_REFUSED_FILTERS {
+            return Err(End::Violation("goes on subscribing to what is not for it"));
+        }
+        Ok(())
+    }
+}
+
+/// Comes then; never if it is `None`.
+pub(super) async fn until(at: Option<Instant>) {
+    match at {
+        Some(at) => sleep_until(at).await,
+        None => std::future::pending().await,
+    }
+}

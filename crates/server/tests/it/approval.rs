@@ -1,0 +1,140 @@
+//! Robots that wait to be approved: they have nothing, nobody can order them anything, and nobody waits for ever.
+
+use reqwest::Method;
+use serde_json::{Value, json};
+use task_proto::RobotId;
+use task_proto::api::{AuditPage, CreateEnrollmentToken, EnrollResponse, EnrollmentToken, PendingRobotList, RobotView};
+use task_proto::token::Token;
+use taskd::store::TokenHolder;
+use tempfile::TempDir;
+
+use crate::database::{TestDatabase, on_both_databases};
+use crate::fleet::{Fleet, mac};
+use crate::harness::{TestRobot, TestServer, answer, refusal};
+use crate::mqtt_harness::{Connect, Raw};
+use crate::story::code;
+
+on_both_databases! {
+    a_robot_waits_until_it_is_approved_or_turned_away_or_a_week_has_passed,
+}
+
+const DAY_MS: u64 = 24 * 60 * 60 * 1000;
+
+async fn a_robot_waits_until_it_is_approved_or_turned_away_or_a_week_has_passed(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let store = fleet.database.store.clone();
+    let holder = async |token: &Token| {
+        store.admit(token, fleet.clock.now_ms()).await.expect("reads").map(|admitted| admitted.holder)
+    };
+    let order = CreateEnrollmentToken { approval: true, ttl_s: Some(30 * 24 * 3600), ..Default::default() };
+    let token = fleet.enrolment_token(order).await;
+    let one = fleet.try_enroll(&token, mac(1), Some("one")).await.expect("enrols");
+    // An answer that was lost is mended as ever, and the robot goes on waiting.
+    let one = fleet.try_enroll(&token, mac(1), Some("one")).await.map(|again| (one, again)).expect("mended");
+    assert!(one.0.awaits_approval && one.1.awaits_approval);
+    let one = one.1;
+    assert_eq!(holder(&one.token).await, Some(TokenHolder::Pending(one.robot_id.clone())));
+    let two = fleet.try_enroll(&token, mac(2), Some("two")).await.expect("enrols");
+    assert_eq!(store.matching_robots(&"*".parse().expect("valid")).await.expect("reads"), []);
+    assert_eq!(store.broker_credentials().await.expect("reads"), []);
+    assert_eq!(store.desired_tasks(std::slice::from_ref(&one.robot_id)).await.expect("reads"), []);
+
+    for _ in 0..2 {
+        fleet.actions.approve_robot(&fleet.operator, &one.robot_id).await.expect("approved");
+    }
+    assert!(matches!(holder(&one.token).await, Some(TokenHolder::Robot { .. })));
+    assert_eq!(store.matching_robots(&"*".parse().expect("valid")).await.expect("reads").len(), 1);
+    // Rejecting one that does not wait would be removing it.
+    assert_eq!(code(fleet.actions.reject_robot(&fleet.operator, &one.robot_id).await), "not_pending");
+
+    fleet.actions.reject_robot(&fleet.operator, &two.robot_id).await.expect("rejected");
+    assert_eq!(holder(&two.token).await, None);
+    // Name and MAC are free again.
+    let two = fleet.try_enroll(&token, mac(2), Some("two")).await.expect("enrols");
+    fleet.clock.advance_ms(7 * DAY_MS);
+    fleet.actions.expire().await.expect("looks");
+    assert!(holder(&two.token).await.is_some(), "a week has not passed");
+    fleet.clock.advance_ms(1);
+    fleet.actions.expire().await.expect("looks");
+    assert_eq!(holder(&two.token).await, None);
+    let left: Vec<RobotId> = store.robots().await.expect("reads").into_iter().map(|robot| robot.id).collect();
+    assert_eq!(left, [one.robot_id]);
+}
+
+async fn enrol(server: &TestServer, token: &str, number: u8) -> EnrollResponse {
+    let body = json!({ "mac": format!("02:00:00:00:00:{number:02x}"), "name": format!("robot-{number}") });
+    answer(server.bare(Method::POST, "/api/v1/enroll").bearer_auth(token).json(&body)).await
+}
+
+async fn act(server: &TestServer, robot: &RobotId, verb: &str) {
+    let request = server.request(Method::POST, &format!("/api/v1/robots/{robot}/{verb}"));
+    request.send().await.expect("an answer").error_for_status().expect("done");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_robot_that_waits_has_nothing_until_it_is_approved() {
+    let directory = TempDir::new().expect("a directory");
+    let server = TestServer::start_in(directory, |config| config.enrolment_approval = true).await;
+    let package = server.push("talker", "1.0.0").await;
+    let token: EnrollmentToken = server.post("/api/v1/enrollment-tokens", &json!({})).await;
+    let came = enrol(&server, &token.token, 1).await;
+    assert!(came.awaits_approval);
+    let own = format!("/api/v1/robots/{}", came.robot_id);
+    let routes = [
+        (Method::GET, format!("{own}/desired")),
+        (Method::GET, format!("{own}/mqtt")),
+        (Method::POST, format!("{own}/token")),
+        (Method::POST, format!("{own}/report")),
+    ];
+    for (method, path) in routes {
+        let refused = refusal(server.bare(method, &path).bearer_auth(&came.token)).await;
+        assert_eq!(refused, (403, "awaits_approval".to_owned()), "{path}");
+    }
+    for path in ["/v2/".to_owned(), format!("/v2/talker/blobs/{}", package.content.digest)] {
+        let refused = server.bare(Method::GET, &path).bearer_auth(&came.token).send().await.expect("an answer");
+        assert_eq!(refused.status(), 403, "{path}");
+    }
+    let connect = Connect {
+        client_id: came.robot_id.to_string(),
+        user_name: Some(came.robot_id.to_string()),
+        password: Some(came.token.clone()),
+        clean: true,
+        keep_alive_s: 0,
+        will: None,
+    };
+    let stream = tokio::net::TcpStream::connect(&server.server.addresses().mqtt).await.expect("listens");
+    let mut raw = Raw { stream };
+    raw.send(&connect.packet()).await;
+    raw.expect(&[0x20, 2, 0, 5]).await;
+    // An order does not mean it, by whatever selector.
+    for selector in ["*", "robot-1", came.robot_id.as_str()] {
+        let body = json!({ "package": "talker", "manifest": package.manifest.digest, "selector": selector });
+        assert_eq!(refusal(server.order("/api/v1/deployments", selector, &body)).await.1, "no_robots_match");
+    }
+    let view: RobotView = server.get(&own).await;
+    assert_eq!((view.conditions[0].code.as_str(), view.online), ("awaits_approval", false));
+    let list: PendingRobotList = server.get("/api/v1/pending-robots").await;
+    let [pending] = &list.robots[..] else { panic!("{list:?}") };
+    assert_eq!((&pending.id, pending.address.as_deref()), (&came.robot_id, Some("127.0.0.1")));
+    assert_eq!(pending.token.as_ref().map(|id| id.as_str()), Some(token.id.as_str()));
+
+    act(&server, &came.robot_id, "approve").await;
+    let robot = TestRobot::new(came.robot_id.clone(), came.token);
+    server.deploy(&package, "*", "key").await;
+    assert_eq!(server.desired(&robot).await.tasks.len(), 1);
+    let approved: AuditPage = server.get("/api/v1/audit?act=robot.approve").await;
+    let entry: Value = serde_json::from_str(approved.records[0].entry.get()).expect("json");
+    assert_eq!(
+        (entry["who"].as_str(), entry["target"].as_str()),
+        (Some("operator.token"), Some(came.robot_id.as_str()))
+    );
+
+    // A robot that an administrator makes a token for is known already.
+    let own: EnrollmentToken = server.post("/api/v1/enrollment-tokens", &json!({ "robot": "robot-1" })).await;
+    assert!(!enrol(&server, &own.token, 1).await.awaits_approval);
+    let other = enrol(&server, &token.token, 2).await;
+    act(&server, &other.robot_id, "reject").await;
+    let refused = server.bare(Method::GET, "/v2/").bearer_auth(&other.token).send().await.expect("an answer");
+    assert_eq!(refused.status(), 401);
+    assert_eq!(server.get::<PendingRobotList>("/api/v1/pending-robots").await.robots, []);
+}

@@ -1,0 +1,155 @@
+//! Robots that misbehave: slowed on their own connection, cut off, kept away, shown, and forgiven. Nobody else notices.
+
+use std::time::Duration;
+
+use reqwest::{Method, Response};
+use task_proto::RobotId;
+use task_proto::api::{RobotView, ServerInfo};
+use task_proto::report::Phase;
+use task_proto::topic::RobotTopic;
+use taskd::conduct::ConductLimits;
+use tempfile::TempDir;
+use tokio::io::AsyncWriteExt as _;
+use tokio::time::timeout;
+
+use crate::harness::{TestRobot, TestServer};
+use crate::mqtt_harness::{Connect, PATIENCE, TestBroker, framed, publish, subscribe, topic};
+
+const HOUR: Duration = Duration::from_secs(3600);
+
+/// CONNACK: the server is not available (to this robot, now).
+const NOT_NOW: [u8; 4] = [0x20, 2, 0, 3];
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_flood_is_cut_off_and_kept_away_and_others_are_served() {
+    let limits = ConductLimits {
+        messages_per_s: 10,
+        patience: Duration::from_millis(300),
+        backoff: HOUR,
+        ..ConductLimits::default()
+    };
+    let broker = TestBroker::with_conduct(|_| {}, limits).await;
+    let robot = RobotId::random();
+    let mut raw = broker.robot(&robot).await;
+    let message = publish(&topic(&robot, RobotTopic::Telemetry), 0, 0, b"flood");
+    let flood = async { while raw.stream.write_all(&message.repeat(1000)).await.is_ok() {} };
+    let (flooded, ()) = tokio::join!(timeout(PATIENCE, flood), broker.assert_serves());
+    flooded.expect("the flood should be cut off");
+    let text = broker.conduct.trouble(&robot).expect("it is shown");
+    assert!(text.contains("more over MQTT than a robot may") && text.contains("cut off"), "{text}");
+    // A new connection makes no new robot of it, and costs nobody else anything.
+    broker.raw_with(&Connect::robot(&robot).packet()).await.expect(&NOT_NOW).await;
+    let totals = broker.conduct.totals();
+    assert_eq!((totals.slowed, totals.cut, totals.turned_away), (1, 1, 1));
+    broker.assert_serves().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_none_of_ours_would_send_cuts_its_robot_off() {
+    let limits = ConductLimits { backoff: HOUR, ..ConductLimits::default() };
+    let broker = TestBroker::with_conduct(|_| {}, limits).await;
+    let other = topic(&RobotId::random(), RobotTopic::Report);
+    let refused: Vec<(String, u8)> = (0..17).map(|number| (format!("taskd/v1/r/{number}/#"), 0)).collect();
+    let refused: Vec<(&str, u8)> = refused.iter().map(|(filter, qos)| (filter.as_str(), *qos)).collect();
+    let cases = [
+        (publish(&other, 1, 1, b"{}"), "publishes where it may not"),
+        (framed(0x30, &vec![0; 300_000]), "packet of 300000 bytes"),
+        (vec![0x36, 2, 0, 0], "what is no MQTT"),
+        (subscribe(1, &refused), "subscribing to what is not for it"),
+    ];
+    for (packet, shown) in cases {
+        let robot = RobotId::random();
+        let mut raw = broker.robot(&robot).await;
+        raw.send(&packet).await;
+        raw.expect_close().await;
+        let text = broker.conduct.trouble(&robot).expect("it is shown");
+        assert!(text.contains(shown), "{text}");
+        broker.raw_with(&Connect::robot(&robot).packet()).await.expect(&NOT_NOW).await;
+    }
+    broker.assert_serves().await;
+    // Somebody without its token can't get it into trouble.
+    let robot = RobotId::random();
+    let stranger = Connect { password: Some("pw-".to_owned()), ..Connect::robot(&robot) };
+    broker
+        .raw_with(&[stranger.packet(), framed(0x30, &vec![0; 300_000])].concat())
+        .await
+        .expect(&[0x20, 2, 0, 4])
+        .await;
+    assert_eq!(broker.conduct.trouble(&robot), None);
+}
+
+async fn server(limits: ConductLimits) -> TestServer {
+    TestServer::start_in(TempDir::new().expect("a directory"), |config| config.robots = limits).await
+}
+
+/// Reports until it is told to wait for longer than it would be held up; gives that answer.
+async fn report_until_refused(server: &TestServer, robot: &mut TestRobot) -> Response {
+    let state = server.desired(robot).await;
+    loop {
+        let response = server.report(robot, &state, Phase::Running).await;
+        match response.status().as_u16() {
+            200 => {}
+            429 => return response,
+            other => panic!("{other}"),
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn who_reports_too_often_is_cut_off_and_still_told_what_to_do() {
+    let limits = ConductLimits {
+        requests_per_s: 2,
+        patience: Duration::from_millis(1),
+        backoff: HOUR,
+        ..ConductLimits::default()
+    };
+    let server = server(limits).await;
+    let (mut atlas, mut boreas) = (server.enroll("atlas").await, server.enroll("boreas").await);
+    let refused = report_until_refused(&server, &mut atlas).await;
+    let wait_s: u64 = refused.headers()["retry-after"].to_str().expect("text").parse().expect("seconds");
+    assert!((3000..=3601).contains(&wait_s), "{wait_s}");
+    let view: RobotView = server.robot(&atlas).await;
+    let condition = &view.conditions[0];
+    assert_eq!(condition.code, "misbehaves");
+    assert!(condition.text.contains("more often than a robot may"), "{}", condition.text);
+    assert_eq!(server.ask_desired(&atlas).await.status(), 200, "an order to stop would reach it");
+    // The other one is none the worse.
+    let state = server.desired(&boreas).await;
+    assert_eq!(server.report(&mut boreas, &state, Phase::Running).await.status(), 200);
+    assert!(server.robot(&boreas).await.conditions.is_empty());
+    let info: ServerInfo = server.get("/api/v1/server").await;
+    assert_eq!((info.conduct.slowed, info.conduct.cut), (1, 1));
+    let shown = server.request(Method::GET, "/api/v1/robots").send().await.expect("an answer");
+    assert!(shown.text().await.expect("text").contains("misbehaves"));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn who_behaves_again_is_forgiven_by_itself() {
+    let limits = ConductLimits {
+        requests_per_s: 2,
+        patience: Duration::from_millis(1),
+        backoff: Duration::from_millis(1),
+        forgive_after: Duration::from_millis(1),
+        ..ConductLimits::default()
+    };
+    let server = server(limits).await;
+    let mut atlas = server.enroll("atlas").await;
+    let mut events = server.request(Method::GET, "/api/v1/events").send().await.expect("an answer");
+    report_until_refused(&server, &mut atlas).await;
+    // Both its trouble and the end of that are told to whoever listens.
+    let mut heard = String::new();
+    let forgiven = timeout(PATIENCE, async {
+        loop {
+            let chunk = events.chunk().await.expect("a stream").expect("goes on");
+            heard.push_str(&String::from_utf8_lossy(&chunk));
+            let last = heard.rfind("misbehaves");
+            if last.is_some_and(|last| heard[last..].contains("\"conditions\":[]")) {
+                return;
+            }
+        }
+    });
+    forgiven.await.expect("forgiven");
+    assert!(server.robot(&atlas).await.conditions.is_empty());
+    let state = server.desired(&atlas).await;
+    assert_eq!(server.report(&mut atlas, &state, Phase::Running).await.status(), 200);
+}

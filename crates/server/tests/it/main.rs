@@ -3,6 +3,7 @@
 #![expect(clippy::unwrap_used, reason = "a test that can't go on should panic where it stands")]
 
 mod api;
+mod audited;
 mod auth;
 mod browser;
 mod cli;

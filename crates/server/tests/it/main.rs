@@ -13,6 +13,7 @@ mod deliveries;
 mod direct_push;
 mod fleet;
 mod harness;
+mod headers;
 mod logs;
 mod mqtt;
 mod mqtt_harness;

@@ -21,6 +21,7 @@ pub mod fan_out;
 pub mod gatekeeper;
 pub mod http;
 pub mod mqtt_access;
+pub mod oidc;
 pub mod package;
 pub mod part_requests;
 pub mod passwords;

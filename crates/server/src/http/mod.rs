@@ -16,6 +16,7 @@ pub mod listener;
 mod logs;
 mod mqtt;
 pub mod oci;
+mod oidc;
 mod outputs;
 mod packages;
 mod people;
@@ -50,6 +51,7 @@ use crate::broker::Broker;
 use crate::changes::Changes;
 use crate::clock::Clock;
 use crate::mqtt_access::MqttAccess;
+use crate::oidc::Provider;
 use crate::presence::Presence;
 use crate::report_writer::ReportWriter;
 use crate::requests::Requests;
@@ -90,6 +92,8 @@ pub struct AppParts {
     pub transfers: Transfers,
     /// Who is signed in at the page.
     pub sessions: Arc<session::Sessions>,
+    /// By whom people may sign in, if there is such a provider.
+    pub provider: Option<Arc<Provider>>,
     /// Failed authentications.
     pub attempts: Arc<attempts::FailedAttempts>,
     /// The event stream's source.
@@ -204,6 +208,8 @@ pub fn routes() -> Vec<Route> {
         Route::new(get.clone(), "/api/v1/session", Anyone, session::show),
         Route::new(post.clone(), "/api/v1/session", Anyone, session::sign_in),
         Route::new(delete.clone(), "/api/v1/session", Person(Read), session::sign_out),
+        Route::new(get.clone(), "/api/v1/oidc/sign-in", Anyone, oidc::begin),
+        Route::new(get.clone(), "/api/v1/oidc/callback", Anyone, oidc::finish),
         Route::new(post.clone(), "/api/v1/login", Anyone, people::log_in),
         Route::new(get.clone(), "/api/v1/me", Person(Read), people::me),
         Route::new(put.clone(), "/api/v1/password", Person(Read), people::change_password),

@@ -17,6 +17,7 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[
     (7, "people", include_str!("../migrations/0007_people.sql")),
     (8, "direct_pushes", include_str!("../migrations/0008_direct_pushes.sql")),
     (11, "client_keys", include_str!("../migrations/0011_client_keys.sql")),
+    (12, "provider", include_str!("../migrations/0012_provider.sql")),
 ];
 
 /// Applies what has not been applied yet.

@@ -16,8 +16,8 @@ pub use self::enrolment::{AWAITS_APPROVAL, EnrollmentTokenList, EnrollmentTokenV
 pub use self::logs::{LogEvent, LogsFrom, LogsQuery, LogsView};
 pub use self::mqtt::{BrokerFiles, ExternalBroker, MqttEndpoint};
 pub use self::people::{
-    AccessToken, AddUser, AuditPage, AuditQuery, ChangePassword, CreateToken, EditUser, LogIn, Me, SessionView,
-    SetPassword, SignIn, TokenList, TokenOrigin, TokenView, UserList, UserView,
+    AccessToken, AddUser, AuditPage, AuditQuery, ChangePassword, CreateToken, EditUser, LogIn, Me, ProviderView,
+    SessionView, SetPassword, SignIn, TokenList, TokenOrigin, TokenView, UserList, UserView,
 };
 use crate::desired::{PackageRef, Wanted};
 use crate::envelope::PublicKey;

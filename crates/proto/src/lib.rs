@@ -7,6 +7,7 @@ pub mod desired;
 pub mod digest;
 pub mod envelope;
 pub mod id;
+pub mod line;
 pub mod log;
 pub mod manifest;
 pub mod oci;

@@ -2,6 +2,7 @@
 //! One table names every setting, so the three sources can't drift apart. It reads the file it is pointed to and
 //! resolves host names; it never creates anything.
 
+mod oidc;
 mod settings;
 mod tables;
 mod tls;
@@ -17,6 +18,7 @@ use task_proto::id::LabelKey;
 use task_proto::part::DEFAULT_PART_BYTES;
 use task_proto::topic::TopicPrefix;
 
+pub use self::oidc::{OidcSettings, RoleRule, private_url};
 use self::settings::{SETTINGS, Setting};
 pub use self::tables::{SiteLimits, TransferLimits};
 pub use self::tls::TlsSettings;
@@ -67,6 +69,8 @@ pub struct Config {
     pub max_silent_per_address: usize,
     /// The addresses of reverse proxies that are believed about where a request came from.
     pub trusted_proxies: Vec<IpAddr>,
+    /// By which provider people may sign in; without an issuer by none.
+    pub oidc: OidcSettings,
     /// The most bytes one blob may have.
     pub max_blob_bytes: u64,
     /// How packages travel to robots.
@@ -217,6 +221,12 @@ pub enum ConfigError {
         "tls.client_certificates: robots can't show their keys to a server that does not encrypt; set tls.private_ca"
     )]
     KeysInPlainText,
+    /// The provider can't be used without it.
+    #[error("{missing} is missing, and signing in by a provider does not work without it")]
+    OidcIncomplete {
+        /// The setting there is not.
+        missing: &'static str,
+    },
     /// An unencrypted listener would be reachable from other machines.
     #[error(
         "{key} = {address}: unencrypted connections from other machines are refused; leave out --tls-private-ca=false, \
@@ -262,6 +272,7 @@ impl Config {
             max_mqtt_connections: 20_000,
             max_silent_per_address: 2048,
             trusted_proxies: Vec::new(),
+            oidc: OidcSettings::default(),
             max_blob_bytes: 16 << 30,
             delivery: DeliverySettings::default(),
             transfers: TransferLimits::default(),
@@ -300,6 +311,7 @@ impl Config {
 
     /// Refuses settings that do not go together.
     fn check(&self) -> Result<(), ConfigError> {
+        self.oidc.check()?;
         let is_exposed = |broker: &&BrokerUrl| !broker.tls && !broker.is_loopback() && !self.allow_plaintext;
         if let Some(broker) = self.broker.as_ref().filter(is_exposed) {
             return Err(ConfigError::PlaintextBroker { address: broker.address() });
@@ -586,20 +598,20 @@ mod tests {
 
     #[test]
     fn an_external_broker_and_its_password_stay_out_of_sight() {
-        let url = "mqtt://taskd:secret@localhost:1884";
+        let url = "mqtt://taskd:swordfish@localhost:1884";
         let config = load(&[], &[("TASKD_BROKER", url), ("TASKD_MQTT", "0.0.0.0:1883")], None).expect("loads");
-        assert!(!format!("{config:?}").contains("secret"));
+        assert!(!format!("{config:?}").contains("swordfish"));
         assert_eq!(config.broker.expect("external").address(), "localhost:1884");
         let back = load(&[("broker", "embedded")], &[("TASKD_BROKER", url)], None).expect("loads");
         assert_eq!(back.broker, None);
-        let elsewhere = Some("broker = \"mqtt://taskd:secret@broker.lab\"");
+        let elsewhere = Some("broker = \"mqtt://taskd:swordfish@broker.lab\"");
         for message in [
             load(&[("broker", url)], &[], None).expect_err("readable by everybody"),
-            load(&[], &[("TASKD_BROKER", "tcp://taskd:secret@localhost")], None).expect_err("no such scheme"),
+            load(&[], &[("TASKD_BROKER", "tcp://taskd:swordfish@localhost")], None).expect_err("no such scheme"),
             load(&[], &[], elsewhere).expect_err("readable on the way"),
         ] {
             assert!(message.contains("broker") || message.contains("BROKER"), "{message}");
-            assert!(!message.contains("secret"), "{message}");
+            assert!(!message.contains("swordfish"), "{message}");
         }
         assert!(load(&[("allow-plaintext", "true")], &[], elsewhere).is_ok());
     }

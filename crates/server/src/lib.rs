@@ -23,6 +23,7 @@ pub mod gatekeeper;
 pub mod http;
 pub mod key_file;
 pub mod mqtt_access;
+pub mod oidc;
 pub mod package;
 pub mod part_requests;
 pub mod passwords;

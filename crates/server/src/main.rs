@@ -7,6 +7,7 @@ use std::time::Duration;
 use anyhow::Context as _;
 use clap::{Parser, Subcommand};
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
+use task_proto::line::OneLineEach;
 use taskd::clock::Clock;
 use taskd::commands;
 use taskd::config::{Config, ConfigError, ServeFlags};
@@ -67,10 +68,11 @@ fn main() -> ExitCode {
 async fn serve(flags: &ServeFlags) -> anyhow::Result<ExitCode> {
     let filter =
         EnvFilter::try_from_env("TASKD_LOG").unwrap_or_else(|_| EnvFilter::new("info,sqlx=warn,rumqttd=error"));
+    let has_colours = std::io::stderr().is_terminal();
     tracing_subscriber::fmt()
         .with_env_filter(filter)
-        .with_writer(std::io::stderr)
-        .with_ansi(std::io::stderr().is_terminal())
+        .with_writer(move || OneLineEach::new(std::io::stderr(), has_colours))
+        .with_ansi(has_colours)
         .init();
     let mut config = Config::load(flags, std::env::vars_os())?;
     match open_files() {

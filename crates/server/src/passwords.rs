@@ -15,6 +15,8 @@ const MOST_WAITING: usize = 32;
 const SHORTEST: usize = 12;
 /// The longest, in bytes.
 const LONGEST: usize = 1024;
+/// The hash of a password that nobody knows, at the costs of new ones: what is checked for a user who has none.
+const DECOY: &str = "$argon2id$v=19$m=19456,t=2,p=1$oiWDNzbpRSZLLWAsLdq6YA$fFQXZmPfKzsmg/2F1msjXUWT4U8aycI1kUvh4FTMccY";
 
 /// What is kept of a password: an argon2id hash in PHC form, with its own salt and costs.
 #[derive(Clone, PartialEq, Eq)]
@@ -57,6 +59,7 @@ pub enum PasswordError {
 pub struct Passwords {
     turns: Arc<Semaphore>,
     places: Arc<Semaphore>,
+    decoy: PasswordHash,
 }
 
 impl Default for Passwords {
@@ -65,7 +68,7 @@ impl Default for Passwords {
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let at_once = (cores / 4).clamp(1, 4);
         let places = Arc::new(Semaphore::new(at_once + MOST_WAITING));
-        Self { turns: Arc::new(Semaphore::new(at_once)), places }
+        Self { turns: Arc::new(Semaphore::new(at_once)), places, decoy: PasswordHash(DECOY.to_owned()) }
     }
 }
 
@@ -82,14 +85,12 @@ impl Passwords {
         if password.len() > LONGEST {
             return Ok(false);
         }
-        let (password, hash) = (password.to_owned(), hash.cloned());
-        self.work(move || match hash {
-            Some(hash) => match Argon2::default().verify_password(password.as_bytes(), hash.as_str()) {
-                Ok(()) => Ok(true),
-                Err(argon2::password_hash::Error::PasswordInvalid) => Ok(false),
-                Err(_) => Err(PasswordError::Failed),
-            },
-            None => hashed(&password).map(|_| false),
+        let (password, is_there) = (password.to_owned(), hash.is_some());
+        let hash = hash.unwrap_or(&self.decoy).clone();
+        self.work(move || match Argon2::default().verify_password(password.as_bytes(), hash.as_str()) {
+            Ok(()) => Ok(is_there),
+            Err(argon2::password_hash::Error::PasswordInvalid) => Ok(false),
+            Err(_) => Err(PasswordError::Failed),
         })
         .await?
     }
@@ -168,6 +169,20 @@ mod tests {
         assert!(matches!(passwords.verify("correct horse battery", Some(&nonsense)).await, Err(PasswordError::Failed)));
         let again = passwords.hash(&alice(), "correct horse battery").await.expect("hashed");
         assert_ne!(again, hash, "each has its own salt");
+    }
+
+    #[tokio::test]
+    async fn who_has_no_password_costs_as_much_as_who_has_one() {
+        let passwords = Passwords::default();
+        let (hash, costs) =
+            (passwords.hash(&alice(), "correct horse battery").await.expect("hashed"), "$m=19456,t=2,p=1$");
+        assert!(hash.as_str().contains(costs) && passwords.decoy.as_str().contains(costs));
+        assert_eq!(hash.as_str().len(), passwords.decoy.as_str().len());
+        // It is really looked at: one that can't be is noticed, and one that fits opens nothing.
+        let unreadable = Passwords { decoy: PasswordHash::stored("nonsense".to_owned()), ..Passwords::default() };
+        assert!(matches!(unreadable.verify("correct horse battery", None).await, Err(PasswordError::Failed)));
+        let fitting = Passwords { decoy: hash, ..Passwords::default() };
+        assert!(!fitting.verify("correct horse battery", None).await.expect("checked"));
     }
 
     #[test]

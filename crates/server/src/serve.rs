@@ -29,6 +29,7 @@ use crate::http::events::{EventFeed, EventSource};
 use crate::http::traffic::HttpTotals;
 use crate::http::{App, AppParts, listener};
 use crate::mqtt_access::MqttAccess;
+use crate::oidc::{OidcSetUpError, Provider};
 use crate::presence::Presence;
 use crate::report_writer::ReportWriter;
 use crate::requests::Requests;
@@ -75,6 +76,9 @@ pub enum ServeError {
     /// MQTT can't be served.
     #[error(transparent)]
     Broker(#[from] BrokerError),
+    /// The provider can't be asked.
+    #[error(transparent)]
+    Oidc(#[from] OidcSetUpError),
     /// HTTP can't be served.
     #[error("cannot listen for HTTP on {address}")]
     Listen {
@@ -129,6 +133,8 @@ impl Server {
         let (broker, mqtt) =
             start_broker(&config, broker, &data, &public_key, Arc::new(gatekeeper), Arc::new(uplink)).await?;
 
+        let provider = (!config.oidc.issuer.is_empty()).then(|| Provider::new(config.oidc.clone())).transpose()?;
+        let provider = provider.map(Arc::new);
         let transfers = Transfers::new(&config.transfers, config.delivery.site_label.clone());
         let (stop, tasks) = (CancellationToken::new(), TaskTracker::new());
         let http_traffic = Arc::new(HttpTotals::default());
@@ -147,6 +153,7 @@ impl Server {
             sessions: Arc::default(),
             visits: Arc::default(),
             conduct,
+            provider,
             attempts: Arc::default(),
             events: EventFeed::new(),
             key: public_key,

@@ -57,6 +57,16 @@ impl SignIns {
         accounts.count(user.clone(), MOST_FOR_ACCOUNT, now_ms)
     }
 
+    /// An attempt is about to be made of which only the address is known.
+    pub fn begin_unnamed(&self, address: IpAddr, now_ms: u64) -> Result<(), Blocked> {
+        self.lock().addresses.count(network(address), MOST_FROM_ADDRESS, now_ms)
+    }
+
+    /// That one has succeeded.
+    pub fn unnamed_succeeded(&self, address: IpAddr) {
+        self.lock().addresses.take_back(&network(address));
+    }
+
     /// The attempt that was begun has succeeded: it counts no longer, and the address is known for the account.
     pub fn succeeded(&self, user: &UserName, address: IpAddr, now_ms: u64) {
         let pair = (user.clone(), network(address));

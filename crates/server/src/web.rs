@@ -18,6 +18,11 @@ const REVALIDATED: &str = "no-cache";
 /// Paths below `vendor/` name the version, so what is there never changes.
 const IMMUTABLE: &str = "public, max-age=31536000, immutable";
 
+/// The page loads nothing from elsewhere and has no code but these files.
+const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; font-src 'self'; \
+     connect-src 'self'; worker-src 'self'; manifest-src 'self'; base-uri 'none'; form-action 'none'; \
+     frame-ancestors 'none'";
+
 /// `GET /` (anyone): the page. It holds no data; that needs a session.
 pub async fn index(headers: HeaderMap) -> Result<Response, ApiError> {
     serve("index.html", &headers)
@@ -33,10 +38,11 @@ fn serve(path: &str, headers: &HeaderMap) -> Result<Response, ApiError> {
     let tag = tag(&file);
     let caching = if path.starts_with("vendor/") { IMMUTABLE } else { REVALIDATED };
     let caching = [(header::ETAG, tag.clone()), (header::CACHE_CONTROL, caching.to_owned())];
+    let policy = [(header::CONTENT_SECURITY_POLICY, POLICY)];
     if is_known(headers, &tag) {
-        return Ok((StatusCode::NOT_MODIFIED, caching).into_response());
+        return Ok((StatusCode::NOT_MODIFIED, caching, policy).into_response());
     }
-    Ok((caching, [(header::CONTENT_TYPE, content_type(path))], file.data.into_owned()).into_response())
+    Ok((caching, policy, [(header::CONTENT_TYPE, content_type(path))], file.data.into_owned()).into_response())
 }
 
 fn tag(file: &EmbeddedFile) -> String {

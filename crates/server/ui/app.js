@@ -13,6 +13,17 @@ import { Layout, robotTable, sign } from './robots.js';
 
 const REFETCH_PAUSE_MS = 2_000;
 
+/** Why the provider's way in led nowhere. */
+const PROVIDER_PROBLEMS = {
+  expired: 'Signing in took too long or was begun in another browser. Try again.',
+  refused: 'The provider did not let you in.',
+  no_role: 'You have no role here. Ask an administrator.',
+  no_name: 'The provider has no name for you that can be used here. Ask an administrator.',
+  name_taken: 'Somebody else has your name here. Ask an administrator.',
+  blocked: 'Too many sign-ins failed from your address. Try again in a quarter of an hour.',
+  failed: 'Signing in by the provider failed. The server\u2019s log says why.',
+};
+
 const page = {
   view: 'starting',
   fleet: new Fleet(),
@@ -22,6 +33,8 @@ const page = {
   heardAt: null,
   /** Who is signed in. */
   me: null,
+  /** Another way to sign in, if there is one. */
+  provider: null,
   clockAheadMs: 0,
   problem: null,
   isSigningIn: false,
@@ -50,24 +63,24 @@ function rearrange(act) {
 
 // Signing in and out
 
-async function start() {
-  const token = tokenOfLink();
-  if (token) return signIn({ token });
+async function start({ token, problem } = ofLink()) {
   try {
-    const { expires_at_ms: until } = await api.session();
-    if (until) enter();
-    else leave();
+    const { expires_at_ms: until, provider } = await api.session();
+    page.provider = provider;
+    if (token) signIn({ token });
+    else if (until) enter();
+    else leave(problem && (PROVIDER_PROBLEMS[problem] ?? PROVIDER_PROBLEMS.failed));
   } catch (error) {
     change(() => (page.problem = error.message));
-    setTimeout(start, REFETCH_PAUSE_MS);
+    setTimeout(() => start({ token, problem }), REFETCH_PAUSE_MS);
   }
 }
 
-/** The token of a link `/#token=…`, which then leaves the address bar and the history. */
-function tokenOfLink() {
-  const token = new URLSearchParams(location.hash.slice(1)).get('token');
-  if (token) history.replaceState(null, '', location.pathname);
-  return token;
+/** What a link says, `/#token=…` or `/#problem=…`, which then leaves the address bar and the history. */
+function ofLink() {
+  const said = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
+  if (said.token || said.problem) history.replaceState(null, '', location.pathname);
+  return said;
 }
 
 async function signIn(who) {
@@ -208,6 +221,7 @@ function keepInPlace(layout) {
 const signInView = () => html`
   <main class="sign-in">
     <h1>taskd</h1>
+    ${page.provider ? html`<p><a class="button by-provider" href=${page.provider.url}>Sign in with ${page.provider.title}</a></p>` : nothing}
     <form class="by-password" @submit=${signInWith}>
       <label for="user">Name</label>
       <input id="user" name="user" required autofocus autocomplete="username" autocapitalize="none" spellcheck="false">
@@ -282,7 +296,7 @@ function streamState(now) {
 }
 
 addEventListener('hashchange', () => {
-  const token = tokenOfLink();
+  const { token } = ofLink();
   if (token) signIn({ token });
 });
 addEventListener('scroll', () => change(() => {}), { passive: true });

@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use task_proto::InstanceId;
+use task_proto::line::OneLineEach;
 use task_proto::report::Status;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
@@ -150,7 +151,8 @@ fn start_logging() {
     let filter = tracing_subscriber::EnvFilter::try_from_env("TASK_AGENT_LOG")
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info,rumqttc=warn,rustdds=error"));
     let colours = std::io::stderr().is_terminal();
-    tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colours).with_writer(std::io::stderr).init();
+    let writer = move || OneLineEach::new(std::io::stderr(), colours);
+    tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colours).with_writer(writer).init();
 }
 
 /// Keeps a second agent away from the data directory while this one lives.

@@ -26,6 +26,9 @@ pub struct UserView {
     pub scope: Option<Selector>,
     /// Whether they can sign in with a password.
     pub has_password: bool,
+    /// Who they are at the provider by which they sign in, behind its issuer; absent: they don't.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub subject: Option<String>,
     /// When they were added.
     pub created_at_ms: u64,
 }
@@ -103,6 +106,18 @@ pub struct SignIn {
 pub struct SessionView {
     /// When the caller's session ends; absent: not signed in.
     pub expires_at_ms: Option<u64>,
+    /// Another way to sign in than with a password; absent: there is none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub provider: Option<ProviderView>,
+}
+
+/// A provider by which people may sign in.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ProviderView {
+    /// What it is called.
+    pub title: String,
+    /// Where the browser has to go.
+    pub url: String,
 }
 
 /// `GET /me` (any person): who the caller is and what they may.

@@ -2,7 +2,7 @@
 
 use std::fmt::Debug;
 
-use task_proto::api::{AccessToken, Me, TokenOrigin, TokenView, UserView};
+use task_proto::api::{AccessToken, Me, ProviderView, SessionView, TokenOrigin, TokenView, UserView};
 use task_proto::audit::{AuditEntry, AuditRecord, Link};
 use task_proto::person::Permission;
 
@@ -19,9 +19,16 @@ fn people_and_their_tokens() {
         roles: parsed("operator,publisher"),
         scope: Some(parsed("site=lab")),
         has_password: true,
+        subject: None,
         created_at_ms: 1_800_000_000_000,
     };
     check("user_view.json", &user);
+    let subject = Some("https://id.example.org 248289761001".to_owned());
+    check("user_view_of_provider.json", &UserView { has_password: false, subject, ..user });
+    let provider =
+        ProviderView { title: "the lab".to_owned(), url: "https://fleet.example.org/api/v1/oidc".to_owned() };
+    check("session_view.json", &SessionView { expires_at_ms: Some(1_800_000_000_000), provider: Some(provider) });
+    check_tolerance::<SessionView>("session_view.json");
     let token = TokenView {
         id: parsed("0123456789ab"),
         user: parsed("alice"),

@@ -7,6 +7,7 @@ mod desired;
 mod fallen_behind;
 pub mod people;
 mod robots;
+pub mod sign_in;
 mod tasks;
 
 use std::fmt;
@@ -195,6 +196,18 @@ pub enum ActionError {
     /// More at once than can be checked.
     #[error("too many sign-ins at once; try again")]
     TooManySignIns,
+    /// No rule gives whoever came by the provider a role.
+    #[error("nothing that the provider says of you gives you a role here; ask an administrator")]
+    NoRole {
+        /// Who was a user until now.
+        removed: Option<UserName>,
+    },
+    /// The provider does not say what to call them.
+    #[error("the provider has no name for you that is a user name here; ask an administrator")]
+    NoName,
+    /// The provider and the rules for it decide.
+    #[error("{0} signs in by the provider: what {0} may is for oidc.rules in the configuration to say")]
+    OfProvider(UserName),
     /// It could not be hashed.
     #[error("the password could not be hashed")]
     PasswordFailed,
@@ -288,6 +301,9 @@ impl ActionError {
             Self::NotPermitted(_) => "forbidden",
             Self::SignInBlocked { .. } | Self::TooManySignIns | Self::TooManyPending(_) => "too_many_requests",
             Self::NotPending(_) => "not_pending",
+            Self::NoRole { .. } => "no_role",
+            Self::NoName => "no_name",
+            Self::OfProvider(_) => "of_provider",
             Self::UserExists(_) => "user_exists",
             Self::LastAdministrator(_) => "last_administrator",
             Self::IdempotencyKeyReused(_) => "idempotency_key_reused",

@@ -1,10 +1,10 @@
-//! People come, change and go, sign in, and get and lose tokens. Whoever had more rights before such a change is served
+//! People come, change and go, sign out, and get and lose tokens. Whoever had more rights before such a change is served
 //! with them no longer.
 
 use std::net::IpAddr;
 
 use task_proto::api::{
-    AccessToken, AddUser, ChangePassword, CreateToken, EditUser, LogIn, TokenList, TokenOrigin, TokenView, UserView,
+    AccessToken, AddUser, ChangePassword, CreateToken, EditUser, TokenList, TokenOrigin, TokenView, UserView,
 };
 use task_proto::person::Permission;
 use task_proto::selector::Selector;
@@ -15,19 +15,14 @@ use super::robots::lifetime_ms;
 use super::{ActionError, Actions, DAY_MS};
 use crate::passwords::PasswordError;
 use crate::person::{Person, first_name};
-use crate::sign_ins::Blocked;
-use crate::store::{Act, Deed, NewToken, StoreError, User, Write};
+use crate::store::{Act, Deed, NewToken, User, Write};
 
 /// The most users.
 const MOST_USERS: usize = 10_000;
 /// The most access tokens of one user; of those from signing in, the oldest goes for a newer one.
-const MOST_TOKENS: usize = 100;
+pub(super) const MOST_TOKENS: usize = 100;
 /// How long a token lives that was made without saying so.
 const TOKEN_LIFETIME_MS: u64 = 90 * DAY_MS;
-/// How long one lives that came from `taskd login`, if it does not say, and at the most.
-const LOGIN_LIFETIME_MS: u64 = 30 * DAY_MS;
-/// How long a page is signed in.
-pub const PAGE_LIFETIME_MS: u64 = DAY_MS / 2;
 /// The longest title of a token, in characters.
 const MOST_TITLE: usize = 200;
 /// A selector as long as that is a list of robots that belongs into a label.
@@ -36,35 +31,19 @@ const MOST_SCOPE_BYTES: usize = 1_024;
 /// Names that stand for something else in the audit.
 const RESERVED: [&str; 3] = ["operator.token", "enrolment", "server"];
 
-/// Someone who has just signed in.
-pub struct SignedIn {
-    /// By this token.
-    pub token: Token,
-    /// Which ends then.
-    pub expires_at_ms: u64,
-}
-
 impl Actions {
     /// Adds a user.
     pub async fn add_user(&self, by: &Person, order: &AddUser) -> Result<UserView, ActionError> {
         let name = &order.name;
-        if RESERVED.contains(&name.as_str()) {
-            return Err(ActionError::UserExists(name.clone()));
-        }
         let password = match &order.password {
             Some(password) => Some(self.passwords.hash(name, password).await?),
             None => None,
         };
         let (scope, now_ms) = (limit(order.scope.as_ref())?, self.clock.now_ms());
-        let user = User { name: name.clone(), roles: order.roles.clone(), scope, password, created_at_ms: now_ms };
+        let roles = order.roles.clone();
+        let user = User { name: name.clone(), roles, scope, password, subject: None, created_at_ms: now_ms };
         let mut write = self.store.begin().await?;
-        let users = write.users().await?;
-        if users.iter().any(|user| user.name == *name) {
-            return Err(ActionError::UserExists(name.clone()));
-        }
-        if users.len() >= MOST_USERS {
-            return Err(ActionError::Invalid { key: "name", reason: format!("there are {MOST_USERS} users already") });
-        }
+        check_new(&mut write, name).await?;
         write.put_user(&user).await?;
         write.audit(&Deed::by(by, Act::UserAdd, name).described(&user), now_ms).await?;
         write.commit().await?;
@@ -75,6 +54,7 @@ impl Actions {
     pub async fn edit_user(&self, by: &Person, name: &UserName, edit: &EditUser) -> Result<UserView, ActionError> {
         let mut write = self.store.begin().await?;
         let before = known_user(&mut write, name).await?;
+        check_own(&before)?;
         let mut user = before.clone();
         if let Some(roles) = &edit.roles {
             user.roles = roles.clone();
@@ -108,11 +88,12 @@ impl Actions {
     /// Sets a user's password. What was signed in with the old one is signed out; tokens that were made stay.
     pub async fn set_password(&self, by: &Person, name: &UserName, password: &str) -> Result<(), ActionError> {
         // Told before the work of hashing.
-        self.store.user(name).await?.ok_or_else(|| ActionError::UserNotFound(name.clone()))?;
+        check_own(&self.store.user(name).await?.ok_or_else(|| ActionError::UserNotFound(name.clone()))?)?;
         let hash = self.passwords.hash(name, password).await?;
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
         let user = known_user(&mut write, name).await?;
+        check_own(&user)?;
         write.put_user(&User { password: Some(hash), ..user }).await?;
         for token in write.tokens_of_user(name).await? {
             let is_own = token.id == by.token;
@@ -137,37 +118,6 @@ impl Actions {
             error => error,
         })?;
         self.set_password(by, &by.name, &order.new).await
-    }
-
-    /// Signs in with a password.
-    pub async fn sign_in(&self, order: &LogIn, origin: TokenOrigin, address: IpAddr) -> Result<SignedIn, ActionError> {
-        let lifetime_ms = match (origin, order.ttl_s) {
-            (TokenOrigin::Page, _) => PAGE_LIFETIME_MS,
-            (_, Some(seconds)) => lifetime_ms("ttl_s", seconds)?.min(LOGIN_LIFETIME_MS),
-            (_, None) => LOGIN_LIFETIME_MS,
-        };
-        let checked = self.check_password(&order.user, &order.password, address).await?;
-        let now_ms = self.clock.now_ms();
-        let (token, expires_at_ms) = (Token::random(TokenKind::Operator), now_ms + lifetime_ms);
-        let mut write = self.store.begin().await?;
-        // The password may have been changed while it was checked.
-        if write.user(&order.user).await?.is_none_or(|user| user.password != checked.password) {
-            return Err(ActionError::SignInRefused);
-        }
-        let tokens = write.tokens_of_user(&order.user).await?;
-        let signed_in = tokens.iter().filter(|token| token.origin == origin);
-        for surplus in signed_in.skip(MOST_TOKENS / 2 - 1) {
-            write.revoke_person_token(&surplus.id, now_ms).await?;
-        }
-        let title = format!("from {address}");
-        let (user, roles, scope) = (&order.user, None, None);
-        let new = NewToken { token: &token, user, origin, title: &title, roles, scope, expires_at_ms };
-        write.create_token(&new, now_ms).await?;
-        let deed = Deed::new(user.to_string(), token.id().parse().ok(), Some(address), Act::SignIn, user);
-        let how = if origin == TokenOrigin::Page { "page" } else { "login" };
-        write.audit(&deed.with("how", how).with("expires_at_ms", expires_at_ms), now_ms).await?;
-        write.commit().await?;
-        Ok(SignedIn { token, expires_at_ms })
     }
 
     /// Ends the token of whoever signed in with a password; any other is left as it is.
@@ -217,6 +167,11 @@ impl Actions {
             };
         let mut write = self.store.begin().await?;
         let owner = known_user(&mut write, user).await?;
+        // It would outlast what the provider says of its user, which is only heard when they sign in.
+        if owner.subject.is_some() && !by.may(Permission::Administer) {
+            let reason = format!("{user} signs in by the provider: an administrator makes tokens for {user}");
+            return Err(ActionError::NotPermitted(reason));
+        }
         if order.roles.as_ref().is_some_and(|roles| roles.within(&owner.roles).as_ref() != Some(roles)) {
             return Err(ActionError::Invalid { key: "roles", reason: format!("{user} has only {}", owner.roles) });
         }
@@ -265,38 +220,6 @@ impl Actions {
         self.changes.announce_rights();
         Ok(token.user)
     }
-
-    /// The user, if the password is theirs and not too many were wrong.
-    async fn check_password(&self, name: &UserName, password: &str, address: IpAddr) -> Result<User, ActionError> {
-        let user = self.store.user(name).await?;
-        let hash = user.as_ref().and_then(|user| user.password.as_ref());
-        let now_ms = self.clock.now_ms();
-        if let Err(Blocked { until_ms, is_news }) = self.sign_ins.begin(name, hash.is_some(), address, now_ms) {
-            if is_news {
-                // A name that nobody has may be a password in the wrong field.
-                let whose = if user.is_some() { name.as_str() } else { "nobody" };
-                self.note_blocked(whose, address, until_ms, now_ms).await?;
-            }
-            return Err(ActionError::SignInBlocked { seconds: until_ms.saturating_sub(now_ms).div_ceil(1000) });
-        }
-        match self.passwords.verify(password, hash).await {
-            Ok(true) => self.sign_ins.succeeded(name, address, now_ms),
-            Ok(false) => return Err(ActionError::SignInRefused),
-            Err(error) => {
-                self.sign_ins.given_up(name, hash.is_some(), address);
-                return Err(error.into());
-            }
-        }
-        user.ok_or(ActionError::SignInRefused)
-    }
-
-    async fn note_blocked(&self, whose: &str, address: IpAddr, until_ms: u64, now_ms: u64) -> Result<(), StoreError> {
-        let mut write = self.store.begin_reports().await?;
-        // Nobody knows who it is, so nobody is named as the one who did it.
-        let deed = Deed::new("server".to_owned(), None, Some(address), Act::SignInBlocked, whose);
-        write.audit(&deed.with("until_ms", until_ms), now_ms).await?;
-        write.commit().await
-    }
 }
 
 impl From<PasswordError> for ActionError {
@@ -311,7 +234,7 @@ impl From<PasswordError> for ActionError {
 
 impl Deed {
     /// With what the user may.
-    fn described(self, user: &User) -> Self {
+    pub(super) fn described(self, user: &User) -> Self {
         let scope = user.scope.as_ref().map_or_else(|| "*".to_owned(), Selector::to_string);
         self.with("roles", &user.roles).with("scope", scope)
     }
@@ -326,6 +249,26 @@ fn limit(scope: Option<&Selector>) -> Result<Option<Selector>, ActionError> {
         return Err(ActionError::Invalid { key: "scope", reason });
     }
     Ok((text != "*").then(|| scope.clone()))
+}
+
+/// Refuses a name that is taken.
+pub(super) async fn check_new(write: &mut Write, name: &UserName) -> Result<(), ActionError> {
+    let users = write.users().await?;
+    if RESERVED.contains(&name.as_str()) || users.iter().any(|user| user.name == *name) {
+        return Err(ActionError::UserExists(name.clone()));
+    }
+    if users.len() >= MOST_USERS {
+        return Err(ActionError::Invalid { key: "name", reason: format!("there are {MOST_USERS} users already") });
+    }
+    Ok(())
+}
+
+/// Refuses to change by hand what the provider and the rules for it decide.
+fn check_own(user: &User) -> Result<(), ActionError> {
+    match user.subject {
+        Some(_) => Err(ActionError::OfProvider(user.name.clone())),
+        None => Ok(()),
+    }
 }
 
 async fn known_user(write: &mut Write, name: &UserName) -> Result<User, ActionError> {

@@ -135,7 +135,12 @@ fn show(session: &Session, list: &UserList) -> Result<(), CommandError> {
             user.name.to_string(),
             user.roles.to_string(),
             user.scope.as_ref().map_or_else(|| "*".to_owned(), Selector::to_string),
-            if user.has_password { "yes" } else { "no" }.to_owned(),
+            match (&user.subject, user.has_password) {
+                (Some(_), _) => "by provider",
+                (None, true) => "yes",
+                (None, false) => "no",
+            }
+            .to_owned(),
             time(user.created_at_ms),
         ]
     };

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use task_proto::part::{MAX_PART_BYTES, MIN_PART_BYTES};
 
+use super::oidc::{private_url, public_url};
 use super::{BlobRead, Config, lifetime};
 use crate::delivery::shown_bytes;
 
@@ -209,6 +210,54 @@ pub(super) const SETTINGS: &[Setting] = &[
             config.trusted_proxies = parsed.collect::<Result<_, _>>()?;
             Ok(())
         },
+    },
+    Setting {
+        name: "oidc-issuer",
+        value_name: "URL",
+        help: "OpenID Connect provider by which people may sign in; see docs/people.md [default: none]",
+        set: |config, text| private_url(text).map(|url| config.oidc.issuer = url),
+    },
+    Setting {
+        name: "oidc-client-id",
+        value_name: "ID",
+        help: "What the provider calls this server",
+        set: |config, text| non_empty(text).map(|id| config.oidc.client_id = id),
+    },
+    Setting {
+        name: "oidc-client-secret-file",
+        value_name: "FILE",
+        help: "File with the secret that it gave this server, if it did",
+        set: |config, text| non_empty(text).map(|path| config.oidc.client_secret_file = Some(PathBuf::from(path))),
+    },
+    Setting {
+        name: "oidc-public-url",
+        value_name: "URL",
+        help: "Where browsers reach this server, like https://fleet.example.org",
+        set: |config, text| public_url(text).map(|url| config.oidc.public_url = url),
+    },
+    Setting {
+        name: "oidc-scopes",
+        value_name: "SCOPES",
+        help: "What the provider is asked for [default: openid profile]",
+        set: |config, text| match text.split(' ').any(|scope| scope == "openid") {
+            true => {
+                config.oidc.scopes = text.to_owned();
+                Ok(())
+            }
+            false => Err(format!("{text:?} lacks openid")),
+        },
+    },
+    Setting {
+        name: "oidc-name-claim",
+        value_name: "CLAIM",
+        help: "Claim that a new user is named by [default: preferred_username]",
+        set: |config, text| non_empty(text).map(|claim| config.oidc.name_claim = claim),
+    },
+    Setting {
+        name: "oidc-title",
+        value_name: "TEXT",
+        help: "What the page calls the provider [default: single sign-on]",
+        set: |config, text| non_empty(text).map(|title| config.oidc.title = title),
     },
     Setting {
         name: "max-blob-bytes",

@@ -1,6 +1,6 @@
 //! The tables of the configuration file: `[delivery]` with the operator's rules, `[transfers]` with the limits of each
-//! site, `[robots]` with what one may send, `[tls]`. What has one value is a setting like any other; the rest is read here.
-//! Every error names the key it is about.
+//! site, `[robots]` with what one may send, `[oidc]`, `[tls]`. What has one value is a setting like any other; the rest is read
+//! here. Every error names the key it is about.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -9,7 +9,7 @@ use task_proto::desired::Delivery;
 use task_proto::id::LabelValue;
 
 use super::settings::{Setting, size};
-use super::{Config, ConfigError, Origin, nearest, parse_duration};
+use super::{Config, ConfigError, Origin, nearest, oidc, parse_duration};
 use crate::delivery::{Condition, ConditionKey, MAX_RULES, Quantity, Rule, Rules, Unit};
 
 /// The most sites with limits of their own.
@@ -38,14 +38,14 @@ pub struct SiteLimits {
 }
 
 /// What is wrong, and with which key below the table.
-struct Wrong {
-    key: String,
-    reason: String,
+pub(super) struct Wrong {
+    pub(super) key: String,
+    pub(super) reason: String,
 }
 
 /// Whether the file may have a table of this name.
 pub(super) fn is_known(name: &str) -> bool {
-    matches!(name, "delivery" | "enrolment" | "robots" | "tls" | "transfers")
+    matches!(name, "delivery" | "enrolment" | "oidc" | "robots" | "tls" | "transfers")
 }
 
 impl Config {
@@ -55,6 +55,7 @@ impl Config {
             let setting = format!("{name}_{key}");
             let read = match (name, key.as_str()) {
                 ("delivery", "rules") => rules(value).map(|rules| self.delivery.own_rules = rules),
+                ("oidc", "rules") => oidc::rules(value).map(|rules| self.oidc.rules = rules),
                 ("transfers", "sites") => sites(value).map(|sites| self.transfers.sites = sites),
                 _ if Setting::by_key(&setting).is_none() => {
                     return Err(ConfigError::Unknown { hint: nearest(&setting), origin: origin(key) });

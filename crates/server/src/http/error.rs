@@ -142,9 +142,11 @@ impl From<ActionError> for ApiError {
             ActionError::Store(_) | ActionError::PasswordFailed => return Self::internal(&error),
             ActionError::Invalid { .. } | ActionError::InvalidIdempotencyKey => StatusCode::BAD_REQUEST,
             ActionError::TokenRefused | ActionError::SignInRefused => StatusCode::UNAUTHORIZED,
-            ActionError::TokenForOther { .. } | ActionError::OutOfScope { .. } | ActionError::NotPermitted(_) => {
-                StatusCode::FORBIDDEN
-            }
+            ActionError::TokenForOther { .. }
+            | ActionError::OutOfScope { .. }
+            | ActionError::NotPermitted(_)
+            | ActionError::NoRole { .. }
+            | ActionError::NoName => StatusCode::FORBIDDEN,
             ActionError::SignInBlocked { .. } | ActionError::TooManySignIns | ActionError::TooManyPending(_) => {
                 StatusCode::TOO_MANY_REQUESTS
             }
@@ -162,6 +164,7 @@ impl From<ActionError> for ApiError {
             | ActionError::NotPending(_)
             | ActionError::DeploymentCancelled(_)
             | ActionError::UserExists(_)
+            | ActionError::OfProvider(_)
             | ActionError::LastAdministrator(_)
             | ActionError::Diverged(_) => StatusCode::CONFLICT,
         };

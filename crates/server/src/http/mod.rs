@@ -17,6 +17,7 @@ pub mod listener;
 mod logs;
 mod mqtt;
 pub mod oci;
+mod oidc;
 mod outputs;
 mod packages;
 mod people;
@@ -53,6 +54,7 @@ use crate::changes::Changes;
 use crate::clock::Clock;
 use crate::conduct::Conduct;
 use crate::mqtt_access::MqttAccess;
+use crate::oidc::Provider;
 use crate::presence::Presence;
 use crate::report_writer::ReportWriter;
 use crate::requests::Requests;
@@ -97,6 +99,8 @@ pub struct AppParts {
     pub visits: Arc<visits::Visits>,
     /// How robots behave.
     pub conduct: Arc<Conduct>,
+    /// By whom people may sign in, if there is such a provider.
+    pub provider: Option<Arc<Provider>>,
     /// Failed authentications.
     pub attempts: Arc<attempts::FailedAttempts>,
     /// The event stream's source.
@@ -212,6 +216,8 @@ pub fn routes() -> Vec<Route> {
         Route::new(get.clone(), "/api/v1/session", Anyone, session::show),
         Route::new(post.clone(), "/api/v1/session", Anyone, session::sign_in),
         Route::new(delete.clone(), "/api/v1/session", Person(Read), session::sign_out),
+        Route::new(get.clone(), "/api/v1/oidc/sign-in", Anyone, oidc::begin),
+        Route::new(get.clone(), "/api/v1/oidc/callback", Anyone, oidc::finish),
         Route::new(post.clone(), "/api/v1/login", Anyone, people::log_in),
         Route::new(get.clone(), "/api/v1/me", Person(Read), people::me),
         Route::new(put.clone(), "/api/v1/password", Person(Read), people::change_password),
@@ -302,15 +308,12 @@ async fn method_not_allowed(request: Request) -> Response {
     ApiError::new(StatusCode::METHOD_NOT_ALLOWED, "method_not_allowed", message).into_response()
 }
 
-/// Headers for browsers: the page loads nothing from elsewhere, is never framed, and answers are never sniffed.
+/// What a browser may do with an answer that is not the page: nothing.
+const ANSWER_POLICY: &str = "default-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
+
+/// Headers for browsers: nothing is ever framed or sniffed, or shown to other pages.
 async fn harden(mut response: Response) -> Response {
-    const HEADERS: [(header::HeaderName, &str); 6] = [
-        (
-            header::CONTENT_SECURITY_POLICY,
-            "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; font-src 'self'; \
-             connect-src 'self'; worker-src 'self'; manifest-src 'self'; base-uri 'none'; form-action 'none'; \
-             frame-ancestors 'none'",
-        ),
+    const HEADERS: [(header::HeaderName, &str); 5] = [
         (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
         (header::X_FRAME_OPTIONS, "DENY"),
         (header::REFERRER_POLICY, "no-referrer"),
@@ -321,6 +324,7 @@ async fn harden(mut response: Response) -> Response {
     for (name, value) in HEADERS {
         headers.insert(name, HeaderValue::from_static(value));
     }
+    headers.entry(header::CONTENT_SECURITY_POLICY).or_insert(HeaderValue::from_static(ANSWER_POLICY));
     headers.entry(header::CACHE_CONTROL).or_insert(HeaderValue::from_static("no-store"));
     response
 }

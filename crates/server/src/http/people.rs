@@ -97,7 +97,7 @@ pub(super) async fn log_in(
     let signed_in = app.actions.sign_in(&order, TokenOrigin::Login, peer.ip().to_canonical()).await?;
     let id = signed_in.token.id().parse().map_err(|error| ApiError::internal(&error))?;
     let (token, expires_at_ms) = (signed_in.token.reveal(), signed_in.expires_at_ms);
-    Ok((StatusCode::CREATED, Json(AccessToken { id, token, user: order.user, expires_at_ms })))
+    Ok((StatusCode::CREATED, Json(AccessToken { id, token, user: signed_in.user, expires_at_ms })))
 }
 
 /// The query of `GET /tokens`.

@@ -14,16 +14,18 @@ use task_proto::token::Token;
 use task_proto::{Digest, UserName};
 use tokio_util::sync::{CancellationToken, DropGuard};
 
-use super::App;
 use super::auth::require_same_origin;
 use super::error::ApiError;
 use super::extract::JsonBody;
-use crate::actions::people::PAGE_LIFETIME_MS;
+use super::{App, oidc};
+use crate::actions::sign_in::PAGE_LIFETIME_MS;
 use crate::person::Person;
 use crate::store::TokenHolder;
 
 /// The cookie's name.
 const COOKIE: &str = "taskd_session";
+/// Scripts can't read it, and no other page makes the browser send it.
+const COOKIE_ATTRIBUTES: &str = "HttpOnly; SameSite=Strict; Path=/";
 /// How long a session lasts.
 const LIFETIME_MS: u64 = PAGE_LIFETIME_MS;
 /// Sessions at a time; one more ends the oldest.
@@ -76,12 +78,12 @@ impl Sessions {
 
     /// The session of a request's cookie, if it has one that lives.
     pub fn find(&self, headers: &HeaderMap, now_ms: u64) -> Option<Session> {
-        let key = Digest::of(cookie(headers)?.as_bytes());
+        let key = Digest::of(cookie(headers, COOKIE)?.as_bytes());
         self.lock().get(&key).map(|entry| &entry.session).filter(|session| session.expires_at_ms > now_ms).cloned()
     }
 
     fn end(&self, headers: &HeaderMap) {
-        if let Some(id) = cookie(headers) {
+        if let Some(id) = cookie(headers, COOKIE) {
             self.lock().remove(&Digest::of(id.as_bytes()));
         }
     }
@@ -91,17 +93,24 @@ impl Sessions {
     }
 }
 
-fn cookie(headers: &HeaderMap) -> Option<&str> {
+/// The value of a request's cookie.
+pub(super) fn cookie<'a>(headers: &'a HeaderMap, wanted: &str) -> Option<&'a str> {
     let lines = headers.get_all(header::COOKIE).iter().filter_map(|value| value.to_str().ok());
     let mut pairs = lines.flat_map(|line| line.split(';')).filter_map(|pair| pair.trim().split_once('='));
-    pairs.find(|(name, _)| *name == COOKIE).map(|(_, value)| value)
+    pairs.find(|(name, _)| *name == wanted).map(|(_, value)| value)
 }
 
-/// A page that came encrypted never sends it in plain text.
-fn set_cookie(app: &App, value: &str, max_age_s: u64) -> [(header::HeaderName, String); 1] {
-    let secure = if app.ca_pin.is_some() { "; Secure" } else { "" };
-    let attributes = "HttpOnly; SameSite=Strict; Path=/";
-    [(header::SET_COOKIE, format!("{COOKIE}={value}; {attributes}; Max-Age={max_age_s}{secure}"))]
+/// A cookie as it is set. Where browsers come by an encrypted way they are to send it on no other.
+pub(super) fn set_cookie(app: &App, name: &str, value: &str, attributes: &str, max_age_s: u64) -> String {
+    let is_behind_tls = app.provider.as_ref().is_some_and(|it| it.settings().public_url.starts_with("https:"));
+    let secure = if app.ca_pin.is_some() || is_behind_tls { "; Secure" } else { "" };
+    format!("{name}={value}; {attributes}; Max-Age={max_age_s}{secure}")
+}
+
+/// Begins a session and gives its cookie.
+pub(super) fn begin_session(app: &App, token: Token, user: UserName, now_ms: u64) -> String {
+    let id = app.sessions.begin(token, user, now_ms);
+    set_cookie(app, COOKIE, &id, COOKIE_ATTRIBUTES, LIFETIME_MS / 1000)
 }
 
 /// `POST /session`: signs in.
@@ -125,9 +134,9 @@ pub(super) async fn sign_in(
         }
         _ => return Err(ApiError::invalid("user: expected a user and a password, or else a token")),
     };
-    let id = app.sessions.begin(token, user, now_ms);
-    let view = SessionView { expires_at_ms: Some(now_ms + LIFETIME_MS) };
-    Ok((set_cookie(&app, &id, LIFETIME_MS / 1000), Json(view)).into_response())
+    let cookie = begin_session(&app, token, user, now_ms);
+    let view = SessionView { expires_at_ms: Some(now_ms + LIFETIME_MS), provider: None };
+    Ok(([(header::SET_COOKIE, cookie)], Json(view)).into_response())
 }
 
 async fn known_token(app: &App, text: &str, now_ms: u64) -> Result<(Token, UserName), ApiError> {
@@ -142,10 +151,10 @@ async fn known_token(app: &App, text: &str, now_ms: u64) -> Result<(Token, UserN
 pub(super) async fn show(State(app): State<App>, headers: HeaderMap) -> Result<Json<SessionView>, ApiError> {
     let now_ms = app.clock.now_ms();
     let Some(session) = app.sessions.find(&headers, now_ms) else {
-        return Ok(Json(SessionView { expires_at_ms: None }));
+        return Ok(Json(SessionView { expires_at_ms: None, provider: oidc::view(&app) }));
     };
     let is_good = app.store.token_holder(&session.token, now_ms).await?.is_some();
-    Ok(Json(SessionView { expires_at_ms: is_good.then_some(session.expires_at_ms) }))
+    Ok(Json(SessionView { expires_at_ms: is_good.then_some(session.expires_at_ms), provider: oidc::view(&app) }))
 }
 
 /// `DELETE /session`: signs out, the page or whoever signed in at the command line.
@@ -153,7 +162,8 @@ pub(super) async fn sign_out(State(app): State<App>, by: Person, headers: Header
     app.sessions.end(&headers);
     app.actions.sign_out(&by).await?;
     app.broker.disconnect_person(&by.name);
-    Ok((StatusCode::NO_CONTENT, set_cookie(&app, "", 0)).into_response())
+    let cookie = set_cookie(&app, COOKIE, "", COOKIE_ATTRIBUTES, 0);
+    Ok((StatusCode::NO_CONTENT, [(header::SET_COOKIE, cookie)]).into_response())
 }
 
 #[cfg(test)]

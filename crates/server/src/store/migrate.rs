@@ -19,6 +19,7 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[
     (9, "publishers", include_str!("../migrations/0009_publishers.sql")),
     (10, "robots", include_str!("../migrations/0010_robots.sql")),
     (11, "client_keys", include_str!("../migrations/0011_client_keys.sql")),
+    (12, "provider", include_str!("../migrations/0012_provider.sql")),
     (13, "approval", include_str!("../migrations/0013_approval.sql")),
 ];
 

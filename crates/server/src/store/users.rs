@@ -27,6 +27,8 @@ pub struct User {
     pub scope: Option<Selector>,
     /// What is kept of their password.
     pub password: Option<PasswordHash>,
+    /// Who they are at the provider by which they sign in, behind its issuer; `None`: they don't.
+    pub subject: Option<String>,
     /// When they were added.
     pub created_at_ms: u64,
 }
@@ -39,8 +41,8 @@ impl User {
 
     /// As others see them.
     pub fn view(self) -> UserView {
-        let Self { name, roles, scope, password, created_at_ms } = self;
-        UserView { name, roles, scope, has_password: password.is_some(), created_at_ms }
+        let Self { name, roles, scope, password, subject, created_at_ms } = self;
+        UserView { name, roles, scope, has_password: password.is_some(), subject, created_at_ms }
     }
 }
 
@@ -63,7 +65,7 @@ pub struct NewToken<'a> {
     pub expires_at_ms: u64,
 }
 
-const USERS: &str = "SELECT name, roles, scope, password, created_at_ms FROM users";
+const USERS: &str = "SELECT name, roles, scope, password, subject, created_at_ms FROM users";
 
 const TOKENS: &str = "SELECT id, user_name, origin, title, roles, scope, created_at_ms, expires_at_ms, revoked_at_ms
      FROM tokens WHERE kind = 'operator'";
@@ -105,6 +107,12 @@ impl Write {
         row.fetch_optional(self.connection()).await?.as_ref().map(user).transpose()
     }
 
+    /// The user who signs in by the provider as `subject`.
+    pub async fn user_by_subject(&mut self, subject: &str) -> Result<Option<User>, StoreError> {
+        let row = sqlx::query(sqlx::AssertSqlSafe(format!("{USERS} WHERE subject = $1"))).bind(subject);
+        row.fetch_optional(self.connection()).await?.as_ref().map(user).transpose()
+    }
+
     /// Everybody.
     pub async fn users(&mut self) -> Result<Vec<User>, StoreError> {
         sqlx::query(USERS).fetch_all(self.connection()).await?.iter().map(user).collect()
@@ -119,7 +127,7 @@ impl Write {
     /// Stores a user in the place of one of that name, if there is one.
     pub async fn put_user(&mut self, user: &User) -> Result<(), StoreError> {
         sqlx::query(
-            "INSERT INTO users (name, roles, scope, password, created_at_ms) VALUES ($1, $2, $3, $4, $5)
+            "INSERT INTO users (name, roles, scope, password, subject, created_at_ms) VALUES ($1, $2, $3, $4, $5, $6)
              ON CONFLICT (name) DO UPDATE
              SET roles = excluded.roles, scope = excluded.scope, password = excluded.password",
         )
@@ -127,6 +135,7 @@ impl Write {
         .bind(user.roles.to_string())
         .bind(user.scope.as_ref().map(Selector::to_string))
         .bind(user.password.as_ref().map(|password| password.as_str().to_owned()))
+        .bind(user.subject.as_deref())
         .bind(stored(user.created_at_ms))
         .execute(self.connection())
         .await?;
@@ -193,6 +202,7 @@ fn user(row: &AnyRow) -> Result<User, StoreError> {
         roles: id("users.roles", row.try_get("roles")?)?,
         scope: optional("users.scope", row.try_get("scope")?)?,
         password: password.map(PasswordHash::stored),
+        subject: row.try_get("subject")?,
         created_at_ms: number(row.try_get("created_at_ms")?),
     })
 }

@@ -167,7 +167,7 @@ async fn a_session_opens_what_its_token_opens_and_only_from_its_own_page() {
 
     let response = sign_in(&origin, server.operator.reveal()).send().await.expect("an answer");
     let cookie = response.headers()["set-cookie"].to_str().expect("text").to_owned();
-    assert!(cookie.contains("HttpOnly") && cookie.contains("SameSite=Strict"), "{cookie}");
+    assert!(cookie.contains("; HttpOnly; SameSite=Strict; Path=/;") && !cookie.contains("Secure"), "{cookie}");
     let cookie = cookie.split(';').next().expect("a pair").to_owned();
     let signed_in = |method, path: &str| server.bare(method, path).header("cookie", &cookie);
     let robots = signed_in(Method::GET, "/api/v1/robots").send().await.expect("an answer");
@@ -188,4 +188,14 @@ async fn a_session_opens_what_its_token_opens_and_only_from_its_own_page() {
     assert_eq!(refusal(signed_in(Method::GET, "/api/v1/robots")).await.0, 401);
     let heard = tokio::time::timeout(Duration::from_secs(9), events.text()).await.expect("the stream ends");
     assert!(heard.expect("a proper end").contains("hello"));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_cookie_of_an_encrypted_server_takes_no_other_way() {
+    let directory = tempfile::TempDir::new().expect("a directory");
+    let server = TestServer::start_in(directory, |config| config.tls.private_ca = Some(true)).await;
+    let sign_in = server.bare(Method::POST, "/api/v1/session").json(&json!({ "token": server.operator.reveal() }));
+    let response = sign_in.send().await.expect("an answer");
+    let cookie = response.headers()["set-cookie"].to_str().expect("text");
+    assert!(cookie.contains("; HttpOnly; SameSite=Strict; Path=/;") && cookie.ends_with("; Secure"), "{cookie}");
 }

@@ -2,7 +2,7 @@
 
 #![expect(clippy::disallowed_methods, reason = "making a test's database takes SQL")]
 
-use sqlx::Connection as _;
+use sqlx::{Connection as _, Row as _};
 use task_proto::{DeploymentId, RobotId};
 use taskd::store::{Store, sqlite_url};
 
@@ -69,6 +69,46 @@ impl TestDatabase {
         let forget = "UPDATE assignments SET mechanism = NULL, rule = NULL, because = NULL, inputs = NULL";
         sqlx::query(forget).execute(&mut connection).await.expect("forgets");
     }
+}
+
+/// Gives a table another name, so that it is not there for whoever looks for it.
+pub async fn rename(url: &str, table: &str, name: &str) {
+    let mut connection = sqlx::AnyConnection::connect(url).await.expect("connects");
+    let rename = sqlx::AssertSqlSafe(format!("ALTER TABLE {table} RENAME TO {name}"));
+    sqlx::query(rename).execute(&mut connection).await.expect("renames");
+}
+
+/// All there is in the tables that orders change, row by row.
+pub async fn contents(url: &str) -> Vec<String> {
+    const TABLES: [&str; 12] = [
+        "users",
+        "tokens",
+        "robots",
+        "deployments",
+        "assignments",
+        "orders",
+        "repository_blobs",
+        "manifests",
+        "manifest_parts",
+        "tags",
+        "packages",
+        "outputs",
+    ];
+    let mut connection = sqlx::AnyConnection::connect(url).await.expect("connects");
+    let mut lines = Vec::new();
+    for table in TABLES {
+        let select = sqlx::AssertSqlSafe(format!("SELECT * FROM {table}"));
+        for row in sqlx::query(select).fetch_all(&mut connection).await.expect("reads") {
+            let value = |at| match row.try_get::<Option<i64>, _>(at) {
+                Ok(number) => format!("{number:?}"),
+                Err(_) => format!("{:?}", row.try_get::<Option<String>, _>(at).expect("a number or a text")),
+            };
+            let values: Vec<String> = (0..row.len()).map(value).collect();
+            lines.push(format!("{table}: {}", values.join(" ")));
+        }
+    }
+    lines.sort();
+    lines
 }
 
 /// Runs each of the async functions, which take a [`TestDatabase`], as one test on each database.

@@ -4,6 +4,7 @@
 
 mod api;
 mod approval;
+mod audited;
 mod auth;
 mod browser;
 mod cli;
@@ -15,17 +16,20 @@ mod direct_push;
 mod enrolments;
 mod fleet;
 mod harness;
+mod headers;
 mod logs;
 mod mqtt;
 mod mqtt_harness;
 mod mqtt_hostile;
 mod mqtt_parts;
 mod oci;
+mod oidc;
 mod outputs;
 mod packages;
 mod page;
 mod people;
 mod permissions;
+mod provider;
 mod registry;
 mod scope;
 mod serve;

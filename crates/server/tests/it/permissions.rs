@@ -15,6 +15,7 @@ use task_proto::person::{Permission, Role, Roles};
 use task_proto::token::{Token, TokenKind};
 use task_proto::topic::RobotTopic;
 use task_proto::{Digest, UserName};
+use taskd::config::OidcSettings;
 use taskd::http::{Route, routes};
 use taskd::store::{NewToken, Store, User, sqlite_url};
 
@@ -83,9 +84,16 @@ struct Town {
 
 impl Town {
     async fn new() -> Self {
-        // The same robot does what it may not again and again.
+        // With a provider that does not answer: who may go there is what counts.
+        let issuer = "http://127.0.0.1:9".to_owned();
+        let oidc = OidcSettings { issuer, public_url: "http://127.0.0.1".to_owned(), ..OidcSettings::default() };
         let directory = tempfile::TempDir::new().expect("a directory");
-        let server = TestServer::start_in(directory, |config| config.robots.backoff = Duration::ZERO).await;
+        let configure = |config: &mut Config| {
+            config.oidc = oidc;
+            // The same robot does what it may not again and again.
+            config.robots.backoff = Duration::ZERO;
+        };
+        let server = TestServer::start_in(directory, configure).await;
         let store = Store::open(&sqlite_url(&server.data().join("taskd.sqlite"))).await.expect("opens");
         let (robot, other_robot) = (server.enroll("atlas").await, server.enroll("boreas").await);
         let (talker, package) = (server.push("talker", "1.0.0").await, server.push("walker", "1.0.0").await);
@@ -99,7 +107,14 @@ impl Town {
     async fn sign_in(&self, user: &str, role: Role, scope: Option<&str>) -> Token {
         let name: UserName = user.parse().expect("a name");
         let scope = scope.map(|scope| scope.parse().expect("a selector"));
-        let user = User { name: name.clone(), roles: Roles::one(role), scope, password: None, created_at_ms: NOW_MS };
+        let user = User {
+            name: name.clone(),
+            roles: Roles::one(role),
+            scope,
+            password: None,
+            subject: None,
+            created_at_ms: NOW_MS,
+        };
         let token = Token::random(TokenKind::Operator);
         let mut write = self.store.begin().await.expect("begins");
         write.put_user(&user).await.expect("stored");

@@ -7,14 +7,17 @@ use std::time::Duration;
 
 use nix::sys::signal::Signal;
 use reqwest::{Method, StatusCode};
+use serde_json::{Value, json};
 use task_proto::report::Phase;
+use task_proto::topic::RobotTopic;
 use taskd::clock::Clock;
 use taskd::config::Config;
 use taskd::serve::{ServeError, Server};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 
-use crate::harness::TestServer;
+use crate::harness::{TestServer, answer};
+use crate::mqtt_harness::{Connect, Raw, publish, topic};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn the_first_start_makes_what_is_needed_and_nobody_else_reads_it() {
@@ -167,18 +170,23 @@ async fn a_database_that_was_put_back_leaves_robots_alone_until_their_next_order
 struct Program {
     process: Child,
     http: String,
+    mqtt: String,
     token: String,
     _directory: tempfile::TempDir,
 }
 
 impl Program {
-    #[expect(clippy::disallowed_methods, reason = "the test starts the program it tests")]
     fn start() -> Self {
+        Self::start_logging_to(Stdio::null())
+    }
+
+    #[expect(clippy::disallowed_methods, reason = "the test starts the program it tests")]
+    fn start_logging_to(log: Stdio) -> Self {
         let directory = tempfile::TempDir::new().expect("a directory");
         let data = directory.path().join("data");
         let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_taskd"));
         command.args(["serve", "--http", "127.0.0.1:0", "--mqtt", "127.0.0.1:0", "--data"]).arg(&data);
-        command.env_clear().stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
+        command.env_clear().stdin(Stdio::null()).stdout(Stdio::piped()).stderr(log);
         let mut process = command.spawn().expect("it starts");
         // The first line comes when both listeners accept.
         let mut said = String::new();
@@ -188,7 +196,7 @@ impl Program {
         let addresses = std::fs::read(data.join("addresses.json")).expect("published");
         let addresses: taskd::data_directory::Addresses = serde_json::from_slice(&addresses).expect("json");
         let token = std::fs::read_to_string(data.join("operator.token")).expect("a token").trim().to_owned();
-        Self { process, http: addresses.http, token, _directory: directory }
+        Self { process, http: addresses.http, mqtt: addresses.mqtt, token, _directory: directory }
     }
 
     /// Begins an upload of ten bytes and sends five.
@@ -249,6 +257,36 @@ async fn a_second_signal_ends_it_at_once() {
     let asked = std::time::Instant::now();
     assert_eq!(program.exit_code().await, Some(1));
     assert!(asked.elapsed() < Duration::from_secs(3), "it waited {:?} for the upload", asked.elapsed());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn whatever_a_robot_says_is_one_line_of_the_log() {
+    let directory = tempfile::TempDir::new().expect("a directory");
+    let path = directory.path().join("log");
+    let program = Program::start_logging_to(std::fs::File::create(&path).expect("created").into());
+    let client = reqwest::Client::new();
+    let post = |path: &str, token: &str, body: &Value| {
+        answer::<Value>(client.post(format!("http://{}/api/v1/{path}", program.http)).bearer_auth(token).json(body))
+    };
+    let enrolment = post("enrollment-tokens", &program.token, &json!({})).await;
+    let enrolment = enrolment["token"].as_str().expect("a token");
+    let robot = post("enroll", enrolment, &json!({ "mac": "02:00:00:00:00:07", "name": "atlas" })).await;
+    let id: task_proto::RobotId = robot["robot_id"].as_str().expect("an id").parse().expect("an id");
+    let mut raw = Raw { stream: TcpStream::connect(&program.mqtt).await.expect("connects") };
+    let password = robot["token"].as_str().map(str::to_owned);
+    raw.send(&Connect { password, ..Connect::robot(&id) }.packet()).await;
+    raw.expect(&[0x20, 2, 0, 0]).await;
+    let level = "x\n2026-01-01T00:00:00Z ERROR forged\r\u{1b}[2J\u{9b}2J\u{202e}";
+    let batch = json!({ "robot_id": id, "lines": [{ "level": level }] }).to_string();
+    raw.send(&publish(&topic(&id, RobotTopic::Log), 1, 7, batch.as_bytes())).await;
+    raw.expect(&[0x40, 2, 0, 7]).await;
+    program.signal(Signal::SIGTERM);
+    assert_eq!(program.exit_code().await, Some(0));
+    let log = std::fs::read_to_string(&path).expect("text");
+    let line = log.lines().find(|line| line.contains("can't be read and is dropped")).expect("it is said");
+    assert!(line.contains("ERROR forged"), "{line:?}");
+    let bad = |c: char| (c.is_control() && c != '\n') || c == '\u{202e}';
+    assert!(!log.contains(bad), "{log:?}");
 }
 
 #[test]

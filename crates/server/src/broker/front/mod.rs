@@ -4,7 +4,7 @@
 //! lasting session are ignored.
 
 mod access;
-mod codec;
+pub mod codec;
 mod doorbell;
 mod entrance;
 mod laggard;

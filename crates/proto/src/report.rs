@@ -339,10 +339,13 @@ impl fmt::Display for Failure {
     }
 }
 
-/// A failure's stable code. Codes of newer versions pass through unchanged.
+/// A failure's stable code. Codes of newer versions pass through unchanged; of what is none, only what could be one is kept.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(transparent)]
+#[serde(from = "String")]
 pub struct FailureCode(Cow<'static, str>);
+
+/// The longest code that is read.
+const MAX_CODE_BYTES: usize = 64;
 
 /// Declares the failure codes this version gives.
 macro_rules! failure_codes {
@@ -425,6 +428,16 @@ impl FailureCode {
     }
 }
 
+impl From<String> for FailureCode {
+    fn from(text: String) -> Self {
+        let fits = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
+        if text.len() <= MAX_CODE_BYTES && text.chars().all(fits) {
+            return Self(Cow::Owned(text));
+        }
+        Self(Cow::Owned(text.chars().filter(|c| fits(*c)).take(MAX_CODE_BYTES).collect()))
+    }
+}
+
 /// A robot's connection state, published by the robot and, with `online` false, by its last will.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Status {
@@ -449,6 +462,16 @@ mod tests {
             assert_eq!(Phase::from_text(phase.as_str()), phase);
         }
         assert_eq!(serde_json::from_str::<Phase>("\"levitating\"").expect("tolerated"), Phase::Unknown);
+    }
+
+    #[test]
+    fn a_code_is_a_word_whatever_comes() {
+        let read = |text: &str| serde_json::from_value::<FailureCode>(text.into()).expect("tolerated");
+        assert_eq!(read("disk_full"), FailureCode::DISK_FULL);
+        assert_eq!(read("untrusted_package_2").as_str(), "untrusted_package_2");
+        assert_eq!(read("\u{1b}[31mDisk\nfull <b>").as_str(), "31miskfullb");
+        assert_eq!(read(&"x".repeat(1 << 20)).as_str().len(), MAX_CODE_BYTES);
+        assert_eq!(serde_json::to_value(read("disk_full")).expect("json"), "disk_full");
     }
 
     #[test]

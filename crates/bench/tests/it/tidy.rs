@@ -1,5 +1,5 @@
-//! Holds the countable rules of style: each file says what it is for, files and functions stay short.
-//! It reads formatted source as text and never judges anything that needs understanding.
+//! Holds the countable rules of style: each file says what it is for, files and functions stay short, and a test that the
+//! table of attacks names is there. It reads formatted source as text and never judges anything that needs understanding.
 
 use std::path::{Path, PathBuf};
 
@@ -74,6 +74,41 @@ fn files_and_functions_are_tidy() {
         })
         .collect();
     assert!(found.is_empty(), "\n{}", found.join("\n"));
+}
+
+/// The texts in backquotes in the column "shown by" of a page's tables.
+fn tests_named(page: &str) -> Vec<&str> {
+    let (mut column, mut named) = (None, Vec::new());
+    for line in page.lines() {
+        let cells: Vec<&str> = line.split('|').map(str::trim).collect();
+        match cells.iter().position(|cell| *cell == "shown by") {
+            Some(at) => column = Some(at),
+            None if !line.starts_with('|') => column = None,
+            None => {}
+        }
+        if let Some(cell) = column.and_then(|at| cells.get(at)) {
+            named.extend(cell.split('`').skip(1).step_by(2));
+        }
+    }
+    named
+}
+
+#[test]
+fn every_test_in_a_table_of_attacks_exists() {
+    let crates = Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("workspace");
+    let mut files = Vec::new();
+    rust_files(crates, &mut files);
+    let sources: Vec<String> = files.iter().map(|path| std::fs::read_to_string(path).expect("readable")).collect();
+    for (name, least) in [("people.md", 20), ("security.md", 40)] {
+        let page = std::fs::read_to_string(crates.join("../docs").join(name)).expect("readable page");
+        let named = tests_named(&page);
+        assert!(named.len() >= least, "found only {} tests in the tables of {name}", named.len());
+        let is_there = |test: &str| sources.iter().any(|source| source.contains(&format!("fn {test}(")));
+        let absent: Vec<_> = named.iter().filter(|test| !is_there(test)).collect();
+        assert!(absent.is_empty(), "docs/{name} names tests that are not there: {absent:?}");
+    }
+    let page = "| a | shown by |\n|---|---|\n| `no` | `x_y`, `z` |\n\n| b | c |\n| d | `no` |\n";
+    assert_eq!(tests_named(page), ["x_y", "z"]);
 }
 
 #[test]

@@ -29,6 +29,8 @@ pub use external::{CANARY_LEVEL, ExternalConfig};
 use external::{Crowd, External};
 pub use fan_out::{FanOut, FanOutError, FanOutSettings, MAX_PART_BYTES, Part, PartQos};
 use front::Front;
+/// What reads clients' bytes; public for those who try it with any.
+pub use front::codec;
 use router::Router;
 
 /// What a client shows at the door.

@@ -54,7 +54,7 @@ impl Output {
     ) -> Result<(), CommandError> {
         let text = match self.format {
             Format::Json => json(value)?,
-            Format::Table => describe(value),
+            Format::Table => shown(&describe(value)),
         };
         print(&text)
     }
@@ -120,9 +120,14 @@ pub(crate) fn printable(text: &str) -> String {
     text.chars().map(|c| if c.is_control() || turns(c) { ' ' } else { c }).collect()
 }
 
-/// Says `text` on stderr. Nobody may be listening, which is no reason to fail.
+/// The same for a text of several lines, which stay.
+fn shown(text: &str) -> String {
+    text.split('\n').map(printable).collect::<Vec<_>>().join("\n")
+}
+
+/// Says `text` on stderr: a server's or a robot's words may be in it. Nobody may be listening, which is no reason to fail.
 pub(crate) fn say(text: &str) {
-    let _ = writeln!(io::stderr().lock(), "{text}");
+    let _ = writeln!(io::stderr().lock(), "{}", shown(text));
 }
 
 /// Says what went wrong and why, the whole chain.
@@ -171,6 +176,7 @@ mod tests {
     #[test]
     fn what_a_terminal_would_obey_is_not_printed() {
         assert_eq!(printable("a\u{1b}[31m\u{9b}2Jb\u{202e}c\u{2066}d\n"), "a [31m 2Jb c d ");
+        assert_eq!(shown("a\u{1b}[31m\nb\r\n"), "a [31m\nb \n");
         let text = "\u{1b}]0;x\u{7}\u{9b}2J\u{7f} é";
         let line = json_line(&text).unwrap();
         assert_eq!(line, r#""\u001b]0;x\u0007\u009b2J\u007f é""#);

@@ -9,10 +9,10 @@ use tempfile::NamedTempFile;
 
 mod archive;
 mod pack;
-mod package_xml;
+pub mod package_xml;
 mod rules;
 mod source;
-mod task_toml;
+pub mod task_toml;
 mod text_file;
 mod tree;
 

@@ -4,26 +4,29 @@
 use roxmltree::{Document, Node};
 
 /// The file's name.
-pub(super) const FILE: &str = "package.xml";
+pub const FILE: &str = "package.xml";
 
 /// What the file says.
 #[derive(Debug, Default, PartialEq, Eq)]
-pub(super) struct PackageXml {
-    pub(super) name: String,
-    pub(super) version: String,
-    pub(super) build_type: BuildType,
+pub struct PackageXml {
+    /// `<name>`; empty if it is absent.
+    pub name: String,
+    /// `<version>`, likewise.
+    pub version: String,
+    /// What builds it.
+    pub build_type: BuildType,
     /// Names from exec_depend, depend and run_depend, sorted, each once. Without those that have a condition, which only
     /// a robot could judge.
-    pub(super) exec_depends: Vec<String>,
+    pub exec_depends: Vec<String>,
     /// Those that have one.
-    pub(super) conditional_depends: Vec<String>,
+    pub conditional_depends: Vec<String>,
     /// What catkin_pkg, and with it colcon and catkin, would refuse.
-    pub(super) invalid: Vec<String>,
+    pub invalid: Vec<String>,
 }
 
 /// What the file says about its build type.
 #[derive(Debug, Default, PartialEq, Eq)]
-pub(super) enum BuildType {
+pub enum BuildType {
     /// Nothing.
     #[default]
     Absent,
@@ -35,13 +38,13 @@ pub(super) enum BuildType {
 
 impl PackageXml {
     /// Whether it says that it needs `package` to run, under whatever condition.
-    pub(super) fn depends_on(&self, package: &str) -> bool {
+    pub fn depends_on(&self, package: &str) -> bool {
         self.exec_depends.iter().chain(&self.conditional_depends).any(|name| name == package)
     }
 }
 
 /// Reads `text`; the error says what is wrong and where.
-pub(super) fn parse(text: &str) -> Result<PackageXml, String> {
+pub fn parse(text: &str) -> Result<PackageXml, String> {
     let document = Document::parse(text).map_err(|error| error.to_string())?;
     let package = document.root_element();
     if !package.has_tag_name("package") {

@@ -10,24 +10,33 @@ use task_proto::{TaskName, Version};
 use super::Problem;
 
 /// The file's name.
-pub(super) const FILE: &str = "task.toml";
+pub const FILE: &str = "task.toml";
 
 /// What the file says; what it leaves out has its default or is `None`.
 #[derive(Debug, Default, PartialEq)]
-pub(super) struct TaskToml {
-    pub(super) name: Option<TaskName>,
-    pub(super) version: Option<Version>,
-    pub(super) build_tool: Option<BuildTool>,
-    pub(super) run: Run,
-    pub(super) ready: Ready,
-    pub(super) parameters: BTreeMap<String, BTreeMap<String, serde_json::Value>>,
-    pub(super) outputs: Outputs,
-    pub(super) requires: Requires,
-    pub(super) limits: Limits,
+pub struct TaskToml {
+    /// The package's name.
+    pub name: Option<TaskName>,
+    /// Its version.
+    pub version: Option<Version>,
+    /// `build.tool`.
+    pub build_tool: Option<BuildTool>,
+    /// `[run]`.
+    pub run: Run,
+    /// `[ready]`.
+    pub ready: Ready,
+    /// `[parameters]`, by node and name.
+    pub parameters: BTreeMap<String, BTreeMap<String, serde_json::Value>>,
+    /// `[outputs]`.
+    pub outputs: Outputs,
+    /// `[requires]`.
+    pub requires: Requires,
+    /// `[limits]`.
+    pub limits: Limits,
 }
 
 /// Reads `text`, adding what is wrong with it to `problems`.
-pub(super) fn parse(text: &str, problems: &mut Vec<Problem>) -> TaskToml {
+pub fn parse(text: &str, problems: &mut Vec<Problem>) -> TaskToml {
     let mut file = TaskToml::default();
     match text.parse::<toml::Table>() {
         Ok(table) => Section { path: String::new(), table, known: Vec::new(), problems }.read_file(&mut file),

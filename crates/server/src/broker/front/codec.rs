@@ -8,16 +8,36 @@ use rumqttd::protocol::{Packet, Protocol, QoS};
 
 /// A packet from a client, with everything checked that can be checked without knowing the session.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) enum Received {
+pub enum Received {
+    /// CONNECT.
     Connect(Connect),
+    /// PUBLISH.
     Publish(Publish),
+    /// PUBACK, of the packet with this id.
     PubAck(u16),
+    /// PUBREC, likewise.
     PubRec(u16),
+    /// PUBREL, likewise.
     PubRel(u16),
+    /// PUBCOMP, likewise.
     PubComp(u16),
-    Subscribe { packet_id: u16, filters: Vec<(String, QoS)> },
-    Unsubscribe { packet_id: u16, filters: Vec<String> },
+    /// SUBSCRIBE.
+    Subscribe {
+        /// What the SUBACK names.
+        packet_id: u16,
+        /// The filters and the QoS asked for, at least one.
+        filters: Vec<(String, QoS)>,
+    },
+    /// UNSUBSCRIBE.
+    Unsubscribe {
+        /// What the UNSUBACK names.
+        packet_id: u16,
+        /// The filters, at least one.
+        filters: Vec<String>,
+    },
+    /// PINGREQ.
     PingReq,
+    /// DISCONNECT.
     Disconnect,
 }
 
@@ -28,40 +48,57 @@ impl Received {
     }
 }
 
+/// What a client says first.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Connect {
-    pub(super) client_id: String,
-    pub(super) clean_session: bool,
-    pub(super) keep_alive_s: u16,
-    pub(super) will: Option<Will>,
-    pub(super) user_name: Option<String>,
-    pub(super) password: Option<String>,
+pub struct Connect {
+    /// Empty if the choice is left to us.
+    pub client_id: String,
+    /// Whether nothing is to be left of an earlier session.
+    pub clean_session: bool,
+    /// Seconds in which it promises to say something; 0: no promise.
+    pub keep_alive_s: u16,
+    /// What is to be said for it when it is gone.
+    pub will: Option<Will>,
+    /// Who it says it is.
+    pub user_name: Option<String>,
+    /// What is to prove it.
+    pub password: Option<String>,
 }
 
 /// The retain flag is read and dropped: nothing is retained here.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Will {
-    pub(super) topic: String,
-    pub(super) payload: Bytes,
-    pub(super) qos: QoS,
+pub struct Will {
+    /// Where.
+    pub topic: String,
+    /// What.
+    pub payload: Bytes,
+    /// How surely.
+    pub qos: QoS,
 }
 
 /// As with the will, no retain flag. The packet id is 0 for QoS 0.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Publish {
-    pub(super) topic: String,
-    pub(super) qos: QoS,
-    pub(super) packet_id: u16,
-    pub(super) payload: Bytes,
+pub struct Publish {
+    /// Where: a name without wildcards.
+    pub topic: String,
+    /// How surely.
+    pub qos: QoS,
+    /// What its acknowledgement names.
+    pub packet_id: u16,
+    /// What.
+    pub payload: Bytes,
 }
 
 /// Why bytes are not a packet. Only [`DecodeError::UnknownProtocol`] deserves an answer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub(super) enum DecodeError {
+pub enum DecodeError {
+    /// Another MQTT.
     #[error("asks for a protocol other than MQTT 3.1.1")]
     UnknownProtocol,
+    /// More bytes than a packet may have here.
     #[error("sends a packet of {0} bytes, which is too large")]
     TooLarge(usize),
+    /// No MQTT.
     #[error("sends a malformed packet: {0}")]
     Malformed(&'static str),
 }
@@ -70,7 +107,7 @@ use DecodeError::Malformed;
 
 /// Takes one packet off the front of `input`; `None` if more bytes are needed. What is wrong is said as early as the
 /// bytes show it, so that nobody has to wait for the rest of a packet that will be refused.
-pub(super) fn decode(input: &mut BytesMut, max_bytes: usize) -> Result<Option<Received>, DecodeError> {
+pub fn decode(input: &mut BytesMut, max_bytes: usize) -> Result<Option<Received>, DecodeError> {
     let Some(&first) = input.first() else { return Ok(None) };
     check_first_byte(first)?;
     let Some((length, header_bytes)) = remaining_length(&input[1..])? else { return Ok(None) };
@@ -95,7 +132,7 @@ pub(super) fn encode(packet: Packet, output: &mut BytesMut) {
 }
 
 /// Writes a PUBLISH, which rumqttd lets nobody else build with a QoS.
-pub(super) fn encode_publish(publish: &Publish, output: &mut BytesMut) {
+pub fn encode_publish(publish: &Publish, output: &mut BytesMut) {
     let Publish { topic, qos, packet_id, payload } = publish;
     if encode_publish_head(topic, *qos, *packet_id, payload.len(), output) {
         output.put_slice(payload);

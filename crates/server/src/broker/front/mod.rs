@@ -5,7 +5,7 @@
 
 mod access;
 mod attendance;
-mod codec;
+pub mod codec;
 mod doorbell;
 mod entrance;
 mod laggard;

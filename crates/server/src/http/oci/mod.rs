@@ -5,7 +5,7 @@ mod blobs;
 mod error;
 mod lists;
 mod manifests;
-mod parsed;
+pub mod parsed;
 mod signed;
 mod uploads;
 

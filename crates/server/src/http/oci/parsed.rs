@@ -18,25 +18,25 @@ const MAX_PARTS: usize = 4096;
 
 /// A manifest of any kind, as far as it is understood.
 #[derive(Debug)]
-pub(super) struct Parsed {
+pub struct Parsed {
     /// The content type it is served with.
-    pub(super) media_type: String,
+    pub media_type: String,
     /// What a list of referrers says it is.
-    pub(super) artifact_type: Option<String>,
+    pub artifact_type: Option<String>,
     /// What a list of referrers says of it.
-    pub(super) annotations: BTreeMap<String, String>,
+    pub annotations: BTreeMap<String, String>,
     /// The manifest it refers to.
-    pub(super) subject: Option<String>,
+    pub subject: Option<String>,
     /// The blobs and manifests that must be in the repository.
-    pub(super) parts: Vec<Digest>,
+    pub parts: Vec<Digest>,
     /// The manifest in full, if it is meant to be a task package.
-    pub(super) package: Option<ImageManifest>,
+    pub package: Option<ImageManifest>,
     /// The same, if it is meant to be the output of a run.
-    pub(super) output: Option<ImageManifest>,
+    pub output: Option<ImageManifest>,
     /// The same, if it is meant to be what publishers have signed about a package.
-    pub(super) signature: Option<ImageManifest>,
+    pub signature: Option<ImageManifest>,
     /// The same, if it is meant to be a list of publishers.
-    pub(super) publishers: Option<ImageManifest>,
+    pub publishers: Option<ImageManifest>,
 }
 
 #[derive(Deserialize)]
@@ -69,7 +69,7 @@ impl Part {
 
 impl Parsed {
     /// Reads a manifest that came with `content_type`.
-    pub(super) fn new(content_type: Option<&str>, bytes: &[u8]) -> Result<Self, OciError> {
+    pub fn new(content_type: Option<&str>, bytes: &[u8]) -> Result<Self, OciError> {
         let invalid = |error: serde_json::Error| OciError::manifest_invalid(format!("not a manifest: {error}"));
         let document: Document = serde_json::from_slice(bytes).map_err(invalid)?;
         let media_type = media_type(content_type, document.media_type.as_deref())?;

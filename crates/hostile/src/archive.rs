@@ -1,0 +1,117 @@
+//! A package's content as a robot unpacks it.
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt as _;
+use std::path::{Component, Path};
+
+use task_agent::unpack::{Limits, Refusal, UnpackError, unpack};
+use task_proto::Digest;
+use task_proto::manifest::ContentFacts;
+
+const BLOCK_BYTES: usize = 512;
+/// Where a header has its checksum, and where its magic.
+const CHECKSUM: std::ops::Range<usize> = 148..156;
+const MAGIC: std::ops::Range<usize> = 257..262;
+
+/// An archive, compressed or not: whatever becomes of it, nothing is changed outside of its directory, and nothing in there
+/// leads out, has a mode of its own, or is larger than announced. One that is not compressed gets the checksums that its
+/// headers need, and compressed.
+pub fn archive(bytes: &[u8]) {
+    let plain = zstd::decode_all(bytes).ok().filter(|_| bytes.len() < 64 * 1024);
+    let (content, tar_size) = match plain {
+        Some(plain) => (bytes.to_vec(), plain.len()),
+        None => (zstd::encode_all(&*with_checksums(bytes), 1).expect("compressed"), bytes.len()),
+    };
+    // How many entries there are is found out by announcing too few.
+    let mut entries = 0;
+    while let Some(found) = unpacked(&content, tar_size as u64, entries) {
+        entries = entries.max(found);
+    }
+}
+
+/// The same with a right checksum in every block that says that it is a header.
+fn with_checksums(bytes: &[u8]) -> Vec<u8> {
+    let mut tar = bytes.to_vec();
+    for block in tar.chunks_exact_mut(BLOCK_BYTES).filter(|block| &block[MAGIC] == b"ustar") {
+        block[CHECKSUM].fill(b' ');
+        let sum: u32 = block.iter().map(|&byte| u32::from(byte)).sum();
+        block[CHECKSUM].copy_from_slice(format!("{sum:06o}\0 ").as_bytes());
+    }
+    tar
+}
+
+/// Unpacks and looks around; the number of entries found, if more were than announced.
+fn unpacked(content: &[u8], tar_size: u64, entries: u64) -> Option<u64> {
+    let outer = tempfile::tempdir().expect("a directory");
+    let (staging, neighbour) = (outer.path().join("staging"), outer.path().join("neighbour"));
+    fs::write(&neighbour, "untouched").expect("written");
+    let facts = ContentFacts { tar_digest: Digest::of(b""), tar_size, entries };
+    let limits = Limits { bytes: 1 << 20, entries: 200, depth: 8, ratio: 200 };
+    let result = unpack(content, content.len() as u64, &facts, &limits, &staging);
+    let mut around: Vec<_> =
+        fs::read_dir(outer.path()).expect("listed").map(|entry| entry.expect("an entry").file_name()).collect();
+    around.sort();
+    assert!(
+        around.iter().all(|name| name == "neighbour" || name == "staging"),
+        "something was made beside: {around:?}"
+    );
+    assert_eq!(fs::read_to_string(&neighbour).expect("still there"), "untouched");
+    if staging.exists() {
+        let size = look(&staging, &staging.canonicalize().expect("a directory"), 0);
+        assert!(size <= tar_size, "{size} bytes of an archive of {tar_size}");
+    }
+    match result {
+        Err(UnpackError::Refused(refusal)) => {
+            assert!(!refusal.to_string().contains(char::is_control), "{refusal:?}");
+            match refusal {
+                Refusal::NotAsAnnounced { what: "entries in the archive", found, announced } if found > announced => {
+                    Some(found)
+                }
+                _ => None,
+            }
+        }
+        Err(UnpackError::Disk { path, source }) => panic!("{} should not have been tried: {source}", path.display()),
+        Err(UnpackError::Source(error)) => panic!("the source does not fail: {error}"),
+        Ok(()) => None,
+    }
+}
+
+/// Looks at everything below `directory`; the size of all files, those with several names counted once.
+fn look(directory: &Path, staging: &Path, depth: usize) -> u64 {
+    assert!(depth <= 8, "{} is too deep", directory.display());
+    let mut size = 0;
+    for entry in fs::read_dir(directory).expect("listed") {
+        let path = entry.expect("an entry").path();
+        let metadata = fs::symlink_metadata(&path).expect("metadata");
+        let mode = metadata.permissions().mode() & 0o7777;
+        if metadata.is_symlink() {
+            follow(&path, staging);
+        } else if metadata.is_dir() {
+            assert_eq!(mode, 0o755, "{}", path.display());
+            size += look(&path, staging, depth + 1);
+        } else {
+            assert!(metadata.is_file() && matches!(mode, 0o644 | 0o755), "{} {mode:o}", path.display());
+            size += metadata.len() / std::os::unix::fs::MetadataExt::nlink(&metadata);
+        }
+    }
+    size
+}
+
+/// Follows a link step by step, over what is not there as well: something may be made there later.
+fn follow(link: &Path, staging: &Path) {
+    let mut at = link.parent().expect("a directory").canonicalize().expect("a directory");
+    for part in fs::read_link(link).expect("a target").components() {
+        match part {
+            Component::CurDir => {}
+            Component::ParentDir => drop(at.pop()),
+            Component::Normal(name) => at.push(name),
+            Component::RootDir | Component::Prefix(_) => panic!("{} is absolute", link.display()),
+        }
+        if at.is_symlink() {
+            // One that leads nowhere, or in a circle, is followed for itself.
+            let Ok(end) = at.canonicalize() else { return };
+            at = end;
+        }
+        assert!(at.starts_with(staging), "{} leads to {}", link.display(), at.display());
+    }
+}

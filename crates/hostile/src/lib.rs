@@ -1,0 +1,53 @@
+//! What foreign bytes must not do: one function for every parser of them. Each takes any bytes and panics if the parser
+//! panics, or if what it accepted breaks a promise: what was read is written and read back the same, an archive leaves its
+//! directory alone. The fuzzer in `fuzz/` calls them without end, the tests here with the kept corpora and changes of them.
+
+mod archive;
+mod mqtt;
+mod mutation;
+mod names;
+mod package;
+mod registry;
+mod said;
+mod signed;
+mod websocket;
+
+pub use archive::archive;
+pub use mqtt::{mqtt_packets, mqtt_session};
+pub use mutation::Mutation;
+pub use names::{names, selector, token};
+pub use package::{manifest, package_xml, task_toml};
+pub use registry::oci_manifest;
+pub use said::{part, reply, report};
+pub use signed::{desired, envelope};
+pub use websocket::websocket;
+
+/// One parser and what is asked of it.
+pub struct Target {
+    /// The name of its program in `fuzz/` and of its directory in `fuzz/corpus`.
+    pub name: &'static str,
+    /// Reads any bytes; panics if that does harm.
+    pub run: fn(&[u8]),
+    /// How many changed inputs the tests try: so many that it takes about two seconds.
+    pub tries: u32,
+}
+
+/// All of them.
+pub const TARGETS: [Target; 16] = [
+    Target { name: "archive", run: archive, tries: 1_000 },
+    Target { name: "desired", run: desired, tries: 1_000 },
+    Target { name: "envelope", run: envelope, tries: 3_000 },
+    Target { name: "manifest", run: manifest, tries: 4_000 },
+    Target { name: "mqtt_packets", run: mqtt_packets, tries: 20_000 },
+    Target { name: "mqtt_session", run: mqtt_session, tries: 400 },
+    Target { name: "names", run: names, tries: 20_000 },
+    Target { name: "oci_manifest", run: oci_manifest, tries: 5_000 },
+    Target { name: "package_xml", run: package_xml, tries: 3_000 },
+    Target { name: "part", run: part, tries: 20_000 },
+    Target { name: "reply", run: reply, tries: 3_000 },
+    Target { name: "report", run: report, tries: 2_000 },
+    Target { name: "selector", run: selector, tries: 20_000 },
+    Target { name: "task_toml", run: task_toml, tries: 1_000 },
+    Target { name: "token", run: token, tries: 20_000 },
+    Target { name: "websocket", run: websocket, tries: 10_000 },
+];

@@ -1,0 +1,150 @@
+//! What clients of the MQTT front send.
+
+use std::io::{ErrorKind, Read as _, Write as _};
+use std::net::{Shutdown, SocketAddr, TcpStream};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::time::Duration;
+
+use bytes::BytesMut;
+use futures_util::FutureExt as _;
+use futures_util::future::BoxFuture;
+use task_proto::RobotId;
+use task_proto::topic::TopicPrefix;
+use taskd::broker::codec::{DecodeError, Received, decode, encode_publish};
+use taskd::broker::{
+    Broker, BrokerConfig, Gatekeeper, Inbox, Limits, Login, NotStored, Principal, Refusal, RobotMessage,
+};
+use tokio::runtime::Runtime;
+
+/// The largest packet that is tried.
+const MAX_PACKET_BYTES: usize = 2048;
+/// More than anything here takes, unless it hangs.
+const PATIENCE: Duration = Duration::from_secs(20);
+/// Who is let in.
+const ROBOT: &str = "r00000000000000a1";
+/// CONNECT as that robot.
+const CONNECT: &[u8] =
+    b"\x10\x32\x00\x04MQTT\x04\xc2\x00\x3c\x00\x11r00000000000000a1\x00\x11r00000000000000a1\x00\x00";
+
+/// Packets from a client: it does not matter in which pieces they come, and what is published has a topic that can be
+/// published to and is read again as it was.
+pub fn mqtt_packets(bytes: &[u8]) {
+    let whole = read(bytes, bytes.len());
+    for piece_bytes in [1, 7] {
+        assert_eq!(read(bytes, piece_bytes), whole, "it depends on the pieces");
+    }
+    for packet in whole.0 {
+        if let Received::Publish(publish) = packet {
+            assert!(!publish.topic.is_empty() && !publish.topic.contains(['+', '#', '\0']), "{:?}", publish.topic);
+            let mut written = BytesMut::new();
+            encode_publish(&publish, &mut written);
+            assert_eq!(decode(&mut written, MAX_PACKET_BYTES), Ok(Some(Received::Publish(publish))));
+            assert!(written.is_empty());
+        }
+    }
+}
+
+/// All packets in `bytes` that come in pieces of this length, and what is wrong with the next one.
+fn read(bytes: &[u8], piece_bytes: usize) -> (Vec<Received>, Option<DecodeError>) {
+    let (mut packets, mut input) = (Vec::new(), BytesMut::new());
+    for piece in bytes.chunks(piece_bytes.max(1)) {
+        input.extend_from_slice(piece);
+        loop {
+            match decode(&mut input, MAX_PACKET_BYTES) {
+                Ok(None) => break,
+                Ok(Some(packet)) => packets.push(packet),
+                Err(error) => return (packets, Some(error)),
+            }
+        }
+    }
+    (packets, None)
+}
+
+/// A connection, from its first byte or, if that is odd, from behind a good CONNECT: it ends when the client has said all;
+/// one that is not let in is told so in one packet or not at all; the inbox hears of this robot only, and the next client
+/// is served.
+pub fn mqtt_session(bytes: &[u8]) {
+    let Some((&first, said)) = bytes.split_first() else { return };
+    let front = Front::running();
+    // Takeover would mix up those of several threads.
+    let _turn = front.turn.lock().unwrap_or_else(PoisonError::into_inner);
+    let heard = front.talk(&[if first % 2 == 0 { &[] } else { CONNECT }, said].concat());
+    match heard.get(..4) {
+        None => assert!(heard.is_empty(), "half an answer: {}", heard.escape_ascii()),
+        Some([0x20, 2, 0, 0]) => {}
+        Some([0x20, 2, 0, 1..=5]) => assert_eq!(heard.len(), 4, "more after a refusal: {}", heard.escape_ascii()),
+        Some(_) => panic!("no CONNACK: {}", heard.escape_ascii()),
+    }
+    if first % 2 == 1 {
+        assert_eq!(&heard[..4], [0x20, 2, 0, 0], "a good CONNECT was refused");
+    }
+    assert_eq!(front.talk(&[CONNECT, b"\xe0\x00"].concat()), [0x20, 2, 0, 0], "the next client is not served");
+}
+
+/// A broker that serves until the process ends.
+struct Front {
+    address: SocketAddr,
+    turn: Mutex<()>,
+    _broker: (Runtime, Broker),
+}
+
+impl Front {
+    fn running() -> &'static Self {
+        static FRONT: OnceLock<Front> = OnceLock::new();
+        FRONT.get_or_init(|| {
+            let runtime = Runtime::new().expect("a runtime");
+            let limits = Limits { max_packet_bytes: MAX_PACKET_BYTES, ..Limits::default() };
+            let listen = ([127, 0, 0, 1], 0).into();
+            let config = BrokerConfig { listen, tls: None, prefix: TopicPrefix::default(), limits };
+            let broker =
+                runtime.block_on(Broker::start(config, Arc::new(Door), Arc::new(Letterbox))).expect("a broker");
+            let address = broker.local_addr().expect("an address");
+            Self { address, turn: Mutex::default(), _broker: (runtime, broker) }
+        })
+    }
+
+    /// Says `bytes` and nothing more; what was answered by the time the connection ended.
+    fn talk(&self, bytes: &[u8]) -> Vec<u8> {
+        let mut stream = TcpStream::connect(self.address).expect("connected");
+        stream.set_read_timeout(Some(PATIENCE)).expect("set");
+        let mut heard = Vec::new();
+        // It may have hung up already, and rightly so.
+        let said = stream.write_all(bytes).and_then(|()| stream.shutdown(Shutdown::Write));
+        match stream.read_to_end(&mut heard) {
+            Ok(_) => {}
+            Err(error) if matches!(error.kind(), ErrorKind::ConnectionReset | ErrorKind::BrokenPipe) => {}
+            Err(error) => panic!("the connection does not end: {error} (said: {said:?})"),
+        }
+        heard
+    }
+}
+
+struct Door;
+
+impl Gatekeeper for Door {
+    fn admit(&self, login: Login) -> BoxFuture<'_, Result<Principal, Refusal>> {
+        let robot = ROBOT.parse().expect("valid");
+        let known = login.user_name.as_deref() == Some(ROBOT);
+        let answer = if known { Ok(Principal::Robot { robot, token_number: 0 }) } else { Err(Refusal::BadCredentials) };
+        async { answer }.boxed()
+    }
+}
+
+struct Letterbox;
+
+impl Inbox for Letterbox {
+    fn receive(&self, message: RobotMessage) -> BoxFuture<'_, Result<(), NotStored>> {
+        assert!(message.robot.as_str() == ROBOT && message.topic.is_from_robot(), "{message:?}");
+        async { Ok(()) }.boxed()
+    }
+
+    fn connected(&self, robot: &RobotId, _peer: Option<SocketAddr>, _connection: u64) {
+        assert_eq!(robot.as_str(), ROBOT);
+    }
+
+    fn disconnected(&self, robot: &RobotId, _connection: u64) {
+        assert_eq!(robot.as_str(), ROBOT);
+    }
+
+    fn everyone_may_be_there(&self) {}
+}

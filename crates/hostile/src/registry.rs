@@ -1,0 +1,25 @@
+//! Manifests as anyone may push them.
+
+use std::collections::BTreeSet;
+
+use task_proto::oci::{MANIFEST_TYPE, PACKAGE_TYPE};
+use taskd::http::oci::parsed::Parsed;
+
+/// An OCI manifest: its parts are known each once, its texts fit a header, and one that calls itself a package is that
+/// package when it is written again.
+pub fn oci_manifest(bytes: &[u8]) {
+    for content_type in [None, Some(MANIFEST_TYPE)] {
+        let Ok(parsed) = Parsed::new(content_type, bytes) else { continue };
+        assert_eq!(parsed.parts.iter().collect::<BTreeSet<_>>().len(), parsed.parts.len());
+        let texts = [Some(&parsed.media_type), parsed.artifact_type.as_ref(), parsed.subject.as_ref()];
+        assert!(texts.into_iter().flatten().all(|text| !text.contains(char::is_control)));
+        let Some(package) = parsed.package else { continue };
+        assert_eq!(parsed.artifact_type.as_deref(), Some(PACKAGE_TYPE));
+        let written = serde_json::to_vec(&package).expect("what was read can be written");
+        let again = Parsed::new(content_type, &written).expect("what was written can be read");
+        assert_eq!((again.package.as_ref(), &again.parts), (Some(&package), &parsed.parts));
+        if let Some((config, content)) = package.package_blobs() {
+            assert!(parsed.parts.contains(&config.digest) && parsed.parts.contains(&content.digest));
+        }
+    }
+}

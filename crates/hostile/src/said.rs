@@ -1,0 +1,56 @@
+//! What robots say over MQTT and HTTP, and the parts of a package that are said to them.
+
+use std::fmt::Debug;
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use task_proto::log::LogBatch;
+use task_proto::part::{Cut, MAX_PARTS, Part};
+use task_proto::report::{Phase, Report, Status};
+use task_proto::request::{Reply, Request};
+use taskd::deployment::Standing;
+
+/// A report, a status or a batch of log lines. An assignment goes on from a report as one that has an end.
+pub fn report(bytes: &[u8]) {
+    same_again::<Status>(bytes);
+    same_again::<LogBatch>(bytes);
+    let Some(report) = same_again::<Report>(bytes) else { return };
+    for task in &report.tasks {
+        for phase in Phase::ALL {
+            let standing = Standing { run: task.run, phase, progress: None, failure: None, attempts: 0 };
+            let Some(next) = standing.after(task) else { continue };
+            assert!(!phase.is_final(), "{phase:?} was left");
+            let text = next.failure.map(|failure| failure.to_string()).unwrap_or_default();
+            assert!(!text.contains(|c: char| c.is_control() && c != '\n'), "{text:?} has a control character");
+        }
+    }
+}
+
+/// A question to a robot, or its answer.
+pub fn reply(bytes: &[u8]) {
+    same_again::<Request>(bytes);
+    same_again::<Reply>(bytes);
+}
+
+/// A part of a package, after eight bytes that are the package's size: what is accepted lies inside of the package.
+pub fn part(bytes: &[u8]) {
+    let Some((size, message)) = bytes.split_first_chunk::<8>() else { return };
+    let size = u64::from_be_bytes(*size);
+    let Ok(part) = Part::decode(message, size) else { return };
+    let cut = Cut::new(size, part.part_bytes).expect("a cut that was accepted");
+    let range = cut.range(part.index);
+    assert!(part.index < part.count && part.count == cut.count() && part.count <= MAX_PARTS);
+    assert!(range.end <= size && range.end - range.start == part.bytes.len() as u64);
+    // All but the reserved byte.
+    let again = part.encode();
+    assert_eq!((again[0], &again[2..]), (message[0], &message[2..]));
+}
+
+/// The `T` that `bytes` are, if any; written and read again it is the same.
+pub(crate) fn same_again<T: DeserializeOwned + Serialize + PartialEq + Debug>(bytes: &[u8]) -> Option<T> {
+    let read: T = serde_json::from_slice(bytes).ok()?;
+    let written = serde_json::to_vec(&read).expect("what was read can be written");
+    let again: T = serde_json::from_slice(&written).expect("what was written can be read");
+    assert_eq!(again, read);
+    Some(read)
+}

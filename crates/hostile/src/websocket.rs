@@ -1,0 +1,53 @@
+//! The frames that carry MQTT over HTTP, as either end takes them apart.
+
+use bytes::BytesMut;
+use task_transport::websocket::frame::{Decoder, Opcode, Piece, Role, Violation, encode};
+
+/// Frames: it does not matter in which pieces they come, and what they carry arrives again when it is sent on.
+pub fn websocket(bytes: &[u8]) {
+    for role in [Role::Server, Role::Client] {
+        let whole = read(role, bytes, bytes.len());
+        for piece_bytes in [1, 7] {
+            assert_eq!(read(role, bytes, piece_bytes), whole, "it depends on the pieces");
+        }
+        let data: Vec<u8> = whole.0.iter().filter_map(Came::data).flatten().copied().collect();
+        let mut sent = BytesMut::new();
+        encode(Opcode::Binary, &data, (role == Role::Server).then_some([1, 2, 3, 4]), &mut sent);
+        let again = if data.is_empty() { vec![] } else { vec![Came::Data(data)] };
+        assert_eq!(read(role, &sent, sent.len()), (again, None));
+    }
+}
+
+/// What came, with data in one piece that came in several.
+#[derive(Debug, PartialEq)]
+enum Came {
+    Data(Vec<u8>),
+    Other(Piece),
+}
+
+impl Came {
+    fn data(&self) -> Option<&Vec<u8>> {
+        match self {
+            Self::Data(data) => Some(data),
+            Self::Other(_) => None,
+        }
+    }
+}
+
+fn read(role: Role, bytes: &[u8], piece_bytes: usize) -> (Vec<Came>, Option<Violation>) {
+    let (mut all, mut decoder, mut input) = (Vec::new(), Decoder::new(role), BytesMut::new());
+    for piece in bytes.chunks(piece_bytes.max(1)) {
+        input.extend_from_slice(piece);
+        loop {
+            match (decoder.decode(&mut input), all.last_mut()) {
+                (Ok(None), _) => break,
+                (Ok(Some(Piece::Data(data))), _) if data.is_empty() => {}
+                (Ok(Some(Piece::Data(data))), Some(Came::Data(before))) => before.extend_from_slice(&data),
+                (Ok(Some(Piece::Data(data))), _) => all.push(Came::Data(data.to_vec())),
+                (Ok(Some(other)), _) => all.push(Came::Other(other)),
+                (Err(violation), _) => return (all, Some(violation)),
+            }
+        }
+    }
+    (all, None)
+}

@@ -1,0 +1,108 @@
+//! Each target over its inputs, and that no target is without its test, its program or its inputs.
+
+use std::fs;
+
+use task_hostile::TARGETS;
+
+use crate::corpus::{directory, kept, run};
+
+#[test]
+fn no_archive_does_harm() {
+    run("archive");
+}
+
+#[test]
+fn no_desired_state_does_harm() {
+    run("desired");
+}
+
+#[test]
+fn no_envelope_does_harm() {
+    run("envelope");
+}
+
+#[test]
+fn no_task_manifest_does_harm() {
+    run("manifest");
+}
+
+#[test]
+fn no_mqtt_packet_does_harm() {
+    run("mqtt_packets");
+}
+
+#[test]
+fn no_mqtt_session_does_harm() {
+    run("mqtt_session");
+}
+
+#[test]
+fn no_name_does_harm() {
+    run("names");
+}
+
+#[test]
+fn no_oci_manifest_does_harm() {
+    run("oci_manifest");
+}
+
+#[test]
+fn no_package_xml_does_harm() {
+    run("package_xml");
+}
+
+#[test]
+fn no_part_does_harm() {
+    run("part");
+}
+
+#[test]
+fn no_question_or_reply_does_harm() {
+    run("reply");
+}
+
+#[test]
+fn no_report_does_harm() {
+    run("report");
+}
+
+#[test]
+fn no_selector_does_harm() {
+    run("selector");
+}
+
+#[test]
+fn no_task_toml_does_harm() {
+    run("task_toml");
+}
+
+#[test]
+fn no_token_does_harm() {
+    run("token");
+}
+
+#[test]
+fn no_websocket_frame_does_harm() {
+    run("websocket");
+}
+
+#[test]
+fn every_target_is_run_here_and_by_the_fuzzer() {
+    let fuzz = directory().join("..");
+    let listed = fs::read_to_string(fuzz.join("Cargo.toml")).expect("fuzz/Cargo.toml");
+    for name in TARGETS.map(|target| target.name) {
+        assert!(include_str!("targets.rs").contains(&format!("    run(\"{name}\");")), "no test for {name}");
+        assert!(
+            listed.contains(&format!("name = \"{name}\"\npath = \"fuzz_targets/{name}.rs\"")),
+            "{name} is not listed"
+        );
+        let program = fs::read_to_string(fuzz.join(format!("fuzz_targets/{name}.rs"))).expect("its program");
+        assert!(program.contains(&format!("task_hostile::{name}(bytes)")), "{name} runs something else");
+    }
+}
+
+#[test]
+fn what_is_kept_stays_small() {
+    let size: usize = TARGETS.iter().flat_map(|target| kept(target.name)).map(|(_, bytes)| bytes.len()).sum();
+    assert!(size <= 300 * 1024, "fuzz/corpus has {size} bytes: minimise it");
+}

@@ -14,12 +14,22 @@ use taskd::broker::codec::{DecodeError, Received, decode, encode_publish};
 use taskd::broker::{
     Broker, BrokerConfig, Gatekeeper, Inbox, Limits, Login, NotStored, Principal, Refusal, RobotMessage,
 };
+use taskd::conduct::{Conduct, ConductLimits};
 use tokio::runtime::Runtime;
 
 /// The largest packet that is tried.
 const MAX_PACKET_BYTES: usize = 2048;
 /// More than anything here takes, unless it hangs.
 const PATIENCE: Duration = Duration::from_secs(20);
+/// The same robot does what it may not again and again.
+const INDULGENT: ConductLimits = ConductLimits {
+    messages_per_s: 1_000_000,
+    bytes_per_s: 1 << 40,
+    requests_per_s: 1_000_000,
+    patience: Duration::MAX,
+    backoff: Duration::ZERO,
+    forgive_after: Duration::ZERO,
+};
 /// Who is let in.
 const ROBOT: &str = "r00000000000000a1";
 /// CONNECT as that robot.
@@ -95,7 +105,8 @@ impl Front {
             let runtime = Runtime::new().expect("a runtime");
             let limits = Limits { max_packet_bytes: MAX_PACKET_BYTES, ..Limits::default() };
             let listen = ([127, 0, 0, 1], 0).into();
-            let config = BrokerConfig { listen, tls: None, prefix: TopicPrefix::default(), limits };
+            let conduct = Conduct::new(INDULGENT);
+            let config = BrokerConfig { listen, tls: None, prefix: TopicPrefix::default(), limits, conduct };
             let broker =
                 runtime.block_on(Broker::start(config, Arc::new(Door), Arc::new(Letterbox))).expect("a broker");
             let address = broker.local_addr().expect("an address");

@@ -201,7 +201,11 @@ pub(super) fn not_permitted(person: &Person, permission: Permission) -> ApiError
 async fn identify_on_line(app: &App, showing: &Showing<'_>) -> Result<(Caller, TokenNumber), ApiError> {
     let arrival = app.visits.arrival();
     let identified = identify(app, showing).await?;
-    let ((Caller::Robot(robot), _), Some(line)) = (&identified, showing.line) else { return Ok(identified) };
+    let Some(line) = showing.line else { return Ok(identified) };
+    let (Caller::Robot(robot), _) = &identified else {
+        line.leave();
+        return Ok(identified);
+    };
     if arrival.enter(robot, line) { Ok(identified) } else { identify(app, showing).await }
 }
 

@@ -152,8 +152,8 @@ impl Site {
         let Guest { peer, silent, proof, crowded } = guest;
         let (leave, spoken) = (silent.leave().clone(), CancellationToken::new());
         let (line, router, traffic) = (Line::default(), self.router.clone(), self.traffic.clone());
-        let connection = connection(stream, peer, proof, silent, spoken.clone(), line.clone(), router, traffic);
-        let mut connection = pin!(connection);
+        let origin = Origin { peer, proof, line: line.clone() };
+        let mut connection = pin!(connection(stream, origin, silent, spoken.clone(), router, traffic));
         let ended = async {
             tokio::select! {
                 _ = connection.as_mut() => return,
@@ -232,13 +232,26 @@ fn is_the_clients_fault(error: &io::Error) -> bool {
     matches!(error.kind(), ConnectionAborted | ConnectionRefused | ConnectionReset)
 }
 
-fn connection<S>(
-    stream: S,
+/// What is known of every request of a connection.
+struct Origin {
     peer: SocketAddr,
     proof: ClientProof,
+    line: Line,
+}
+
+impl Origin {
+    fn mark<B>(&self, request: &mut Request<B>) {
+        request.extensions_mut().insert(ConnectInfo(self.peer));
+        request.extensions_mut().insert(self.proof.clone());
+        request.extensions_mut().insert(self.line.clone());
+    }
+}
+
+fn connection<S>(
+    stream: S,
+    origin: Origin,
     silent: Place,
     spoken: CancellationToken,
-    line: Line,
     router: Router,
     traffic: Arc<HttpTotals>,
 ) -> http1::UpgradeableConnection<
@@ -254,9 +267,7 @@ where
         drop(silent.lock().unwrap_or_else(PoisonError::into_inner).take());
         traffic.request();
         let mut request = request.map(|body| Body::new(PatientBody::new(body)));
-        request.extensions_mut().insert(ConnectInfo(peer));
-        request.extensions_mut().insert(proof.clone());
-        request.extensions_mut().insert(line.clone());
+        origin.mark(&mut request);
         router.clone().oneshot(request)
     });
     http1::Builder::new()

@@ -78,6 +78,11 @@ impl Arrival<'_> {
 }
 
 impl Line {
+    /// Somebody else comes by it now, as behind a proxy.
+    pub fn leave(&self) {
+        *self.visit.lock().unwrap_or_else(PoisonError::into_inner) = None;
+    }
+
     /// Resolves when the connection has to end.
     pub async fn cut(&self) {
         self.cut.cancelled().await;
@@ -110,9 +115,11 @@ mod tests {
         }
         visits.end(&one);
         assert!(line.cut.is_cancelled() && second.cut.is_cancelled() && !stranger.cut.is_cancelled());
-        // A connection that another robot's requests come by, behind a proxy, is that one's.
+        // A connection that another robot's requests come by, behind a proxy, is that one's; or nobody's.
         visits.begin(&one, &stranger);
         visits.end(&other);
+        stranger.leave();
+        visits.end(&one);
         assert!(!stranger.cut.is_cancelled());
         drop((line, second, stranger));
         assert!(visits.robots().is_empty());

@@ -6,6 +6,7 @@ use task_proto::RobotId;
 use task_proto::api::{AuditPage, CreateEnrollmentToken, EnrollResponse, EnrollmentToken, PendingRobotList, RobotView};
 use task_proto::token::Token;
 use taskd::store::TokenHolder;
+use taskd::tls::ClientProof;
 use tempfile::TempDir;
 
 use crate::database::{TestDatabase, on_both_databases};
@@ -24,7 +25,11 @@ async fn a_robot_waits_until_it_is_approved_or_turned_away_or_a_week_has_passed(
     let fleet = Fleet::new(database);
     let store = fleet.database.store.clone();
     let holder = async |token: &Token| {
-        store.admit(token, fleet.clock.now_ms()).await.expect("reads").map(|admitted| admitted.holder)
+        store
+            .admit(token, &ClientProof::NotAsked, fleet.clock.now_ms())
+            .await
+            .expect("reads")
+            .map(|admitted| admitted.holder)
     };
     let order = CreateEnrollmentToken { approval: true, ttl_s: Some(30 * 24 * 3600), ..Default::default() };
     let token = fleet.enrolment_token(order).await;

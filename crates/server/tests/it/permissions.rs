@@ -15,7 +15,7 @@ use task_proto::person::{Permission, Role, Roles};
 use task_proto::token::{Token, TokenKind};
 use task_proto::topic::RobotTopic;
 use task_proto::{Digest, UserName};
-use taskd::config::OidcSettings;
+use taskd::config::{Config, OidcSettings};
 use taskd::http::{Route, routes};
 use taskd::store::{NewToken, Store, User, sqlite_url};
 

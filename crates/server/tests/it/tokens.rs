@@ -239,7 +239,7 @@ async fn a_revoked_robots_tokens_end_and_its_late_reports_come_too_late(database
     let order = || CreateEnrollmentToken { robot: Some("atlas".to_owned()), ..Default::default() };
     let token = fleet.enrolment_token(CreateEnrollmentToken::default()).await;
     let came = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("enrols");
-    let admitted = store.admit(&came.token, 1_000_000).await.expect("reads").expect("valid");
+    let admitted = store.admit(&came.token, &ClientProof::NotAsked, 1_000_000).await.expect("reads").expect("valid");
     let TokenHolder::Robot { token_number, .. } = admitted.holder else { panic!("{admitted:?}") };
     let next = fleet.actions.next_robot_token(&came.robot_id).await.expect("a token");
     let before = fleet.enrolment_token(order()).await;
@@ -254,7 +254,7 @@ async fn a_revoked_robots_tokens_end_and_its_late_reports_come_too_late(database
     assert!(fleet.desired(&robot).await.is_err(), "nothing is signed for it");
     fleet.actions.expire().await.expect("forgets what has ended, but for these");
     for token in [&came.token, &next] {
-        assert_eq!(store.admit(token, 1_000_000).await.expect("reads"), None);
+        assert_eq!(store.admit(token, &ClientProof::NotAsked, 1_000_000).await.expect("reads"), None);
         assert!(store.is_of_revoked_robot(token).await.expect("reads"));
     }
     assert!(!store.is_of_revoked_robot(&Token::random(TokenKind::Robot)).await.expect("reads"));
@@ -267,7 +267,7 @@ async fn a_revoked_robots_tokens_end_and_its_late_reports_come_too_late(database
     let back = fleet.try_enroll(&after, mac(1), None).await.expect("enrols");
     assert_eq!(back.robot_id, came.robot_id);
     for token in [&came.token, &next] {
-        assert_eq!(store.admit(token, 1_000_000).await.expect("reads"), None);
+        assert_eq!(store.admit(token, &ClientProof::NotAsked, 1_000_000).await.expect("reads"), None);
         assert!(!store.is_of_revoked_robot(token).await.expect("reads"));
     }
     assert_eq!(robot_of(&store, &back.token).await, Some(came.robot_id));

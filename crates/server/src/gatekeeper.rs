@@ -38,7 +38,7 @@ impl StoreGatekeeper {
                 Ok(Principal::Operator(person.name))
             }
             Some(TokenHolder::Person(_)) => Err(Refusal::NotAuthorised),
-            Some(TokenHolder::Enrolment | TokenHolder::Pending(_)) => Err(Refusal::NotAuthorised),
+            Some(TokenHolder::Enrolment | TokenHolder::Pending { .. }) => Err(Refusal::NotAuthorised),
             None if self.store.is_of_revoked_robot(&token).await.map_err(unchecked)? => Err(Refusal::NotAuthorised),
             None => Err(Refusal::BadCredentials),
         }

@@ -232,7 +232,7 @@ async fn identify(app: &App, showing: &Showing<'_>) -> Result<(Caller, TokenNumb
     Ok(match holder {
         TokenHolder::Person(person) => (Caller::Person(person), TokenNumber(0)),
         TokenHolder::Enrolment => (Caller::Enrolment(Box::new(token)), TokenNumber(0)),
-        TokenHolder::Pending(_) => return Err(ApiError::awaits_approval()),
+        TokenHolder::Pending { .. } => return Err(ApiError::awaits_approval()),
         TokenHolder::Robot { robot, token_number, .. } => {
             if is_first_use {
                 // Whoever is connected came in by the token that has just ended.

@@ -35,14 +35,19 @@ pub enum TokenHolder {
         key: Option<PublicKey>,
     },
     /// A robot that waits to be approved, which may nothing yet.
-    Pending(RobotId),
+    Pending {
+        /// Which.
+        robot: RobotId,
+        /// The key that it registered when it was given the token.
+        key: Option<PublicKey>,
+    },
 }
 
 impl TokenHolder {
     fn is_proven_by(&self, proof: &ClientProof) -> bool {
         match self {
-            Self::Robot { key, .. } => proof.suffices(key.as_ref()),
-            Self::Person(_) | Self::Enrolment | Self::Pending(_) => true,
+            Self::Robot { key, .. } | Self::Pending { key, .. } => proof.suffices(key.as_ref()),
+            Self::Person(_) | Self::Enrolment => true,
         }
     }
 }
@@ -313,7 +318,9 @@ impl TokenRow {
         match token.kind() {
             TokenKind::Operator => self.person(token).map(TokenHolder::Person),
             TokenKind::Enrolment => Some(TokenHolder::Enrolment),
-            TokenKind::Robot if self.is_pending => self.robot.map(TokenHolder::Pending),
+            TokenKind::Robot if self.is_pending => {
+                self.robot.map(|robot| TokenHolder::Pending { robot, key: self.key })
+            }
             TokenKind::Robot => {
                 self.robot.map(|robot| TokenHolder::Robot { robot, token_number: self.number, key: self.key })
             }

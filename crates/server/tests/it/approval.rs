@@ -38,7 +38,7 @@ async fn a_robot_waits_until_it_is_approved_or_turned_away_or_a_week_has_passed(
     let one = fleet.try_enroll(&token, mac(1), Some("one")).await.map(|again| (one, again)).expect("mended");
     assert!(one.0.awaits_approval && one.1.awaits_approval);
     let one = one.1;
-    assert_eq!(holder(&one.token).await, Some(TokenHolder::Pending(one.robot_id.clone())));
+    assert_eq!(holder(&one.token).await, Some(TokenHolder::Pending { robot: one.robot_id.clone(), key: None }));
     let two = fleet.try_enroll(&token, mac(2), Some("two")).await.expect("enrols");
     assert_eq!(store.matching_robots(&"*".parse().expect("valid")).await.expect("reads"), []);
     assert_eq!(store.broker_credentials().await.expect("reads"), []);

@@ -10,9 +10,9 @@ use taskd::tls::ClientProof;
 use tempfile::TempDir;
 
 use crate::database::{TestDatabase, on_both_databases};
+use crate::enrolments::connack;
 use crate::fleet::{Fleet, mac};
 use crate::harness::{TestRobot, TestServer, answer, refusal};
-use crate::mqtt_harness::{Connect, Raw};
 use crate::story::code;
 
 on_both_databases! {
@@ -99,18 +99,7 @@ async fn a_robot_that_waits_has_nothing_until_it_is_approved() {
         let refused = server.bare(Method::GET, &path).bearer_auth(&came.token).send().await.expect("an answer");
         assert_eq!(refused.status(), 403, "{path}");
     }
-    let connect = Connect {
-        client_id: came.robot_id.to_string(),
-        user_name: Some(came.robot_id.to_string()),
-        password: Some(came.token.clone()),
-        clean: true,
-        keep_alive_s: 0,
-        will: None,
-    };
-    let stream = tokio::net::TcpStream::connect(&server.server.addresses().mqtt).await.expect("listens");
-    let mut raw = Raw { stream };
-    raw.send(&connect.packet()).await;
-    raw.expect(&[0x20, 2, 0, 5]).await;
+    assert_eq!(connack(&server, came.robot_id.as_str(), &came.token).await, 5);
     // An order does not mean it, by whatever selector.
     for selector in ["*", "robot-1", came.robot_id.as_str()] {
         let body = json!({ "package": "talker", "manifest": package.manifest.digest, "selector": selector });

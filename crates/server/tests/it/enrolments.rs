@@ -65,7 +65,7 @@ async fn enrolment_tokens_are_listed_and_revoked_at_once() {
 }
 
 /// The answer to a CONNECT by the robot's token: a CONNACK's code.
-async fn connack(server: &TestServer, robot: &str, token: &str) -> u8 {
+pub async fn connack(server: &TestServer, robot: &str, token: &str) -> u8 {
     let connect = Connect {
         client_id: robot.to_owned(),
         user_name: Some(robot.to_owned()),
@@ -77,7 +77,9 @@ async fn connack(server: &TestServer, robot: &str, token: &str) -> u8 {
     let stream = tokio::net::TcpStream::connect(&server.server.addresses().mqtt).await.expect("listens");
     let mut raw = Raw { stream };
     raw.send(&connect.packet()).await;
-    raw.read(4).await.expect("a CONNACK")[3]
+    let answer = raw.read(4).await.expect("a CONNACK");
+    assert_eq!(answer[..3], [0x20, 2, 0]);
+    answer[3]
 }
 
 #[tokio::test(flavor = "multi_thread")]

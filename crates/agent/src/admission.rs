@@ -127,6 +127,7 @@ mod tests {
             expires_at_ms: NOW_MS + 1,
             tasks: vec![task("a"), task("b")],
             evidence: Default::default(),
+            settings: Default::default(),
         }
     }
 

@@ -11,11 +11,11 @@ use task_proto::topic::RobotTopic;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 
-use crate::clock;
 use crate::graph_answers::GraphAnswers;
 use crate::link::Message;
 use crate::logs::Logs;
 use crate::logs::archive::Wanted;
+use crate::{clock, vitals};
 
 /// Questions answered at the same time; a lifecycle transition may take seconds and should not hold up a list.
 const AT_A_TIME: usize = 8;
@@ -28,6 +28,8 @@ pub struct Answers {
     pub logs: Logs,
     /// Its ROS graph.
     pub graph: GraphAnswers,
+    /// How its machine does.
+    pub vitals: vitals::Asked,
 }
 
 /// A refusal with `code` and `text`.
@@ -93,6 +95,7 @@ impl Answers {
             Ask::Parameter { node, name } => self.graph.parameter(&node, &name).await,
             Ask::SetParameter { node, parameter } => self.graph.set_parameter(&node, &parameter).await,
             Ask::Lifecycle { node, transition } => self.graph.lifecycle(&node, transition).await,
+            Ask::Vitals => Ok(Answer::Vitals(self.vitals.now().await)),
             Ask::Unknown => Err(refusal("unsupported", "this agent does not know the question; it may be too old")),
         }
     }

@@ -231,6 +231,26 @@ impl Cgroup {
     }
 }
 
+/// What control groups could do here.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Outlook {
+    /// End runs for certain, and keep them from starving their neighbours.
+    Isolates,
+    /// Only the former.
+    Counts,
+    /// Nothing: there are none.
+    Nothing,
+}
+
+/// What an agent with the rights to use them would find. Nothing is tried out, so nothing changes.
+pub fn outlook() -> Outlook {
+    let table = fs::read_to_string("/proc/self/mountinfo").unwrap_or_default();
+    let Some(mount) = Mount::find(&table) else { return Outlook::Nothing };
+    let controllers = fs::read_to_string(mount.point.join("cgroup.controllers")).unwrap_or_default();
+    let has = |name| controllers.split_whitespace().any(|controller| controller == name);
+    if has("memory") && has("pids") { Outlook::Isolates } else { Outlook::Counts }
+}
+
 /// Where the hierarchy is mounted and which part of it.
 struct Mount {
     point: PathBuf,

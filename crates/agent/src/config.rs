@@ -6,12 +6,14 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use serde::{Deserialize, Serialize};
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize};
 use task_proto::RobotName;
 use task_proto::envelope::PublicKey;
 use task_proto::id::Labels;
 use task_proto::log::LogLevel;
 use task_proto::publisher::{InvalidRole, Role};
+use task_proto::settings::{MAX_ROS_DOMAIN_ID, RobotLimits};
 use toml::{Table, Value};
 
 use crate::durable;
@@ -25,8 +27,6 @@ pub const MAX_GATE_TIMEOUT_S: u64 = 300;
 const VARIABLE_PREFIX: &str = "TASK_AGENT_";
 /// The variable by which ROS 2 itself knows its domain; `ros_domain_id` wins.
 const ROS_DOMAIN_ID: &str = "ROS_DOMAIN_ID";
-/// ROS 2's last domain whose ports exist everywhere.
-const MAX_ROS_DOMAIN_ID: u32 = 232;
 /// Variables that are no settings: the data directory, the log filter, the enrolment token.
 const OTHER_VARIABLES: [&str; 3] = ["TASK_AGENT_DATA", "TASK_AGENT_LOG", "TASK_AGENT_ENROLL_TOKEN"];
 
@@ -49,6 +49,12 @@ pub struct Settings {
     /// Setup files that are sourced before a task is built or run. Absent: what is in `/opt/ros`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub underlays: Option<Vec<PathBuf>>,
+    /// The robot's own ROS workspace, whose setup file in `install` or `devel` is sourced after them.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub workspace: Option<PathBuf>,
+    /// Whether the server may name setup files also where `trusted_publishers` are named.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub server_underlays: Option<bool>,
     /// `ROS_DOMAIN_ID` of every task. Absent: the agent's own, if it has one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ros_domain_id: Option<u32>,
@@ -61,6 +67,9 @@ pub struct Settings {
     /// Seconds after which the robot asks for a new token.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub token_lifetime_s: Option<u64>,
+    /// Seconds after which the robot says again how its machine does; 0: it does not say.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub vitals_interval_s: Option<u64>,
     /// Whom an agent that is root builds and runs tasks as, by name or number; absent: `taskd-task`. `root` must be said.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub task_user: Option<String>,
@@ -68,8 +77,8 @@ pub struct Settings {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub labels: Option<Labels>,
     /// What tasks may use.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub limits: Option<LimitSettings>,
+    #[serde(default, deserialize_with = "known_limits", skip_serializing_if = "Option::is_none")]
+    pub limits: Option<RobotLimits>,
     /// Who is asked before a task is started, stopped or switched.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gate: Option<GateSettings>,
@@ -153,40 +162,19 @@ pub struct LogSettings {
     pub forward_lines_per_s: Option<u32>,
 }
 
-/// The `[limits]` table.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct LimitSettings {
-    /// Bytes a package may have when it is unpacked.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub archive_bytes: Option<u64>,
-    /// Files, directories and links a package may have.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub archive_entries: Option<u64>,
-    /// Bytes that stay free on the disk.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub disk_reserve_bytes: Option<u64>,
-    /// Bytes of a task's log file before it is rotated.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub log_bytes: Option<u64>,
-    /// Bytes of files that a run may bring back.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub output_bytes: Option<u64>,
-    /// Memory that a build may have; each of its processes, where there are no control groups.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub build_memory_bytes: Option<u64>,
-    /// Seconds a build may take.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub build_timeout_s: Option<u64>,
-    /// Versions that are prepared at the same time.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub parallel_tasks: Option<usize>,
-    /// Memory of a task whose package says nothing of it, in MiB; absent: all there is.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub task_memory_mb: Option<u64>,
-    /// Processes and threads of such a task, and of a build.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub task_pids: Option<u64>,
+/// The `[limits]` table. A robot passes over what a newer server may limit; in its own file an unknown key is a slip.
+fn known_limits<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<RobotLimits>, D::Error> {
+    let table = Table::deserialize(deserializer)?;
+    let known = RobotLimits::default().bounds().map(|(key, ..)| key.trim_start_matches("limits."));
+    if let Some(key) = table.keys().find(|key| !known.contains(&key.as_str())) {
+        return Err(D::Error::custom(format_args!("unknown field `{key}`, expected one of {}", known.join(", "))));
+    }
+    table.try_into().map(Some).map_err(D::Error::custom)
+}
+
+/// A setting that counts something; as many as there can be, where there are fewer.
+pub(crate) fn count(number: u64) -> usize {
+    usize::try_from(number).unwrap_or(usize::MAX)
 }
 
 /// The gate's settings that hold.
@@ -224,6 +212,10 @@ pub struct Config {
     pub labels: Option<Labels>,
     /// Setup files to source; empty: what is found.
     pub underlays: Vec<PathBuf>,
+    /// The robot's own ROS workspace on top of them.
+    pub workspace: Option<PathBuf>,
+    /// Whether the server may name setup files although publishers are trusted.
+    pub server_underlays: bool,
     /// `ROS_DOMAIN_ID` of every task, if the settings or the agent's environment say.
     pub ros_domain_id: Option<u32>,
     /// Between two polls while MQTT works.
@@ -232,12 +224,16 @@ pub struct Config {
     pub poll_interval_without_mqtt: Duration,
     /// The age at which the robot asks for a new token.
     pub token_lifetime: Duration,
+    /// Between two times that the robot says how its machine does; zero: never.
+    pub vitals_interval: Duration,
     /// Whom tasks run as, if the settings say.
     pub task_user: Option<String>,
     /// What tasks may use.
-    pub limits: LimitSettings,
+    pub limits: RobotLimits,
     /// Which log lines go to the server by themselves.
     pub forward: ForwardSettings,
+    /// The level among that, if it was not the default.
+    pub own_forward_level: Option<LogLevel>,
     /// Processes and threads of a task whose package says nothing of them, and of a build.
     pub task_pids: u64,
     /// Versions that are prepared at the same time.
@@ -327,31 +323,38 @@ impl Config {
             name: settings.name,
             labels: settings.labels,
             underlays: settings.underlays.unwrap_or_default(),
+            workspace: settings.workspace,
+            server_underlays: settings.server_underlays.unwrap_or(false),
             ros_domain_id: settings.ros_domain_id,
             poll_interval: Duration::from_secs(settings.poll_interval_s.unwrap_or(300)),
             poll_interval_without_mqtt: Duration::from_secs(settings.poll_interval_without_mqtt_s.unwrap_or(10)),
             token_lifetime: Duration::from_secs(settings.token_lifetime_s.unwrap_or(30 * 86_400)),
-            parallel_tasks: limits.parallel_tasks.unwrap_or(2),
+            vitals_interval: Duration::from_secs(settings.vitals_interval_s.unwrap_or(60)),
+            parallel_tasks: limits.parallel_tasks.map_or(2, count),
             task_user: settings.task_user,
             task_pids: limits.task_pids.unwrap_or(4096),
             limits,
             gate: settings.gate.map(gate).transpose()?,
             trust: settings.trusted_publishers.map(trust).transpose()?,
             forward,
+            own_forward_level: logs.forward_level,
         };
         let bounds = [
             ("ros_domain_id", u64::from(config.ros_domain_id.unwrap_or(0)), 0, u64::from(MAX_ROS_DOMAIN_ID)),
             ("poll_interval_s", config.poll_interval.as_secs(), 1, 86_400),
             ("poll_interval_without_mqtt_s", config.poll_interval_without_mqtt.as_secs(), 1, 86_400),
             ("token_lifetime_s", config.token_lifetime.as_secs(), 3600, 3650 * 86_400),
-            ("limits.parallel_tasks", config.parallel_tasks as u64, 1, 64),
+            ("vitals_interval_s", config.vitals_interval.as_secs(), 0, 86_400),
             ("gate.timeout_s", config.gate.as_ref().map_or(1, |gate| gate.timeout.as_secs()), 1, MAX_GATE_TIMEOUT_S),
             ("logs.forward_lines_per_s", u64::from(config.forward.lines_per_s), 0, 1000),
-            ("limits.task_memory_mb", config.limits.task_memory_mb.unwrap_or(1), 1, 1 << 24),
-            ("limits.task_pids", config.task_pids, 1, 1 << 22),
-            ("limits.build_timeout_s", config.limits.build_timeout_s.unwrap_or(60), 1, 86_400),
         ];
-        for (key, value, least, most) in bounds {
+        if config.workspace.as_deref().is_some_and(|workspace| !workspace.is_absolute()) {
+            let reason = "needs an absolute path".to_owned();
+            return Err(ConfigError::Invalid { origin: "workspace".to_owned(), reason });
+        }
+        let limits = config.limits.bounds().into_iter();
+        let limits = limits.filter_map(|(key, value, least, most)| Some((key, value?, least, most)));
+        for (key, value, least, most) in bounds.into_iter().chain(limits) {
             if value < least || value > most {
                 let reason = format!("{value} is not between {least} and {most}");
                 return Err(ConfigError::Invalid { origin: key.to_owned(), reason });
@@ -413,7 +416,7 @@ pub fn parse_server(text: &str) -> Result<reqwest::Url, ConfigError> {
 fn override_by(table: &mut Table, name: &str, text: &str) -> Result<(), ConfigError> {
     let key = name[VARIABLE_PREFIX.len()..].to_ascii_lowercase();
     let value = match key.as_str() {
-        "server" | "name" | "task_user" | "mqtt_transport" => Value::String(text.to_owned()),
+        "server" | "name" | "task_user" | "mqtt_transport" | "workspace" => Value::String(text.to_owned()),
         "gate_command" => Value::Array(vec![Value::String(text.to_owned())]),
         "trusted_publishers_keys" | "trusted_publishers_keeper_keys" => {
             let keys = text.split(',').map(str::trim).filter(|key| !key.is_empty());
@@ -488,19 +491,19 @@ mod tests {
 
     #[test]
     fn environment_beats_file_beats_defaults() {
-        let file = "mqtt = true\nros_domain_id = 3\n[limits]\nlog_bytes = 5\nbuild_timeout_s = 9\n";
+        let file = "mqtt = true\nros_domain_id = 3\n[limits]\nlog_bytes = 5000\nbuild_timeout_s = 9\n";
         let variables = [
             ("TASK_AGENT_MQTT", "false"),
             ("TASK_AGENT_UNDERLAYS", "/opt/ros/jazzy/setup.bash:/ws/install/setup.bash"),
             ("TASK_AGENT_LABELS", "site=lab,base=turtlebot"),
-            ("TASK_AGENT_LIMITS_LOG_BYTES", "7"),
+            ("TASK_AGENT_LIMITS_LOG_BYTES", "7000"),
             ("TASK_AGENT_LOGS_FORWARD_LEVEL", "error"),
             ("TASK_AGENT_DATA", "/elsewhere"),
             ("PATH", "/bin"),
         ];
         let config = load(file, &variables).expect("valid");
         assert_eq!((config.mqtt, config.ros_domain_id), (false, Some(3)));
-        assert_eq!((config.limits.log_bytes, config.limits.build_timeout_s), (Some(7), Some(9)));
+        assert_eq!((config.limits.log_bytes, config.limits.build_timeout_s), (Some(7000), Some(9)));
         assert_eq!(config.forward, ForwardSettings { level: LogLevel::Error, lines_per_s: 10 });
         assert_eq!(config.underlays.len(), 2);
         assert_eq!(config.labels.expect("given").len(), 2);
@@ -527,6 +530,8 @@ mod tests {
         assert!(text("ros_domain_id = 400\n", &[]).contains("ros_domain_id"));
         assert!(text("", &[("ROS_DOMAIN_ID", "233")]).contains("ROS_DOMAIN_ID: \"233\""));
         assert!(text("poll_interval_s = 0\n", &[]).contains("poll_interval_s"));
+        assert!(text("[limits]\nlog_bytes = 1\n", &[]).starts_with("limits.log_bytes: 1 is not between 4096 and "));
+        assert!(text("", &[("TASK_AGENT_LIMITS_PARALLEL_TASKS", "65")]).starts_with("limits.parallel_tasks: 65"));
         assert!(text("[logs]\nforward_level = \"loud\"\n", &[]).contains("forward_level"));
         assert!(text("", &[("TASK_AGENT_LOGS_FORWARD_LINES_PER_S", "100000")]).contains("logs.forward_lines_per_s"));
     }

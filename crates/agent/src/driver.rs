@@ -60,8 +60,6 @@ pub struct Speaker {
     pub name: Option<RobotName>,
     /// The labels it gives itself.
     pub labels: Option<Labels>,
-    /// How many versions are prepared at the same time.
-    pub parallel_tasks: usize,
 }
 
 /// What the driver has seen of one task; lost at a restart.
@@ -425,7 +423,7 @@ impl<E: Effects> Driver<E> {
     fn has_room(&self, begin: &[(TaskName, Step)]) -> bool {
         let under_way = self.under_way.keys().filter(|(_, lane)| *lane == Lane::Prepare).count();
         let planned = begin.iter().filter(|(_, step)| step.lane() == Lane::Prepare).count();
-        under_way + planned < self.speaker.parallel_tasks
+        under_way + planned < self.effects.parallel_tasks()
     }
 
     /// Takes a changed record; what was seen under another order or process is forgotten.

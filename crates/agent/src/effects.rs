@@ -74,7 +74,10 @@ pub trait Effects: Send + Sync + 'static {
     /// until the receiver is dropped. A package that promises nothing holds since its process was started.
     fn watch(&self, task: &TaskName, run: &ActiveRun) -> watch::Receiver<Health>;
 
-    /// Notes what a desired state says of who has signed what, and begins to get it.
+    /// How many versions may be prepared at the same time.
+    fn parallel_tasks(&self) -> usize;
+
+    /// Notes what a desired state says of who has signed what, and begins to get it; and takes on the settings in it.
     fn heed(&self, state: &DesiredState);
 
     /// What the robot goes by when it asks who has signed a package.

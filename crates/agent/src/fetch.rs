@@ -17,14 +17,16 @@ use std::collections::{HashMap, HashSet};
 use std::fs;
 use std::io;
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, Weak};
 use std::time::Duration;
 
 use bytes::Bytes;
 use http::header::CONNECTION;
+use task_archive::Limits;
 use task_proto::desired::{BlobRef, PackageRef};
 use task_proto::manifest::TaskManifest;
 use task_proto::report::Progress;
+use task_proto::settings::RobotLimits;
 use task_proto::{Digest, RepositoryName};
 use tokio::sync::{OwnedMutexGuard, mpsc, watch};
 use tokio::time::Instant;
@@ -43,7 +45,6 @@ use crate::foreign_file;
 use crate::layout::DataDir;
 use crate::link_meter::LinkMeter;
 use crate::parts::Listening;
-use crate::unpack::Limits;
 
 /// The largest task manifest that is held in memory.
 const MAX_MANIFEST_BYTES: u64 = 1 << 20;
@@ -96,7 +97,9 @@ pub struct Fetcher {
     server: reqwest::Url,
     token: Credential,
     data: DataDir,
-    settings: FetchSettings,
+    /// As they were given, under the robot's limits.
+    given: FetchSettings,
+    settings: RwLock<FetchSettings>,
     turns: Turns,
     meter: LinkMeter,
     offered: Offered,
@@ -105,6 +108,19 @@ pub struct Fetcher {
 }
 
 impl Fetcher {
+    /// Lets what is pulled from now on have no more than `limits` say.
+    pub fn limit(&self, limits: &RobotLimits) {
+        let mut settings = self.given;
+        settings.limits.bytes = limits.archive_bytes.unwrap_or(settings.limits.bytes);
+        settings.limits.entries = limits.archive_entries.unwrap_or(settings.limits.entries);
+        settings.reserve_bytes = limits.disk_reserve_bytes.unwrap_or(settings.reserve_bytes);
+        *self.settings.write().unwrap_or_else(PoisonError::into_inner) = settings;
+    }
+
+    fn settings(&self) -> FetchSettings {
+        *self.settings.read().unwrap_or_else(PoisonError::into_inner)
+    }
+
     /// Pulls from `server` with the robot's `token`.
     pub fn new(
         client: reqwest::Client,
@@ -118,7 +134,8 @@ impl Fetcher {
             server,
             token: token.into(),
             data,
-            settings,
+            given: settings,
+            settings: RwLock::new(settings),
             turns: Turns::default(),
             meter: LinkMeter::default(),
             offered: Offered::default(),
@@ -186,7 +203,7 @@ impl Fetcher {
         let is_there = self.src(package).is_dir() || self.offered.get(&content).is_some();
         if !is_there && self.present(package)? < content.size && !self.given_up().contains(&content.digest) {
             let gathering = Gathering::open(self, package, progress, asks, turn.clone())?;
-            let need = Need::of(package, manifest, gathering.bytes(), self.settings.reserve_bytes);
+            let need = Need::of(package, manifest, gathering.bytes(), self.settings().reserve_bytes);
             let gathered = match self.check_room(need) {
                 Ok(()) => gathering.run(listening.listen(content.digest, content.size), cancel).await,
                 Err(error) => Err(error),
@@ -280,7 +297,7 @@ impl Fetcher {
 
     async fn pull_whole(&self, repository: &RepositoryName, blob: BlobRef) -> Result<Vec<u8>, FetchError> {
         let request = self.request(repository, blob)?;
-        let mut download = Download::start(request, repository, blob, 0, self.settings.stall_timeout).await?;
+        let mut download = Download::start(request, repository, blob, 0, self.settings().stall_timeout).await?;
         let mut bytes = Vec::with_capacity(blob.size as usize);
         while let Some(chunk) = download.next().await? {
             bytes.extend_from_slice(&chunk);
@@ -307,7 +324,7 @@ impl Fetcher {
         }
         let offset = self.present(package)?;
         progress.send_replace(Progress { done: offset, total: package.content.size });
-        let need = Need::of(package, manifest, offset, self.settings.reserve_bytes);
+        let need = Need::of(package, manifest, offset, self.settings().reserve_bytes);
         self.check_room(need)?;
         // Ask first: a replay for nothing each time the server is away would wear the disk out.
         let source = if offset == package.content.size {
@@ -362,7 +379,7 @@ impl Fetcher {
         for reconnects in 1..=MAX_RECONNECTS {
             tracing::info!(package = %package.name, position, %cut, "connecting anew");
             // A server that restarts cuts a whole fleet off at once.
-            let longest = self.settings.reconnect_wait * reconnects;
+            let longest = self.settings().reconnect_wait * reconnects;
             tokio::time::sleep(longest.mul_f64(rand::random())).await;
             let ended = match self.download_content(package, position).await {
                 Ok(mut download) => {
@@ -395,7 +412,7 @@ impl Fetcher {
         let repository = RepositoryName::of_package(&package.name);
         // Nothing is asked for after it.
         let request = self.request(&repository, package.content)?.header(CONNECTION, "close");
-        Download::start(request, &repository, package.content, offset, self.settings.stall_timeout).await
+        Download::start(request, &repository, package.content, offset, self.settings().stall_timeout).await
     }
 
     fn request(&self, repository: &RepositoryName, blob: BlobRef) -> Result<reqwest::RequestBuilder, FetchError> {

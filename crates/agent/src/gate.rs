@@ -30,7 +30,6 @@ const DRAIN_TIMEOUT: Duration = Duration::from_secs(2);
 pub struct Gate {
     config: GateConfig,
     robot: RobotId,
-    environment: BTreeMap<String, String>,
     directory: PathBuf,
 }
 
@@ -67,14 +66,19 @@ pub enum GateError {
 }
 
 impl Gate {
-    /// The gate of `robot`, which is run in `directory` with `environment`.
-    pub fn new(config: GateConfig, robot: RobotId, environment: BTreeMap<String, String>, directory: &Path) -> Self {
-        Self { config, robot, environment, directory: directory.to_owned() }
+    /// The gate of `robot`, which is run in `directory`.
+    pub fn new(config: GateConfig, robot: RobotId, directory: &Path) -> Self {
+        Self { config, robot, directory: directory.to_owned() }
     }
 
-    /// Asks it. A failure is the reason of a no; what it is when there is no answer is a setting.
-    pub async fn ask(&self, task: &TaskName, question: &GateQuestion) -> Result<(), Failure> {
-        let error = match self.run(task, question).await {
+    /// Asks it, run with `environment`. A failure is the reason of a no; what it is when there is no answer is a setting.
+    pub async fn ask(
+        &self,
+        task: &TaskName,
+        question: &GateQuestion,
+        environment: &BTreeMap<String, String>,
+    ) -> Result<(), Failure> {
+        let error = match self.run(task, question, environment).await {
             Ok(answer) => return answer.map_err(|reason| Failure::new(FailureCode::GATE_REFUSED, reason)),
             Err(error) => error,
         };
@@ -88,7 +92,12 @@ impl Gate {
         }
     }
 
-    async fn run(&self, task: &TaskName, question: &GateQuestion) -> Result<Result<(), String>, GateError> {
+    async fn run(
+        &self,
+        task: &TaskName,
+        question: &GateQuestion,
+        environment: &BTreeMap<String, String>,
+    ) -> Result<Result<(), String>, GateError> {
         let program = || PathBuf::from(self.config.command.first().cloned().unwrap_or_default());
         let failed = |source| GateError::Run { program: program(), source };
         // The path need not exist: by it the gate's processes are found again.
@@ -97,7 +106,8 @@ impl Gate {
         // An agent that was killed may have left one that hangs.
         processes.end(KILL_TIMEOUT).await?;
         let (reader, writer) = io::pipe().map_err(failed)?;
-        let environment = self.environment(task, question, &mark);
+        let mut environment = environment.clone();
+        environment.extend(self.asked(task, question, &mark));
         let mut child =
             process::spawn_gate(&self.config.command, &self.directory, &environment, writer).map_err(failed)?;
         let reading = tokio::task::spawn_blocking(move || reason(reader));
@@ -123,8 +133,9 @@ impl Gate {
         }
     }
 
-    fn environment(&self, task: &TaskName, question: &GateQuestion, mark: &Path) -> BTreeMap<String, String> {
-        let asked = [
+    /// The question, as variables.
+    fn asked(&self, task: &TaskName, question: &GateQuestion, mark: &Path) -> [(String, String); 7] {
+        [
             ("TASKD_GATE_STEP", question.step.as_str().to_owned()),
             ("TASKD_TASK", task.to_string()),
             ("TASKD_VERSION", question.version.to_string()),
@@ -132,10 +143,8 @@ impl Gate {
             ("TASKD_RUN", question.run.to_string()),
             ("TASKD_ROBOT", self.robot.to_string()),
             (RUN_DIR_VARIABLE, mark.display().to_string()),
-        ];
-        let mut environment = self.environment.clone();
-        environment.extend(asked.map(|(name, value)| (name.to_owned(), value)));
-        environment
+        ]
+        .map(|(name, value)| (name.to_owned(), value))
     }
 }
 

@@ -1,5 +1,6 @@
 //! When the agent takes part in the ROS graph: from the first time that a task or a question needs it, on a robot that has
-//! ROS 2, until the agent ends; anew, should it have been thrown out. A robot without ROS 2 never opens a socket for it. It looks at nothing itself.
+//! ROS 2, until the agent ends, or until somebody needs another domain and nobody this one any more; anew, should it have been
+//! thrown out. A robot without ROS 2 never opens a socket for it. It looks at nothing itself.
 
 use std::error::Error as _;
 use std::sync::Arc;
@@ -8,8 +9,9 @@ use std::time::Duration;
 use task_proto::MacAddress;
 use task_proto::id::InvalidId;
 use task_proto::report::{Failure, FailureCode, RosFacts};
-use tokio::sync::Mutex;
+use tokio::sync::{Mutex, watch};
 use tokio::time::Instant;
+use tokio_util::sync::{CancellationToken, DropGuard};
 
 use crate::graph::{Graph, GraphSettings};
 use crate::layout::DataDir;
@@ -25,7 +27,7 @@ const RETRY: Duration = Duration::from_secs(10);
 pub struct GraphAccess {
     mac: MacAddress,
     data: DataDir,
-    log_bytes: Option<u64>,
+    log_bytes: Arc<watch::Sender<Option<u64>>>,
     state: Arc<Mutex<State>>,
 }
 
@@ -36,6 +38,9 @@ enum State {
     Open {
         graph: Graph,
         since: Instant,
+        domain_id: u16,
+        /// What nodes say is kept as long: nobody else may write it, and the graph is not held open for it.
+        _keeping: DropGuard,
     },
     Failed {
         failure: Failure,
@@ -46,8 +51,13 @@ enum State {
 impl GraphAccess {
     /// Closed at first. The node is named for the robot, because two agents on one host, or in one domain, need two names.
     /// What nodes say is kept in `data` while it is open.
-    pub fn of_robot(mac: MacAddress, data: DataDir, log_bytes: Option<u64>) -> Self {
-        Self { mac, data, log_bytes, state: Arc::default() }
+    pub fn of_robot(mac: MacAddress, data: DataDir) -> Self {
+        Self { mac, data, log_bytes: Arc::new(watch::Sender::new(None)), state: Arc::default() }
+    }
+
+    /// Lets a file of what nodes say have no more than `log_bytes`, from the next time that the graph is opened.
+    pub fn limit(&self, log_bytes: Option<u64>) {
+        self.log_bytes.send_replace(log_bytes);
     }
 
     /// The graph, opened now if it was not yet. `facts` say what the robot has, as it was seen last.
@@ -65,7 +75,12 @@ impl GraphAccess {
     async fn opened(&self, facts: Option<&RosFacts>) -> Result<(Graph, Instant), Failure> {
         let mut state = self.state.lock().await;
         match &*state {
-            State::Open { graph, since } if !graph.is_closed() => return Ok((graph.clone(), *since)),
+            // Whoever watches a task in the domain that was left goes on with the graph they have.
+            State::Open { graph, since, domain_id, .. }
+                if !graph.is_closed() && facts.is_none_or(|facts| facts.domain_id == Some(*domain_id)) =>
+            {
+                return Ok((graph.clone(), *since));
+            }
             State::Failed { failure, at } if at.elapsed() < RETRY => return Err(failure.clone()),
             // What has closed by itself, because its listening ended, is opened anew.
             State::Closed | State::Open { .. } | State::Failed { .. } => {}
@@ -75,8 +90,11 @@ impl GraphAccess {
             Ok(graph) => {
                 tracing::info!(domain_id = settings.domain_id, localhost_only = settings.localhost_only, "graph open");
                 let since = Instant::now();
-                tokio::spawn(ros::keep(graph.clone(), self.data.clone(), self.log_bytes));
-                *state = State::Open { graph: graph.clone(), since };
+                let over = CancellationToken::new();
+                let keep = ros::keep(graph.clone(), self.data.clone(), *self.log_bytes.borrow());
+                tokio::spawn(over.clone().run_until_cancelled_owned(keep));
+                let (domain_id, _keeping) = (settings.domain_id, over.drop_guard());
+                *state = State::Open { graph: graph.clone(), since, domain_id, _keeping };
                 Ok((graph, since))
             }
             Err(error) => {
@@ -102,5 +120,29 @@ impl GraphAccess {
             node_name: name.parse().map_err(unnamed)?,
             distro: Some(facts.distro.clone()),
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn facts(domain_id: u16) -> RosFacts {
+        RosFacts { distro: "jazzy".to_owned(), rmw: None, domain_id: Some(domain_id), localhost_only: true }
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_domain_that_was_left_is_left_by_whoever_keeps_what_nodes_say() {
+        let temp = tempfile::tempdir().expect("temp dir");
+        let data = DataDir::new(temp.path()).expect("data dir");
+        let access = GraphAccess::of_robot("02:00:00:00:00:01".parse().expect("an address"), data);
+        let before = access.open(Some(&facts(171))).await.expect("open");
+        let mut changes = before.changes();
+        let now = access.open(Some(&facts(172))).await.expect("open");
+        assert!(!before.is_closed(), "who watches a task there still sees it");
+        drop(before);
+        let closed = async { while changes.changed().await.is_ok() {} };
+        tokio::time::timeout(Duration::from_secs(60), closed).await.expect("the graph of the domain before is closed");
+        assert!(!now.is_closed());
     }
 }

@@ -27,7 +27,7 @@ const MAX_POST_BACKOFF_MS: u64 = 60 * 1000;
 /// brings. A fleet that starts at once spreads over it.
 const FIRST_POST: Duration = Duration::from_secs(15);
 /// The longest wait between polls while the server refuses the token.
-const REFUSED_POLL: Duration = Duration::from_secs(300);
+pub(crate) const REFUSED_POLL: Duration = Duration::from_secs(300);
 
 /// What the link tells the driver.
 #[derive(Debug)]
@@ -298,6 +298,6 @@ pub async fn post(server: Server, shared: Shared, heard: mpsc::Sender<Heard>) {
 }
 
 /// Between half and one and a half, so that a fleet that began together does not poll together.
-fn spread() -> f64 {
+pub(crate) fn spread() -> f64 {
     0.5 + rand::random::<f64>()
 }

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory as _, Parser, Subcommand};
 use task_agent::commands;
 
 /// Runs task packages on this robot, as its server orders.
@@ -28,6 +28,10 @@ enum Command {
     Hold(commands::hold::Arguments),
     /// Take a `hold` back
     Release(commands::hold::Arguments),
+    /// Look for what commonly goes wrong on this robot, and say how to mend it
+    Doctor(commands::doctor::Arguments),
+    /// Write man pages
+    Man(commands::man::Arguments),
     /// Stand between the agent and one task; only the agent itself calls this
     #[command(hide = true)]
     Shim {
@@ -45,6 +49,8 @@ fn main() -> ExitCode {
         Command::Status(arguments) => commands::status::run(arguments),
         Command::Hold(arguments) => commands::hold::hold(arguments),
         Command::Release(arguments) => commands::hold::release(arguments),
+        Command::Doctor(arguments) => commands::doctor::run(arguments),
+        Command::Man(arguments) => commands::man::run(&arguments, CommandLine::command()),
         Command::Shim { dir } => commands::shim::run(&dir),
     };
     outcome.unwrap_or_else(|error| {

@@ -353,7 +353,8 @@ impl Session<'_> {
             Event::Outgoing(Outgoing::PingReq) => self.pinged_at = Some(Instant::now()),
             Event::Outgoing(Outgoing::Subscribe(id)) => self.subscriptions.sent(id),
             Event::Outgoing(Outgoing::Publish(id)) => {
-                if let Some(published) = self.unsent.pop_front() {
+                // Without a packet id nothing comes back.
+                if let Some(published) = self.unsent.pop_front().filter(|_| id != 0) {
                     self.sent.push_back((id, published));
                 }
             }
@@ -486,7 +487,9 @@ impl Session<'_> {
 
     fn publish(&mut self, topic: RobotTopic, payload: Vec<u8>, published: Published) {
         let name = topic_name(self.access, topic);
-        if self.client.try_publish(name, QoS::AtLeastOnce, false, payload).is_ok() {
+        // Of vitals the next ones say more than a repetition.
+        let qos = if topic == RobotTopic::Telemetry { QoS::AtMostOnce } else { QoS::AtLeastOnce };
+        if self.client.try_publish(name, qos, false, payload).is_ok() {
             self.unsent.push_back(published);
         }
     }

@@ -112,6 +112,11 @@ impl RunDir {
         Ok(Self(path.canonicalize().map_err(failed)?))
     }
 
+    /// The run directory at `path`, as it is.
+    pub fn at(path: &Path) -> Self {
+        Self(path.to_owned())
+    }
+
     /// The directory.
     pub fn path(&self) -> &Path {
         &self.0

@@ -12,6 +12,7 @@ use task_proto::RobotId;
 use task_proto::api::{EnrollRequest, EnrollResponse, ErrorBody, MqttEndpoint, ReportReply, RobotToken};
 use task_proto::envelope::Envelope;
 use task_proto::report::Report;
+use task_proto::vitals::Telemetry;
 
 use crate::credential::Credential;
 
@@ -122,6 +123,12 @@ impl Server {
         let url = at(&self.base, &format!("robots/{}/report", self.robot));
         let answer = self.ask(Method::POST, url, Some(report), None).await?;
         parse(&answer.body)
+    }
+
+    /// Says how the robot's machine does.
+    pub async fn telemetry(&self, telemetry: &Telemetry) -> Result<(), ServerError> {
+        let url = at(&self.base, &format!("robots/{}/telemetry", self.robot));
+        self.ask(Method::POST, url, Some(telemetry), None).await.map(drop)
     }
 
     /// Asks where the robot's MQTT session goes.

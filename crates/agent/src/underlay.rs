@@ -25,7 +25,7 @@ pub struct Places {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum UnderlayError {
     /// A configured file is not there.
-    #[error("underlays: {} is not there", .0.display())]
+    #[error("underlays, workspace: {} is not there", .0.display())]
     Missing(PathBuf),
     /// The robot does not have it.
     #[error("this robot lacks what the task needs: {0}")]
@@ -55,6 +55,32 @@ pub fn find(configured: &[PathBuf], places: &Places) -> Vec<Installation> {
     found.extend(setups.filter(|setup| setup.is_file()).map(|setup| together(&[setup])));
     // Stable: of one version they stay in the order of their names, the system's first.
     found.sort_by(|one, other| one.versions.cmp(&other.versions));
+    found
+}
+
+/// What tasks can use on this machine, by the settings that hold.
+pub fn by_settings(underlays: &[PathBuf], workspace: Option<&Path>) -> Vec<Installation> {
+    let found = find(underlays, &Places::of_this_machine());
+    match workspace {
+        Some(workspace) => with_workspace(found, workspace),
+        None => found,
+    }
+}
+
+/// What was `found` with a person's own `workspace` on top of each installation of the same ROS, or alone where there is none.
+pub fn with_workspace(mut found: Vec<Installation>, workspace: &Path) -> Vec<Installation> {
+    let devel = workspace.join("devel/setup.bash");
+    let setup = if devel.is_file() { devel } else { workspace.join("install/setup.bash") };
+    let is_ros_1 = setup.parent().is_some_and(|dir| dir.ends_with("devel") || dir.join(".catkin").exists());
+    let version = if is_ros_1 { RosVersion::Ros1 } else { RosVersion::Ros2 };
+    let fits =
+        |installation: &&mut Installation| installation.versions.is_empty() || installation.versions.contains(&version);
+    let mut below = found.iter_mut().filter(fits).peekable();
+    if below.peek().is_none() {
+        found.push(Installation { versions: vec![version], setups: vec![setup], ..Installation::default() });
+        return found;
+    }
+    below.for_each(|installation| installation.setups.push(setup.clone()));
     found
 }
 
@@ -193,5 +219,31 @@ mod tests {
         let found = find(std::slice::from_ref(&jazzy), &places);
         assert_eq!(setup_files(&found, Some(RosVersion::Ros1), &[]), Ok(vec![]));
         assert_eq!(setup_files(&found, Some(RosVersion::Ros2), &[]), Ok(vec![jazzy]));
+    }
+
+    #[test]
+    fn a_workspace_lies_on_top_of_the_ros_it_was_made_with() {
+        let dir = tempfile::tempdir().unwrap();
+        let installed = |setup: &str, version| Installation {
+            versions: vec![version],
+            setups: vec![setup.into()],
+            ..Installation::default()
+        };
+        let found = vec![installed("/opt/ros/noetic/setup.bash", RosVersion::Ros1), installed("/j", RosVersion::Ros2)];
+        let setups = |found: &[Installation]| found.iter().map(|one| one.setups.clone()).collect::<Vec<_>>();
+        let install = dir.path().join("install/setup.bash");
+        let on_ros_2 = with_workspace(found.clone(), dir.path());
+        assert_eq!(setups(&on_ros_2), [vec!["/opt/ros/noetic/setup.bash".into()], vec!["/j".into(), install.clone()]]);
+        assert_eq!(
+            setup_files(&on_ros_2, Some(RosVersion::Ros2), &[]),
+            Err(UnderlayError::Missing("/j".into())),
+            "what is not there is named"
+        );
+        assert_eq!(setups(&with_workspace(Vec::new(), dir.path())), [[install]]);
+        let devel = dir.path().join("devel/setup.bash");
+        fs::create_dir(devel.parent().unwrap()).unwrap();
+        fs::write(&devel, "").unwrap();
+        let on_ros_1 = with_workspace(found, dir.path());
+        assert_eq!(setups(&on_ros_1), [vec!["/opt/ros/noetic/setup.bash".into(), devel], vec!["/j".into()]]);
     }
 }

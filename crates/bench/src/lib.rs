@@ -25,4 +25,5 @@ pub mod robots;
 pub mod run;
 pub mod scenario;
 pub mod server;
+mod simulated;
 pub mod taskd;

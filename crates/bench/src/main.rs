@@ -9,11 +9,12 @@ use clap::{Parser, Subcommand};
 use taskbench::compare::{CompareFlags, compare};
 use taskbench::load::{Load, LoadFlags};
 use taskbench::progress::say;
-use taskbench::report::page;
+use taskbench::report;
 use taskbench::run::Run;
 use taskbench::scenario::blob::{self, BlobFlags};
 use taskbench::scenario::broker::{self, BrokerFlags};
 use taskbench::scenario::fleet::{self, FleetFlags};
+use taskbench::scenario::page::{self, PageFlags};
 use taskbench::scenario::paper::{self, PaperFlags};
 use taskbench::scenario::pull::{self, PullFlags};
 use taskbench::scenario::status::{self, StatusFlags};
@@ -92,6 +93,13 @@ enum Command {
     #[command(after_help = "Example:\n  taskbench status --rate 10000 --postgres postgres://postgres@localhost/bench")]
     Status(StatusFlags),
 
+    /// Look at the page in a browser while a fleet reports, and scroll
+    ///
+    /// Needs node, Chromium and what `scripts/need page` installs. First rows are timed from asking for the page, with a
+    /// session; main-thread times are the browser's own trace.
+    #[command(after_help = "Example:\n  taskbench page --robots 10000 --rate 1000 --browser \"$(scripts/need page)\"")]
+    Page(PageFlags),
+
     /// Show what has changed between two results of the same scenario
     #[command(after_help = "Example:\n  taskbench compare old/blob.json new/blob.json --least 5")]
     Compare(CompareFlags),
@@ -124,6 +132,7 @@ async fn run(command: Command) -> anyhow::Result<ExitCode> {
         Command::Pull(flags) => concluded(until_interrupted(pull::run(flags)).await?),
         Command::Broker(flags) => concluded(until_interrupted(broker::run(flags)).await?),
         Command::Status(flags) => concluded(until_interrupted(status::run(flags)).await?),
+        Command::Page(flags) => concluded(until_interrupted(page::run(flags)).await?),
         Command::Compare(flags) => {
             print(&compare(&flags)?)?;
             Ok(ExitCode::SUCCESS)
@@ -131,7 +140,7 @@ async fn run(command: Command) -> anyhow::Result<ExitCode> {
         Command::Report { json, html } => {
             let run = Run::read(&json).with_context(|| json.display().to_string())?;
             let html = html.unwrap_or_else(|| json.with_extension("html"));
-            std::fs::write(&html, page(&run)).with_context(|| html.display().to_string())?;
+            std::fs::write(&html, report::page(&run)).with_context(|| html.display().to_string())?;
             Ok(ExitCode::SUCCESS)
         }
     }

@@ -88,18 +88,18 @@ fn settings(point: &Point) -> String {
 
 fn table(points: &[Point]) -> String {
     let mut table = "<h2>All points</h2><table><thead><tr><th>series<th>settings<th>quantity<th>n<th>min<th>median<th>\
-                     p99<th>max<th>failed</tr></thead><tbody>"
+                     p95<th>p99<th>max<th>failed</tr></thead><tbody>"
         .to_owned();
     for point in points {
         let begin = format!("<tr><td>{}<td>{}", escaped(&point.series), escaped(&settings(point)));
         for (name, quantity) in &point.quantities {
-            let figures = [quantity.min, quantity.median, quantity.p99, quantity.max];
+            let figures = [quantity.min, quantity.median, quantity.p95, quantity.p99, quantity.max];
             let figures = figures.map(|value| format!("<td>{}", written(value, quantity.unit))).concat();
             let _ =
                 write!(table, "{begin}<td>{}<td>{}{figures}<td>{}</tr>", escaped(name), quantity.count, point.failed());
         }
         if point.quantities.is_empty() {
-            let _ = write!(table, "{begin}<td colspan=\"6\"><td>{}</tr>", point.failed());
+            let _ = write!(table, "{begin}<td colspan=\"7\"><td>{}</tr>", point.failed());
         }
     }
     table + "</tbody></table>"

@@ -7,14 +7,18 @@ use std::time::{Duration, Instant};
 use rumqttc::{
     AsyncClient, Event, EventLoop, Incoming, LastWill, MqttOptions, NetworkOptions, Outgoing, QoS, SubscribeReasonCode,
 };
+use task_agent::vitals::Source as _;
 use task_proto::api::EnrollResponse;
 use task_proto::desired::{DesiredState, DesiredTask, Doorbell, MAX_DOORBELL_BYTES};
 use task_proto::envelope::{DESIRED_STATE_TYPE, PublicKey};
 use task_proto::report::{ActiveVersion, HostFacts, Phase, Report, Status, TaskReport};
 use task_proto::topic::{RobotTopic, Topic};
+use task_proto::vitals::Telemetry;
 use task_proto::{DeploymentId, Generation, InstanceId};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
+
+use crate::simulated::{Machine, VITALS_INTERVAL};
 
 /// How long the server may take for any one thing.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -75,12 +79,14 @@ struct Session {
     client: AsyncClient,
     heard: watch::Receiver<Heard>,
     listener: JoinHandle<()>,
+    teller: JoinHandle<()>,
     published: u64,
 }
 
 impl Drop for Session {
     fn drop(&mut self) {
         self.listener.abort();
+        self.teller.abort();
     }
 }
 
@@ -102,7 +108,8 @@ impl Robot {
         event_loop.set_network_options(network);
         let (heard_in, heard) = watch::channel(Heard::default());
         let listener = listen(event_loop, client.clone(), self.identity.clone(), self.status(true), heard_in);
-        self.session = Some(Session { client, heard, listener: tokio::spawn(listener), published: 0 });
+        let teller = tokio::spawn(tell_vitals(client.clone(), self.identity.clone()));
+        self.session = Some(Session { client, heard, listener: tokio::spawn(listener), teller, published: 0 });
         Ok(self.hear("SUBACK", |heard| heard.subscribed).await? - begun)
     }
 
@@ -176,6 +183,7 @@ impl Robot {
             active: (phase == Phase::Running).then(|| ActiveVersion {
                 deployment: task.deployment.clone(),
                 version: task.package.version.clone(),
+                manifest: Some(task.package.manifest.digest),
                 pid: 1,
             }),
         };
@@ -255,7 +263,8 @@ async fn listen(
                 let _ = client.try_publish(topic, QoS::AtLeastOnce, false, status.clone());
                 heard.send_modify(|heard| heard.subscribed = Some(Instant::now()));
             }
-            Event::Outgoing(Outgoing::Publish(id)) => first_publish = first_publish.or(Some(id)),
+            // Vitals have no packet id.
+            Event::Outgoing(Outgoing::Publish(id)) => first_publish = first_publish.or(Some(id).filter(|id| *id != 0)),
             Event::Incoming(Incoming::PubAck(ack)) if Some(ack.pkid) == first_publish && !status_acknowledged => {
                 status_acknowledged = true;
             }
@@ -271,6 +280,20 @@ async fn listen(
         }
     };
     heard.send_modify(|heard| heard.ended = Some(ended));
+}
+
+/// Says how the robot does, once in a while, from some moment on.
+async fn tell_vitals(client: AsyncClient, identity: Arc<Identity>) {
+    let mut machine = Machine::new();
+    let first = tokio::time::Instant::now() + VITALS_INTERVAL.mul_f64(rand::random());
+    let mut ticks = tokio::time::interval_at(first, VITALS_INTERVAL);
+    loop {
+        ticks.tick().await;
+        let telemetry = Telemetry { robot_id: identity.enrolled.robot_id.clone(), vitals: machine.look() };
+        // Where there is no room the next ones say more.
+        let payload = json_bytes(&telemetry);
+        let _ = client.try_publish(identity.topic(RobotTopic::Telemetry), QoS::AtMostOnce, false, payload);
+    }
 }
 
 fn json_bytes(value: &impl serde::Serialize) -> Vec<u8> {

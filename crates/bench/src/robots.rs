@@ -20,12 +20,15 @@ use task_agent::effects::Robot;
 use task_agent::fetch::{FetchSettings, Fetcher};
 use task_agent::layout::DataDir;
 use task_agent::ledger::Ledger;
-use task_agent::link::{self, Heard, Intervals, Shared, Talk};
+use task_agent::link::{self, Heard, Intervals, Message, Shared, Talk};
 use task_agent::mqtt::{self, MqttAccess, Ways};
 use task_agent::outputs::Registry;
 use task_agent::server;
+use task_agent::vitals::{Sender, Source as _};
 use task_proto::report::{HostFacts, Phase, Report, Status, TaskReport};
-use task_proto::{DeploymentId, InstanceId};
+use task_proto::request::{Answer, Ask, Outcome, Refusal, Reply, Request};
+use task_proto::topic::RobotTopic;
+use task_proto::{DeploymentId, InstanceId, RobotId};
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
@@ -33,6 +36,7 @@ use self::body::Body;
 use self::words::{Crew, Member, Order, Word, own_address};
 use crate::clock::monotonic_ns;
 use crate::encryption::{another, client_config};
+use crate::simulated::{Machine, VITALS_INTERVAL};
 
 /// Messages from a robot's link that its driver has not taken yet, as in the agent.
 const QUEUED_MESSAGES: usize = 16;
@@ -121,7 +125,6 @@ async fn assemble(crew: &Crew, tls: ClientConfig, number: usize, member: &Member
         boot_id: BOOT_ID.to_owned(),
         name: None,
         labels: None,
-        parallel_tasks: config.parallel_tasks,
     };
     let facts = HostFacts {
         agent_version: concat!("taskbench ", env!("CARGO_PKG_VERSION")).to_owned(),
@@ -165,16 +168,40 @@ fn start(number: usize, robot: Assembled, crew: &Crew, words: mpsc::Sender<Word>
     let (heard, messages): (mpsc::Sender<Heard>, _) = mpsc::channel(QUEUED_MESSAGES);
     let poll = std::time::Duration::from_millis(crew.poll_ms);
     let intervals = Intervals { slow: poll, fast: poll.min(std::time::Duration::from_secs(10)) };
+    let robot_id = access.robot.clone();
+    let (requests, asked) = mpsc::channel(QUEUED_MESSAGES);
+    let (said, to_say) = mpsc::channel(QUEUED_MESSAGES);
+    let (interval, source) = (VITALS_INTERVAL, Machine::new());
+    let vitals = Sender { robot_id: robot_id.clone(), interval, source: source.clone(), server: server.clone() };
+    tokio::spawn(vitals.run(shared.clone(), said.clone()));
+    tokio::spawn(answer(robot_id, source, asked, said));
     tokio::spawn(witness(number, shared.clone(), words));
     tokio::spawn(driver.run(messages));
     tokio::spawn(link::over_http(server, shared.clone(), intervals, heard.clone()));
     tokio::spawn(async move {
-        // Nobody asks these robots anything, and their tasks say nothing.
-        let (requests, _asked) = mpsc::channel(1);
-        let (_said, messages) = mpsc::channel(1);
+        // Their tasks say nothing.
         let (_batches, lines) = mpsc::channel(1);
-        mqtt::run(access, shared, heard, Talk { requests, messages, lines }).await;
+        mqtt::run(access, shared, heard, Talk { requests, messages: to_say, lines }).await;
     });
+}
+
+/// Answers how the robot does, and nothing else.
+async fn answer(
+    robot_id: RobotId,
+    mut machine: Machine,
+    mut asked: mpsc::Receiver<Request>,
+    said: mpsc::Sender<Message>,
+) {
+    while let Some(Request { id, ask, .. }) = asked.recv().await {
+        let text = "a simulated robot has no more than its vitals".to_owned();
+        let outcome = match ask {
+            Ask::Vitals => Outcome::Answer(Answer::Vitals(machine.look())),
+            _ => Outcome::Refusal(Refusal { code: "unsupported".to_owned(), text }),
+        };
+        if let Ok(payload) = serde_json::to_vec(&Reply { robot_id: robot_id.clone(), id, outcome }) {
+            let _ = said.try_send(Message { topic: RobotTopic::Reply, payload });
+        }
+    }
 }
 
 /// Says what the robot's reports show, each once it is acknowledged.

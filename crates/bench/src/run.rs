@@ -135,6 +135,8 @@ pub struct Quantity {
     pub min: f64,
     /// Half of the values were no larger.
     pub median: f64,
+    /// Of a hundred values ninety-five were no larger.
+    pub p95: f64,
     /// Of a hundred values ninety-nine were no larger.
     pub p99: f64,
     /// The largest.
@@ -211,6 +213,7 @@ impl Quantity {
             count: sorted.len(),
             min: sorted.first().copied()?,
             median: at(50)?,
+            p95: at(95)?,
             p99: at(99)?,
             max: sorted.last().copied()?,
             samples: if samples.len() <= MOST_SAMPLES { samples } else { Vec::new() },
@@ -304,19 +307,19 @@ impl Run {
             self.points.iter().flat_map(|p| p.settings.keys()).collect();
         let names = settings.iter().map(|name| cell(name));
         let head = std::iter::once("series".to_owned()).chain(names);
-        let rest = ["quantity", "unit", "count", "min", "median", "p99", "max", "failed"].map(str::to_owned);
+        let rest = ["quantity", "unit", "count", "min", "median", "p95", "p99", "max", "failed"].map(str::to_owned);
         let mut text = head.chain(rest).collect::<Vec<_>>().join(",") + "\n";
         for point in &self.points {
             let mut begin = vec![cell(&point.series)];
             begin.extend(settings.iter().map(|name| point.settings.get(*name).map_or(String::new(), f64::to_string)));
-            let mut row = |cells: [String; 7]| {
+            let mut row = |cells: [String; 8]| {
                 let all: Vec<String> = begin.iter().cloned().chain(cells).chain([point.failed().to_string()]).collect();
                 text.push_str(&(all.join(",") + "\n"));
             };
             for (name, q) in &point.quantities {
-                let figures = [q.min, q.median, q.p99, q.max].map(|value| value.to_string());
-                let [min, median, p99, max] = figures;
-                row([cell(name), cell(q.unit.symbol()), q.count.to_string(), min, median, p99, max]);
+                let figures = [q.min, q.median, q.p95, q.p99, q.max].map(|value| value.to_string());
+                let [min, median, p95, p99, max] = figures;
+                row([cell(name), cell(q.unit.symbol()), q.count.to_string(), min, median, p95, p99, max]);
             }
             if point.quantities.is_empty() {
                 row(Default::default());
@@ -377,9 +380,9 @@ pub(crate) mod tests {
     #[test]
     fn figures_are_values_that_occurred() {
         let of = |n: u32| Quantity::of(Unit::Milliseconds, (1..=n).rev().map(f64::from)).expect("figures");
-        let figures = |q: &Quantity| [q.min, q.median, q.p99, q.max];
-        assert_eq!(figures(&of(200)), [1.0, 100.0, 198.0, 200.0]);
-        assert_eq!(figures(&of(1)), [1.0; 4]);
+        let figures = |q: &Quantity| [q.min, q.median, q.p95, q.p99, q.max];
+        assert_eq!(figures(&of(200)), [1.0, 100.0, 190.0, 198.0, 200.0]);
+        assert_eq!(figures(&of(1)), [1.0; 5]);
         assert_eq!((of(3).samples, of(200).samples), (vec![3.0, 2.0, 1.0], vec![]));
         assert_eq!(Quantity::of(Unit::Number, []), None);
         assert_eq!(Quantity::of(Unit::Number, [f64::NAN]), None);
@@ -396,9 +399,9 @@ pub(crate) mod tests {
         assert_eq!((read.failed(), &read.plots), (1, &run.plots));
         let csv = std::fs::read_to_string(&files[1]).expect("read");
         let lines: Vec<&str> = csv.lines().collect();
-        assert_eq!(lines[0], "series,payload_bytes,robots,quantity,unit,count,min,median,p99,max,failed");
-        assert_eq!(lines[1], "push-pull,1000,1,delay,ms,3,10,20,30,30,0");
-        assert_eq!(lines[4], "direct-push,4000,4,,,,,,,,1");
+        assert_eq!(lines[0], "series,payload_bytes,robots,quantity,unit,count,min,median,p95,p99,max,failed");
+        assert_eq!(lines[1], "push-pull,1000,1,delay,ms,3,10,20,30,30,30,0");
+        assert_eq!(lines[4], "direct-push,4000,4,,,,,,,,,1");
         assert_eq!(cell("a \"b\", c"), "\"a \"\"b\"\", c\"");
     }
 

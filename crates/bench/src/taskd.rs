@@ -71,6 +71,8 @@ pub struct Taskd {
     pub mqtt: SocketAddr,
     /// Of its certificate authority, if it encrypts.
     pub pin: Option<CaPin>,
+    /// The operator's token.
+    pub token: Token,
     /// Its API, as the operator.
     pub server: Server,
     /// Its version.
@@ -124,7 +126,7 @@ impl Taskd {
         let base: Url = url(http, pin).parse().context("the server's address")?;
         let server = Server::new(base, &token, pin)?;
         let version = server.info().await.context("the server does not answer")?.version;
-        Ok(Self { process, program, dir, http, mqtt, pin, server, version })
+        Ok(Self { process, program, dir, http, mqtt, pin, token, server, version })
     }
 
     /// Its URL.

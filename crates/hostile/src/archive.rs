@@ -1,27 +1,34 @@
-//! A package's content as a robot unpacks it.
+//! A package's archive as a robot unpacks it, and as the server does where someone brings a directory.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Component, Path};
 
-use task_agent::unpack::{Limits, Refusal, UnpackError, unpack};
+use task_archive::{Compression, Entries, Kind, Limits, Refusal, UnpackError, unpack, unpack_unannounced};
 use task_proto::Digest;
 use task_proto::manifest::ContentFacts;
+use taskd::package::contents::list;
 
+const LIMITS: Limits = Limits { bytes: 1 << 20, entries: 200, depth: 8, ratio: 200 };
 const BLOCK_BYTES: usize = 512;
 /// Where a header has its checksum, and where its magic.
 const CHECKSUM: std::ops::Range<usize> = 148..156;
 const MAGIC: std::ops::Range<usize> = 257..262;
 
 /// An archive, compressed or not: whatever becomes of it, nothing is changed outside of its directory, and nothing in there
-/// leads out, has a mode of its own, or is larger than announced. One that is not compressed gets the checksums that its
-/// headers need, and compressed.
+/// leads out, has a mode of its own, or is larger than announced, or than may be where nothing was announced. One that is not
+/// compressed gets the checksums that its headers need, and compressed.
 pub fn archive(bytes: &[u8]) {
     let plain = zstd::decode_all(bytes).ok().filter(|_| bytes.len() < 64 * 1024);
     let (content, tar_size) = match plain {
         Some(plain) => (bytes.to_vec(), plain.len()),
-        None => (zstd::encode_all(&*with_checksums(bytes), 1).expect("compressed"), bytes.len()),
+        None => {
+            let tar = with_checksums(bytes);
+            unannounced(&tar, Compression::None);
+            (zstd::encode_all(&*tar, 1).expect("compressed"), bytes.len())
+        }
     };
+    unannounced(&content, Compression::Zstd);
     // How many entries there are is found out by announcing too few.
     let mut entries = 0;
     while let Some(found) = unpacked(&content, tar_size as u64, entries) {
@@ -40,14 +47,46 @@ fn with_checksums(bytes: &[u8]) -> Vec<u8> {
     tar
 }
 
-/// Unpacks and looks around; the number of entries found, if more were than announced.
+/// Unpacks an archive of which nothing is known. What is unpacked was listed before, entry by entry.
+fn unannounced(content: &[u8], compression: Compression) {
+    let mut listed = 0;
+    let mut entries = Entries::unannounced(content, compression, &LIMITS).expect("bytes in memory");
+    let whole = loop {
+        match entries.next() {
+            Ok(Some(entry)) => {
+                listed += u64::from(matches!(entry.kind, Kind::File { .. }));
+                assert!(!Path::new(&entry.path).is_absolute(), "{entry:?}");
+            }
+            end => break end.is_ok(),
+        }
+    };
+    let unpacked = in_staging(LIMITS.bytes, |staging| unpack_unannounced(content, compression, &LIMITS, staging));
+    assert!(listed <= LIMITS.entries + 1 && (whole || unpacked.is_err()), "{listed} files, {unpacked:?}");
+}
+
+/// Unpacks as announced; the number of entries found, if more were than announced.
 fn unpacked(content: &[u8], tar_size: u64, entries: u64) -> Option<u64> {
+    let facts = ContentFacts { tar_digest: Digest::of(b""), tar_size, entries };
+    let size = content.len() as u64;
+    match in_staging(tar_size, |staging| unpack(content, size, &facts, &LIMITS, staging)) {
+        Ok(()) => {
+            let listed = list(content, size, &facts).expect("what can be unpacked can be listed");
+            assert!(listed.is_sorted_by(|one, next| one.path < next.path), "{listed:?}");
+            None
+        }
+        Err(Refusal::NotAsAnnounced { what: "entries in the archive", found, announced }) if found > announced => {
+            Some(found)
+        }
+        _ => None,
+    }
+}
+
+/// Unpacks and looks around; why it was refused, if it was.
+fn in_staging(most_bytes: u64, unpack: impl FnOnce(&Path) -> Result<(), UnpackError>) -> Result<(), Refusal> {
     let outer = tempfile::tempdir().expect("a directory");
     let (staging, neighbour) = (outer.path().join("staging"), outer.path().join("neighbour"));
     fs::write(&neighbour, "untouched").expect("written");
-    let facts = ContentFacts { tar_digest: Digest::of(b""), tar_size, entries };
-    let limits = Limits { bytes: 1 << 20, entries: 200, depth: 8, ratio: 200 };
-    let result = unpack(content, content.len() as u64, &facts, &limits, &staging);
+    let result = unpack(&staging);
     let mut around: Vec<_> =
         fs::read_dir(outer.path()).expect("listed").map(|entry| entry.expect("an entry").file_name()).collect();
     around.sort();
@@ -58,21 +97,16 @@ fn unpacked(content: &[u8], tar_size: u64, entries: u64) -> Option<u64> {
     assert_eq!(fs::read_to_string(&neighbour).expect("still there"), "untouched");
     if staging.exists() {
         let size = look(&staging, &staging.canonicalize().expect("a directory"), 0);
-        assert!(size <= tar_size, "{size} bytes of an archive of {tar_size}");
+        assert!(size <= most_bytes, "{size} bytes of an archive of {most_bytes}");
     }
     match result {
         Err(UnpackError::Refused(refusal)) => {
             assert!(!refusal.to_string().contains(char::is_control), "{refusal:?}");
-            match refusal {
-                Refusal::NotAsAnnounced { what: "entries in the archive", found, announced } if found > announced => {
-                    Some(found)
-                }
-                _ => None,
-            }
+            Err(refusal)
         }
         Err(UnpackError::Disk { path, source }) => panic!("{} should not have been tried: {source}", path.display()),
         Err(UnpackError::Source(error)) => panic!("the source does not fail: {error}"),
-        Ok(()) => None,
+        Ok(()) => Ok(()),
     }
 }
 

@@ -1,32 +1,54 @@
 //! Bodies of the HTTP API under `/api/v1`. Times are milliseconds since the Unix epoch by the server's clock, sizes are
 //! bytes. Unknown fields are tolerated in answers; requests are checked by the server.
 
+mod bulk;
 mod conduct;
 mod delivery;
 mod enrolment;
+mod feed;
+mod history;
 mod logs;
 mod mqtt;
+mod orders;
+mod packages;
 mod people;
+mod server;
+mod status;
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 
+pub use self::bulk::{BulkLabels, BulkRemove};
 pub use self::conduct::ConductTotals;
 pub use self::delivery::{DeliveryChoice, DeliveryDecision, MAX_PRIORITY, MIN_PRIORITY};
 pub use self::enrolment::{AWAITS_APPROVAL, EnrollmentTokenList, EnrollmentTokenView, PendingRobot, PendingRobotList};
+pub use self::feed::{FeedEntry, FeedKind, FeedPage, MAX_FEED_ENTRIES};
+pub use self::history::{MAX_TIMELINE, PastAssignment, TaskHistory, TimelineEntry, VitalsView};
 pub use self::logs::{LogEvent, LogsFrom, LogsQuery, LogsView};
 pub use self::mqtt::{BrokerFiles, ExternalBroker, MqttEndpoint};
+pub use self::orders::{RetryDeployment, RolledBack};
+pub use self::packages::{
+    ChangedFile, PackageDiff, PackageFile, PackageFileKind, PackageFiles, PackageList, PackageUse, PackageVersions,
+    PackageView,
+};
 pub use self::people::{
     AccessToken, AddUser, AuditPage, AuditQuery, ChangePassword, CreateToken, EditUser, LogIn, Me, ProviderView,
     SessionView, SetPassword, SignIn, TokenList, TokenOrigin, TokenView, UserList, UserView,
 };
+pub use self::server::{HttpTraffic, MqttConnection, MqttTraffic, ServerInfo, Traffic};
+pub use self::status::{
+    BrokerStatus, DatabaseStatus, DiskStatus, LimitView, ListenerView, MAX_SITES, ReportStatus, RobotCounts,
+    RobotSession, RuleView, ServerRules, ServerStatus, SessionList, SiteStatus, Subscription, TransferStatus,
+};
 use crate::desired::{PackageRef, Wanted};
 use crate::envelope::PublicKey;
 use crate::id::Labels;
-use crate::manifest::{TaskKind, TaskManifest};
+use crate::manifest::TaskKind;
 use crate::output::OutputSet;
 use crate::report::{ActiveVersion, Condition, Failure, HostFacts, LinkFacts, Phase, Progress};
 use crate::selector::Selector;
-use crate::{CaPin, DeploymentId, Digest, Generation, MacAddress, RobotId, RobotName, TaskName, Version};
+use crate::settings::{EffectiveSettings, RobotSettings};
+use crate::vitals::Vitals;
+use crate::{DeploymentId, Digest, Generation, MacAddress, RobotId, RobotName, TaskName, Version};
 
 /// Where the API begins.
 pub const BASE: &str = "/api/v1";
@@ -35,6 +57,7 @@ pub const IDEMPOTENCY_KEY: &str = "idempotency-key";
 
 /// Every error's body.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct ErrorBody {
     /// The error.
     pub error: ApiError,
@@ -42,6 +65,7 @@ pub struct ErrorBody {
 
 /// An error: a stable code for programs, a sentence for people.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct ApiError {
     /// `not_found`, `invalid_request`, `unauthorized`, `forbidden`, `mac_known`, `no_robots_match`, …
     pub code: String,
@@ -49,88 +73,9 @@ pub struct ApiError {
     pub message: String,
 }
 
-/// `GET /server` (read).
-#[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct ServerInfo {
-    /// The server's version.
-    pub version: String,
-    /// The key that signs desired states.
-    pub key: PublicKey,
-    /// The pin of the authority that made its certificate, if that is its own.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub ca_pin: Option<CaPin>,
-    /// Where MQTT is: the listener's address, `host:port`, as bound, or the external broker's.
-    pub mqtt: String,
-    /// The server's clock.
-    pub now_ms: u64,
-    /// What went over MQTT since the server started.
-    #[serde(default)]
-    pub traffic: MqttTraffic,
-    /// What went over HTTP since then.
-    #[serde(default)]
-    pub http: HttpTraffic,
-    /// What was done about robots that misbehaved since then.
-    #[serde(default)]
-    pub conduct: ConductTotals,
-}
-
-/// What went over HTTP, all connections together, counted at the sockets. In is towards the server.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(default)]
-pub struct HttpTraffic {
-    /// Connections that were taken.
-    pub connections: u64,
-    /// Requests whose head was read.
-    pub requests: u64,
-    /// Bytes, heads and bodies.
-    pub bytes_in: u64,
-    /// Likewise.
-    pub bytes_out: u64,
-}
-
-/// What went over MQTT, all connections together, the server's own watchdog excepted. With an external broker only the
-/// server's own connection to it is known.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(default)]
-pub struct MqttTraffic {
-    /// Robots that are connected now.
-    pub robots_connected: u64,
-    /// Clients that were let in.
-    pub connections_accepted: u64,
-    /// Clients that were turned away: too many, too slow, a wrong password, no MQTT.
-    pub connections_refused: u64,
-    /// Messages that were sent where their sender may not, or could not be stored.
-    pub messages_refused: u64,
-    /// Messages that a listener would have got, had it kept up.
-    pub messages_dropped: u64,
-    /// The connections' own figures, added up.
-    pub all: Traffic,
-}
-
-/// What went over an MQTT connection since it began. In is towards the server.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(default)]
-pub struct Traffic {
-    /// Bytes, with those that were refused.
-    pub bytes_in: u64,
-    /// Likewise.
-    pub bytes_out: u64,
-    /// MQTT control packets, CONNECT included.
-    pub packets_in: u64,
-    /// MQTT control packets, CONNACK included.
-    pub packets_out: u64,
-    /// PUBLISH.
-    pub messages_in: u64,
-    /// PUBLISH.
-    pub messages_out: u64,
-    /// PUBACK.
-    pub acks_in: u64,
-    /// PUBACK.
-    pub acks_out: u64,
-}
-
 /// `POST /enroll` (enrolment token).
 #[derive(Debug, Clone, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct EnrollRequest {
     /// The robot's MAC: its identity towards people.
     pub mac: MacAddress,
@@ -139,6 +84,7 @@ pub struct EnrollRequest {
     pub name: Option<RobotName>,
     /// Its labels.
     #[serde(default)]
+    #[cfg_attr(feature = "openapi", schema(inline))]
     pub labels: Labels,
     /// The key that it can show by a client certificate.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -147,6 +93,7 @@ pub struct EnrollRequest {
 
 /// Answer to an enrolment. The token is shown this once.
 #[derive(Clone, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct EnrollResponse {
     /// The robot's new identity.
     pub robot_id: RobotId,
@@ -163,6 +110,7 @@ pub struct EnrollResponse {
 
 /// Answer to a robot's `POST /robots/{robot}/token`. The token is shown this once; its first use ends the one before.
 #[derive(Clone, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct RobotToken {
     /// The robot's next bearer token and MQTT password.
     pub token: String,
@@ -170,6 +118,7 @@ pub struct RobotToken {
 
 /// `POST /enrollment-tokens` (administer).
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct CreateEnrollmentToken {
     /// Only for this robot, by id or name, which may register again with it.
     #[serde(default)]
@@ -182,6 +131,7 @@ pub struct CreateEnrollmentToken {
     pub ttl_s: Option<u64>,
     /// Labels each robot that uses it gets.
     #[serde(default)]
+    #[cfg_attr(feature = "openapi", schema(inline))]
     pub labels: Labels,
     /// Whether a robot that comes by it waits to be approved, also where the server does not ask that of all.
     #[serde(default)]
@@ -190,6 +140,7 @@ pub struct CreateEnrollmentToken {
 
 /// A new enrolment token. The secret is shown this once.
 #[derive(Clone, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct EnrollmentToken {
     /// The public part of it.
     pub id: String,
@@ -199,15 +150,23 @@ pub struct EnrollmentToken {
     pub expires_at_ms: u64,
 }
 
-/// `GET /robots` (read), optionally `?selector=`.
+/// `GET /robots` (read), optionally `?selector=`, and `?limit=` (1 to 1,000) with `?after=`, a robot's name, for a page.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct RobotList {
     /// Sorted by name.
     pub robots: Vec<RobotView>,
+    /// On a page that is not the last: what `after` has to be for the next one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub next: Option<RobotName>,
+    /// On a page: how many robots all pages have.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub total: Option<u64>,
 }
 
 /// A robot as the operator sees it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct RobotView {
     /// Its identity.
     pub id: RobotId,
@@ -216,6 +175,7 @@ pub struct RobotView {
     /// The MAC it was registered by.
     pub mac: MacAddress,
     /// Its labels.
+    #[cfg_attr(feature = "openapi", schema(inline))]
     pub labels: Labels,
     /// Whether it is connected over MQTT or polls.
     pub online: bool,
@@ -241,19 +201,20 @@ pub struct RobotView {
     /// Its MQTT connection, if it has one; only in `GET /robots/{robot}`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mqtt: Option<MqttConnection>,
-}
-
-/// A robot's MQTT connection.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct MqttConnection {
-    /// When it began.
-    pub since_ms: u64,
-    /// What went over it.
-    pub traffic: Traffic,
+    /// How its machine did last; absent: not said since the server started.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub vitals: Option<Vitals>,
+    /// What was set for it here; absent: nothing.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub settings: Option<RobotSettings>,
+    /// What holds there, as it last said; absent: the agent's defaults.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub effective_settings: Option<EffectiveSettings>,
 }
 
 /// A task on a robot: what is ordered, and where it stands.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct RobotTask {
     /// The task's name.
     pub task: TaskName,
@@ -285,47 +246,42 @@ pub struct RobotTask {
 
 /// `PATCH /robots/{robot}` (maintain): absent fields stay.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct EditRobot {
     /// A new name.
     #[serde(default)]
     pub name: Option<RobotName>,
     /// The new labels, all of them.
     #[serde(default)]
+    #[cfg_attr(feature = "openapi", schema(inline))]
     pub labels: Option<Labels>,
+    /// The new settings, all of them; null: none.
+    #[serde(default, skip_serializing_if = "Option::is_none", deserialize_with = "given")]
+    pub settings: Option<Option<RobotSettings>>,
+}
+
+/// Null is something that was given.
+fn given<'de, D: Deserializer<'de>, T: Deserialize<'de>>(deserializer: D) -> Result<Option<T>, D::Error> {
+    T::deserialize(deserializer).map(Some)
 }
 
 /// Answer to a robot's `POST /robots/{robot}/report`. The report is stored.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct ReportReply {
     /// The generation the robot should have.
     pub generation: Generation,
     /// The name and labels the server holds; the server's win over the robot's own.
     pub name: RobotName,
     /// Likewise.
+    #[cfg_attr(feature = "openapi", schema(inline))]
     pub labels: Labels,
-}
-
-/// `GET /packages` (read).
-#[derive(Debug, Clone, Default, Serialize, Deserialize)]
-pub struct PackageList {
-    /// Sorted by name, then newest first.
-    pub packages: Vec<PackageView>,
-}
-
-/// One package version.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct PackageView {
-    /// The pinned package.
-    pub package: PackageRef,
-    /// When it was pushed.
-    pub pushed_at_ms: u64,
-    /// Its manifest.
-    pub manifest: TaskManifest,
 }
 
 /// `GET /outputs` (read), optionally `?robot=` (id or name) and `?task=`. The files are read from
 /// `/v2/outputs/<robot id>/<task>/blobs/<digest>`.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct OutputList {
     /// The newest first, at most 1,000.
     pub outputs: Vec<OutputView>,
@@ -333,6 +289,7 @@ pub struct OutputList {
 
 /// What one run brought back.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct OutputView {
     /// The robot's name.
     pub robot_name: RobotName,
@@ -347,6 +304,7 @@ pub struct OutputView {
 
 /// `POST /deployments` (operate), with an `Idempotency-Key` header.
 #[derive(Debug, Clone, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct CreateDeployment {
     /// The package's name: its repository.
     pub package: TaskName,
@@ -359,6 +317,7 @@ pub struct CreateDeployment {
     pub delivery: DeliveryChoice,
     /// From -100 to 100: the higher comes first, on the robot and where transfers have to wait.
     #[serde(default)]
+    #[cfg_attr(feature = "openapi", schema(minimum = -100, maximum = 100))]
     pub priority: i32,
     /// How many robots at a time; absent: all at once.
     #[serde(default)]
@@ -393,6 +352,7 @@ impl CreateDeployment {
 
 /// Answer to a dry run, and to an order on tasks: the robots meant.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct MatchedRobots {
     /// Sorted by name.
     pub robots: Vec<MatchedRobot>,
@@ -400,6 +360,7 @@ pub struct MatchedRobots {
 
 /// A robot that a selector matched.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct MatchedRobot {
     /// Its identity.
     pub id: RobotId,
@@ -409,15 +370,21 @@ pub struct MatchedRobot {
     pub online: bool,
 }
 
-/// `GET /deployments` (read): the newest first, without assignments.
+/// `GET /deployments` (read): the newest first, without assignments; optionally `?limit=` (1 to 1,000) with `?before=`, a
+/// deployment's id, for a page.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct DeploymentList {
     /// The deployments.
     pub deployments: Vec<DeploymentView>,
+    /// On a page that is not the last: what `before` has to be for the next one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub next: Option<DeploymentId>,
 }
 
 /// A deployment as the operator sees it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct DeploymentView {
     /// Its identity.
     pub id: DeploymentId,
@@ -425,8 +392,9 @@ pub struct DeploymentView {
     pub package: PackageRef,
     /// Service or job.
     pub kind: TaskKind,
-    /// The selector as it was given.
-    pub selector: Selector,
+    /// The selector as it was given. Absent in lists and events where it is longer than 1,000 characters.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub selector: Option<Selector>,
     /// How the bytes travel, as it was ordered.
     pub delivery: DeliveryChoice,
     /// The higher comes first.
@@ -453,6 +421,7 @@ pub struct DeploymentView {
 
 /// How many assignments stand in a phase.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct PhaseCount {
     /// The phase.
     pub phase: Phase,
@@ -462,6 +431,7 @@ pub struct PhaseCount {
 
 /// Where a deployment stands as a whole.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum DeploymentState {
     /// Some assignment is not settled.
@@ -476,6 +446,7 @@ pub enum DeploymentState {
 
 /// A deployment's part for one robot.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct AssignmentView {
     /// The robot.
     pub robot: RobotId,
@@ -500,10 +471,14 @@ pub struct AssignmentView {
     pub superseded_by: Option<DeploymentId>,
     /// When it last changed.
     pub updated_at_ms: u64,
+    /// The phases it went through, the oldest first; only with `?timeline=true`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub timeline: Option<Vec<TimelineEntry>>,
 }
 
-/// `POST /tasks/{task}/{start|stop|remove}` (operate), with an `Idempotency-Key` header.
+/// `POST /tasks/{task}/{start|stop|restart|remove|rollback}` (operate), with an `Idempotency-Key` header.
 #[derive(Debug, Clone, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct OrderTask {
     /// Which robots; those that have no such task are left out.
     pub selector: Selector,
@@ -515,6 +490,7 @@ pub struct OrderTask {
 /// What `GET /events` (read) streams: each is the `data` of a server-sent event whose `event` is the tag's value.
 /// A view replaces what was known before. After (re)connecting, fetch the lists once.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub enum Event {
     /// A robot is new or has changed.
@@ -536,6 +512,11 @@ pub enum Event {
     Package {
         /// Which.
         name: TaskName,
+    },
+    /// Something happened that is worth a look.
+    Feed {
+        /// What.
+        entry: FeedEntry,
     },
     /// The listener was too slow and missed events: fetch the lists again.
     Missed,

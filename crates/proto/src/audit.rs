@@ -12,6 +12,7 @@ use crate::{Digest, TokenId};
 
 /// One act, as it is written down. Its JSON, byte for byte, is what the chain covers.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct AuditEntry {
     /// 1 for the first; each next one is one higher.
     pub number: u64,
@@ -24,6 +25,7 @@ pub struct AuditEntry {
     pub token: Option<TokenId>,
     /// From where.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "openapi", schema(value_type = Option<String>))]
     pub address: Option<IpAddr>,
     /// What was done, like `deployment.create`.
     pub act: String,
@@ -36,10 +38,12 @@ pub struct AuditEntry {
 
 /// An entry with its place in the chain. Also a line of an export.
 #[derive(Debug, Clone, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct AuditRecord {
     /// The SHA-256 of the digest before it, as text, and of the entry's bytes.
     pub digest: Digest,
     /// An [`AuditEntry`], byte for byte as it was chained.
+    #[cfg_attr(feature = "openapi", schema(value_type = AuditEntry))]
     pub entry: Box<RawValue>,
 }
 

@@ -9,6 +9,7 @@ use base64::engine::general_purpose::STANDARD;
 use serde::{Deserialize, Serialize};
 
 use crate::envelope::Envelope;
+use crate::settings::{RobotSettings, each_readable};
 use crate::{DeploymentId, Digest, Generation, RobotId, TaskName, Version};
 
 /// The largest [`Envelope`], in bytes of JSON, that travels inside an MQTT message; above it only the generation does.
@@ -33,6 +34,9 @@ pub struct DesiredState {
     /// desired: it may change without the generation.
     #[serde(default, skip_serializing_if = "Evidence::is_empty")]
     pub evidence: Evidence,
+    /// What the robot's administrator has set at the server; the robot's own settings win.
+    #[serde(default, skip_serializing_if = "RobotSettings::is_empty", deserialize_with = "each_readable")]
+    pub settings: RobotSettings,
 }
 
 /// Blobs that publishers have signed, see [`crate::publisher`]. That the server names them proves nothing.
@@ -101,6 +105,7 @@ fn is_zero(priority: &i32) -> bool {
 
 /// A package pinned by digest.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct PackageRef {
     /// The package's name.
     pub name: TaskName,
@@ -116,6 +121,7 @@ pub struct PackageRef {
 
 /// Bytes by digest.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct BlobRef {
     /// What they hash to.
     pub digest: Digest,
@@ -132,6 +138,7 @@ impl BlobRef {
 
 /// Whether a task should be running.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Wanted {
     /// Yes.
@@ -142,6 +149,7 @@ pub enum Wanted {
 
 /// How a package's bytes travel to a robot.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum Delivery {
     /// Nothing is published; the robot asks on its own timer.

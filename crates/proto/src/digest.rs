@@ -8,6 +8,7 @@ use sha2::{Digest as _, Sha256};
 
 /// The sha-256 digest of some bytes.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(value_type = String, pattern = "^sha256:[0-9a-f]{64}$", example = "sha256:e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"))]
 #[serde(try_from = "String", into = "String")]
 pub struct Digest([u8; 32]);
 

@@ -17,6 +17,7 @@ pub const DESIRED_STATE_TYPE: &str = "application/vnd.taskd.desired.v1+json";
 
 /// A signed payload: JSON `{"payload": base64, "payloadType": text, "signatures": [{"keyid", "sig": base64}]}`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Envelope {
     payload: String,
     #[serde(rename = "payloadType")]
@@ -25,6 +26,7 @@ pub struct Envelope {
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 struct EnvelopeSignature {
     #[serde(default)]
     keyid: String,
@@ -170,6 +172,7 @@ impl SigningKey {
 
 /// An ed25519 public key, as text standard base64 of its 32 bytes.
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(value_type = String, example = "11qYAYKxCrfVS/7TyWQHOg7hcvPapiMlrwIaaPcHURo="))]
 #[serde(try_from = "String", into = "String")]
 pub struct PublicKey(ed25519_dalek::VerifyingKey);
 

@@ -1,6 +1,7 @@
 //! Names and numbers that identify things: each parsed once at the edge, then passed around as its own type.
 //! It never looks anything up.
 
+use std::borrow::Borrow;
 use std::collections::BTreeMap;
 use std::fmt;
 use std::str::FromStr;
@@ -25,9 +26,14 @@ impl InvalidId {
 
 /// Declares a text identifier: a newtype over `String` that only `FromStr` (and so serde) can make.
 macro_rules! text_id {
-    ($(#[$doc:meta])* $name:ident, $kind:literal, $expected:literal, $valid:expr) => {
+    ($(#[$doc:meta])* $name:ident like $example:literal $pattern:literal, $kind:literal, $expected:literal, $valid:expr) => {
         $(#[$doc])*
         #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+        #[cfg_attr(
+            feature = "openapi",
+            derive(utoipa::ToSchema),
+            schema(value_type = String, example = $example, pattern = $pattern)
+        )]
         #[serde(try_from = "String", into = "String")]
         pub struct $name(String);
 
@@ -50,6 +56,12 @@ macro_rules! text_id {
             type Error = InvalidId;
             fn try_from(text: String) -> Result<Self, InvalidId> {
                 text.parse()
+            }
+        }
+
+        impl Borrow<str> for $name {
+            fn borrow(&self) -> &str {
+                &self.0
             }
         }
 
@@ -82,23 +94,28 @@ fn random_hex(prefix: char) -> String {
 text_id!(
     /// A robot's server-issued identity: `r` and 16 lower-case hex digits. It is also the robot's MQTT client id and
     /// user name, and is never used twice.
-    RobotId, "robot id", "the letter r and 16 lower-case hex digits", |t| is_prefixed_hex(t, 'r')
+    RobotId like "r00000000000000a1" r"^r[0-9a-f]{16}$",
+    "robot id", "the letter r and 16 lower-case hex digits", |t| is_prefixed_hex(t, 'r')
 );
 text_id!(
     /// An operator's order: `d` and 16 lower-case hex digits.
-    DeploymentId, "deployment id", "the letter d and 16 lower-case hex digits", |t| is_prefixed_hex(t, 'd')
+    DeploymentId like "d00000000000000a1" r"^d[0-9a-f]{16}$",
+    "deployment id", "the letter d and 16 lower-case hex digits", |t| is_prefixed_hex(t, 'd')
 );
 text_id!(
     /// One start of an agent: `i` and 16 lower-case hex digits.
-    InstanceId, "instance id", "the letter i and 16 lower-case hex digits", |t| is_prefixed_hex(t, 'i')
+    InstanceId like "i00000000000000a1" r"^i[0-9a-f]{16}$",
+    "instance id", "the letter i and 16 lower-case hex digits", |t| is_prefixed_hex(t, 'i')
 );
 text_id!(
     /// A question to a robot: `q` and 16 lower-case hex digits.
-    RequestId, "request id", "the letter q and 16 lower-case hex digits", |t| is_prefixed_hex(t, 'q')
+    RequestId like "q00000000000000a1" r"^q[0-9a-f]{16}$",
+    "request id", "the letter q and 16 lower-case hex digits", |t| is_prefixed_hex(t, 'q')
 );
 text_id!(
     /// A node's, topic's or service's full name on a ROS graph, `/robot/scan`; from the ROS 2 design article on names.
-    GraphName, "ROS name", "like /robot/scan: letters, digits and '_' in parts that begin with no digit, at most 255 bytes", |t| {
+    GraphName like "/robot/scan" r"^(/[A-Za-z_][A-Za-z0-9_]*)+$",
+    "ROS name", "like /robot/scan: letters, digits and '_' in parts that begin with no digit, at most 255 bytes", |t| {
         let part_ok = |part: &str| {
             part.bytes().next().is_some_and(|b| b.is_ascii_alphabetic() || b == b'_')
                 && part.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'_')
@@ -109,7 +126,8 @@ text_id!(
 text_id!(
     /// The name of a package and of the task it becomes on a robot. It is one component of an OCI repository name, so it
     /// is also safe as a file name.
-    TaskName, "package name",
+    TaskName like "corridor_mapping" r"^[a-z0-9]+([._-][a-z0-9]+)*$",
+    "package name",
     "at most 64 lower-case letters and digits, joined by single '.', '_' or '-'", |t| {
         let edge = |b: u8| b.is_ascii_lowercase() || b.is_ascii_digit();
         let bytes = t.as_bytes();
@@ -123,7 +141,8 @@ text_id!(
 );
 text_id!(
     /// A package's version; it is used as an OCI tag.
-    Version, "version", "at most 128 letters, digits, '.', '_' and '-', not starting with '.' or '-'", |t| {
+    Version like "1.0.0" r"^[A-Za-z0-9_][A-Za-z0-9._-]{0,127}$",
+    "version", "at most 128 letters, digits, '.', '_' and '-', not starting with '.' or '-'", |t| {
         t.len() <= 128
             && t.bytes().next().is_some_and(|b| b.is_ascii_alphanumeric() || b == b'_')
             && t.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-'))
@@ -131,7 +150,8 @@ text_id!(
 );
 text_id!(
     /// An OCI repository's name; that of a package's repository is its [`TaskName`].
-    RepositoryName, "repository name",
+    RepositoryName like "corridor_mapping" r"^[a-z0-9]+((\.|_|__|-+)[a-z0-9]+)*(/[a-z0-9]+((\.|_|__|-+)[a-z0-9]+)*)*$",
+    "repository name",
     "at most 255 bytes of components joined by '/', each lower-case letters and digits joined by one '.', one or two '_' \
      or any number of '-'", |t| {
         t.len() <= 255 && t.split('/').all(is_repository_component)
@@ -147,7 +167,8 @@ impl RepositoryName {
 text_id!(
     /// A file that came back from a task, by its path below the task's directory. It can't leave the directory it is
     /// written into.
-    OutputPath, "path of an output",
+    OutputPath like "maps/corridor.pgm" r"^[^/]+(/[^/]+)*$",
+    "path of an output",
     "at most 1024 bytes of printable names, none of them '.' or '..', joined by single '/'", |t| {
         t.len() <= 1024
             && !t.chars().any(char::is_control)
@@ -156,7 +177,8 @@ text_id!(
 );
 text_id!(
     /// A name for a manifest inside its repository.
-    Tag, "tag", "at most 128 letters, digits, '.', '_' and '-', not starting with '.' or '-'", |t| {
+    Tag like "1.0.0" r"^[A-Za-z0-9_][A-Za-z0-9._-]{0,127}$",
+    "tag", "at most 128 letters, digits, '.', '_' and '-', not starting with '.' or '-'", |t| {
         t.len() <= 128
             && t.bytes().next().is_some_and(|b| b.is_ascii_alphanumeric() || b == b'_')
             && t.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-'))
@@ -164,7 +186,8 @@ text_id!(
 );
 text_id!(
     /// The name people give a robot.
-    RobotName, "robot name", "1 to 64 letters, digits, '.', '_' and '-', not starting with '.' or '-'", |t| {
+    RobotName like "atlas-1" r"^[A-Za-z0-9_][A-Za-z0-9._-]{0,63}$",
+    "robot name", "1 to 64 letters, digits, '.', '_' and '-', not starting with '.' or '-'", |t| {
         t.len() <= 64
             && t.bytes().next().is_some_and(|b| b.is_ascii_alphanumeric() || b == b'_')
             && t.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-'))
@@ -172,25 +195,41 @@ text_id!(
 );
 text_id!(
     /// A person's name: what they sign in with, and how the audit names them.
-    UserName, "user name", "1 to 64 lower-case letters, digits, '.', '_', '-' and '@', starting with a letter or digit", |t| {
+    UserName like "alice" r"^[a-z0-9][a-z0-9._@-]{0,63}$",
+    "user name", "1 to 64 lower-case letters, digits, '.', '_', '-' and '@', starting with a letter or digit", |t| {
         t.len() <= 64
             && t.bytes().next().is_some_and(|b| b.is_ascii_lowercase() || b.is_ascii_digit())
             && t.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || matches!(b, b'.' | b'_' | b'-' | b'@'))
     }
 );
 text_id!(
+    /// A file or directory on a robot, as its administrator names it.
+    AbsolutePath like "/opt/ros/jazzy/setup.bash" r"^/",
+    "absolute path",
+    "it starts with '/', has at most 1024 bytes, no '.' or '..' between its '/', and only printable characters", |t| {
+        let turns = |c: char| matches!(c, '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
+        t.len() <= 1024
+            && t.starts_with('/')
+            && !t.chars().any(|c| c.is_control() || turns(c))
+            && !t.split('/').any(|name| matches!(name, "." | ".."))
+    }
+);
+text_id!(
     /// The public part of a token, by which it is listed and revoked: 12 lower-case hex digits.
-    TokenId, "token id", "12 lower-case hex digits", |t| t.len() == 12 && is_lower_hex(t)
+    TokenId like "0123456789ab" r"^[0-9a-f]{12}$",
+    "token id", "12 lower-case hex digits", |t| t.len() == 12 && is_lower_hex(t)
 );
 text_id!(
     /// A label's key.
-    LabelKey, "label key", "1 to 63 letters, digits, '.', '_', '/' and '-'", |t| {
+    LabelKey like "site" r"^[A-Za-z0-9._/-]{1,63}$",
+    "label key", "1 to 63 letters, digits, '.', '_', '/' and '-'", |t| {
         !t.is_empty() && is_label_text(t)
     }
 );
 text_id!(
     /// A label's value; it may be empty.
-    LabelValue, "label value", "at most 63 letters, digits, '.', '_', '/' and '-'", is_label_text
+    LabelValue like "lab" r"^[A-Za-z0-9._/-]{0,63}$",
+    "label value", "at most 63 letters, digits, '.', '_', '/' and '-'", is_label_text
 );
 
 fn is_repository_component(text: &str) -> bool {
@@ -239,6 +278,7 @@ impl InstanceId {
 
 /// The number of a robot's desired state. It only grows; zero means "none yet".
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(transparent)]
 pub struct Generation(pub u64);
 
@@ -257,6 +297,7 @@ impl fmt::Display for Generation {
 
 /// An IEEE 802 MAC-48 address, written `aa:bb:cc:dd:ee:ff`; `-` as separator and capitals are read as well.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(value_type = String, pattern = "^[0-9A-Fa-f]{2}([:-][0-9A-Fa-f]{2}){5}$", example = "02:00:00:00:00:01"))]
 #[serde(try_from = "String", into = "String")]
 pub struct MacAddress([u8; 6]);
 

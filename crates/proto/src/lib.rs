@@ -3,6 +3,7 @@
 
 pub mod api;
 pub mod audit;
+pub mod checkup;
 pub mod desired;
 pub mod digest;
 pub mod envelope;
@@ -20,13 +21,15 @@ pub mod report;
 pub mod request;
 pub mod ros;
 pub mod selector;
+pub mod settings;
 pub mod time;
 pub mod token;
 pub mod topic;
+pub mod vitals;
 
 pub use digest::Digest;
 pub use id::{
-    DeploymentId, Generation, InstanceId, MacAddress, RepositoryName, RobotId, RobotName, Tag, TaskName, TokenId,
-    UserName, Version,
+    AbsolutePath, DeploymentId, Generation, InstanceId, MacAddress, RepositoryName, RobotId, RobotName, Tag, TaskName,
+    TokenId, UserName, Version,
 };
 pub use pin::CaPin;

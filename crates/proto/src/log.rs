@@ -19,6 +19,7 @@ pub const MAX_BATCH_BYTES: usize = 200 * 1024;
 
 /// How serious a line is: the five levels of ROS, each more serious than the one before.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum LogLevel {
     /// For whoever wrote the program.
@@ -36,6 +37,7 @@ pub enum LogLevel {
 
 /// Where a line comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum LogSource {
     /// The task's standard output.
@@ -55,6 +57,7 @@ pub enum LogSource {
 
 /// One line.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct LogLine {
     /// When, by the robot's clock: milliseconds since the Unix epoch.
     pub at_ms: u64,
@@ -74,6 +77,7 @@ pub struct LogLine {
 
 /// What a robot publishes on its `log` topic, and part of the answer to [`crate::request::Ask::Logs`].
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct LogBatch {
     /// Who speaks.
     pub robot_id: RobotId,

@@ -29,6 +29,7 @@ pub const CONTENT_RATIO_FREE_BYTES: u64 = 64 << 20;
 
 /// What a package is and how it is built, run and watched.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct TaskManifest {
     /// The package's and the task's name.
     pub name: TaskName,
@@ -63,6 +64,7 @@ pub struct TaskManifest {
 
 /// How a package is built on the robot.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Build {
     /// The build tool.
     #[serde(default)]
@@ -71,6 +73,7 @@ pub struct Build {
 
 /// A build tool.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum BuildTool {
     /// `colcon build`, ROS 2.
@@ -84,6 +87,7 @@ pub enum BuildTool {
 
 /// How a task is run. Exactly one of `launch` and `exec` is given.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Run {
     /// Package and launch file for `ros2 launch`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -136,6 +140,7 @@ fn default_stop_timeout_s() -> u32 {
 
 /// Whether a task keeps running or ends.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum TaskKind {
     /// Keeps running.
@@ -147,6 +152,7 @@ pub enum TaskKind {
 
 /// What a reboot does to a task.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum OnBoot {
     /// It is started.
@@ -158,6 +164,7 @@ pub enum OnBoot {
 
 /// When a process that ended by itself is started again.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum Restart {
     /// When it failed.
@@ -171,6 +178,7 @@ pub enum Restart {
 
 /// What must hold before a task counts as running.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Ready {
     /// Nodes that must be on the graph.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -207,6 +215,7 @@ impl Default for Ready {
 
 /// What must hold of a topic beside having a publisher.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct ReadyTopic {
     /// Messages a second it must carry.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -223,6 +232,7 @@ fn default_ready_timeout_s() -> u32 {
 
 /// Files that come back to the server when the task ends.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Outputs {
     /// Glob patterns below the task's directory.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -231,9 +241,11 @@ pub struct Outputs {
 
 /// What a robot must have; an empty list accepts anything.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Requires {
     /// Labels the robot must carry.
     #[serde(default, skip_serializing_if = "Labels::is_empty")]
+    #[cfg_attr(feature = "openapi", schema(inline))]
     pub labels: Labels,
     /// ROS distributions, any of which will do.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -245,6 +257,7 @@ pub struct Requires {
 
 /// What a task may use of the robot; enforced where the robot has control groups.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Limits {
     /// Memory of all its processes together, in MiB.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -266,6 +279,7 @@ impl Limits {
 
 /// What the packer measured of the content blob, so that a robot knows before it pulls.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct ContentFacts {
     /// Digest of the uncompressed tar.
     pub tar_digest: Digest,

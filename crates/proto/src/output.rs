@@ -19,6 +19,7 @@ pub const MAX_FILES: usize = 256;
 
 /// The files of one run.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct OutputSet {
     /// The robot it ran on.
     pub robot_id: RobotId,
@@ -36,6 +37,7 @@ pub struct OutputSet {
 
 /// One file.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct OutputFile {
     /// Its path below the directory the task ran in.
     pub path: OutputPath,

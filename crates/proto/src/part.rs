@@ -53,6 +53,7 @@ pub struct Part<'a> {
 
 /// A run of parts that a robot lacks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct PartRange {
     /// The first, from 0.
     pub from: u32,

@@ -15,6 +15,7 @@ use serde::{Deserialize, Serialize};
 
 /// What a route of the API, or a part of it, takes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Permission {
     /// See robots, deployments, packages, logs and outputs, and pull packages.
@@ -54,6 +55,7 @@ impl fmt::Display for Permission {
 
 /// A fixed set of permissions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Role {
     /// Looks.
@@ -114,6 +116,7 @@ impl FromStr for Role {
 
 /// One role or several: who has several may do what any of them allows. On the wire a list of names.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(value_type = Vec<Role>, min_items = 1))]
 #[serde(try_from = "Vec<Role>", into = "Vec<Role>")]
 pub struct Roles(BTreeSet<Role>);
 

@@ -15,6 +15,7 @@ pub const PINNED_PROTOCOL: &[u8] = b"taskd-pinned";
 
 /// The SHA-256 of an authority's SubjectPublicKeyInfo (DER), 64 hex digits. Its certificate may be made anew.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(value_type = String, pattern = "^[0-9a-f]{64}$", example = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"))]
 #[serde(try_from = "String", into = "String")]
 pub struct CaPin([u8; 32]);
 

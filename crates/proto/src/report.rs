@@ -9,10 +9,12 @@ use serde::{Deserialize, Serialize};
 use crate::desired::{PackageRef, Wanted};
 use crate::manifest::TaskKind;
 use crate::part::PartRange;
-use crate::{DeploymentId, Generation, InstanceId, MacAddress, RobotId, TaskName, Version};
+use crate::settings::{EffectiveSettings, tolerant};
+use crate::{DeploymentId, Digest, Generation, InstanceId, MacAddress, RobotId, TaskName, Version};
 
 /// A robot's whole state. A later one replaces an earlier one; (start, seq) says which is later.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Report {
     /// Who speaks.
     pub robot_id: RobotId,
@@ -42,6 +44,7 @@ pub struct Report {
 
 /// What earlier transfers have shown of a robot's way to the server.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct LinkFacts {
     /// Moving average of fetches; absent before the first that was long enough to measure.
@@ -58,6 +61,7 @@ pub struct LinkFacts {
 
 /// What the agent found out about its machine.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct HostFacts {
     /// The agent's version.
     pub agent_version: String,
@@ -87,10 +91,14 @@ pub struct HostFacts {
     /// runs whatever its server orders.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub publishers: Option<u64>,
+    /// What holds of all that can be set for it; absent where everything is the agent's default.
+    #[serde(default, skip_serializing_if = "Option::is_none", deserialize_with = "tolerant")]
+    pub settings: Option<EffectiveSettings>,
 }
 
 /// How tasks on a robot meet ROS.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct RosFacts {
     /// The distribution tasks use unless they require another, for example `jazzy`.
     pub distro: String,
@@ -107,6 +115,7 @@ pub struct RosFacts {
 
 /// What keeps tasks from using more than their limits.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Isolation {
     /// A control group per task, with its controllers.
@@ -119,6 +128,7 @@ pub enum Isolation {
 
 /// A condition of the whole robot, with a stable code and a text for people.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Condition {
     /// For programs: `held`, `state_refused`, `settings_differ`, …
     pub code: String,
@@ -128,6 +138,7 @@ pub struct Condition {
 
 /// One task in a robot's ledger.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct TaskReport {
     /// The task's name.
     pub task: TaskName,
@@ -172,17 +183,22 @@ pub struct TaskReport {
 
 /// The version of a task that is running.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct ActiveVersion {
     /// The order that brought it.
     pub deployment: DeploymentId,
     /// Its version.
     pub version: Version,
+    /// The digest of its manifest, as several may have one version. Older agents don't say it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub manifest: Option<Digest>,
     /// The task's process id on the robot.
     pub pid: u32,
 }
 
 /// How far a phase has come.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Progress {
     /// Bytes done.
     pub done: u64,
@@ -192,6 +208,7 @@ pub struct Progress {
 
 /// Where an assignment stands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Phase {
     /// Ordered; the robot has not begun.
@@ -317,6 +334,7 @@ impl fmt::Display for Phase {
 
 /// Why something failed: a stable code for programs and a text that says what and where.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Failure {
     /// For programs.
     pub code: FailureCode,
@@ -341,6 +359,7 @@ impl fmt::Display for Failure {
 
 /// A failure's stable code. Codes of newer versions pass through unchanged; of what is none, only what could be one is kept.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(value_type = String, example = "process_exited"))]
 #[serde(from = "String")]
 pub struct FailureCode(Cow<'static, str>);
 

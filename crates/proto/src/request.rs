@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 use crate::id::{GraphName, RequestId};
 use crate::log::{LogBatch, LogLevel};
 use crate::ros::{LifecycleState, NodeDetail, NodeSummary, Parameter, TopicSummary, Transition};
+use crate::vitals::Vitals;
 use crate::{RobotId, TaskName};
 
 /// The largest reply, in bytes of JSON; a broker of ours takes packets up to 256 KiB.
@@ -26,6 +27,7 @@ pub struct Request {
 
 /// What can be asked of a robot. Also the body of `POST /robots/{robot}/ask` (read, or operate if it changes something).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub enum Ask {
     /// The nodes on its ROS graph.
@@ -84,6 +86,8 @@ pub enum Ask {
         /// For how many milliseconds.
         lease_ms: u64,
     },
+    /// How its machine does now.
+    Vitals,
     /// A question of a newer version; it is refused as `unsupported`.
     #[serde(other)]
     Unknown,
@@ -120,6 +124,7 @@ pub enum Outcome {
 
 /// An answer, of the kind that was asked for.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub enum Answer {
     /// To [`Ask::Nodes`].
@@ -162,6 +167,8 @@ pub enum Answer {
     Logs(LogBatch),
     /// To [`Ask::Follow`].
     Following,
+    /// To [`Ask::Vitals`].
+    Vitals(Vitals),
 }
 
 /// Why a robot gives no answer: a stable code for programs, a sentence for people.

@@ -8,6 +8,7 @@ pub use crate::id::GraphName;
 
 /// A lifecycle node's primary or transition state, as in `lifecycle_msgs/msg/State`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum LifecycleState {
     /// Created, not configured.
@@ -38,6 +39,7 @@ impl LifecycleState {
 
 /// What a lifecycle node can be asked for, as in `lifecycle_msgs/msg/Transition`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Transition {
     /// Unconfigured to inactive.
@@ -70,6 +72,7 @@ impl Transition {
 
 /// A node in a list.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct NodeSummary {
     /// Its full name.
     pub name: GraphName,
@@ -83,6 +86,7 @@ pub struct NodeSummary {
 
 /// A node with its endpoints.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct NodeDetail {
     /// Name, task and state.
     #[serde(flatten)]
@@ -99,6 +103,7 @@ pub struct NodeDetail {
 
 /// A topic or service at a node.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Endpoint {
     /// Its full name.
     pub name: GraphName,
@@ -109,6 +114,7 @@ pub struct Endpoint {
 
 /// A topic with who is at its ends.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct TopicSummary {
     /// Its full name.
     pub name: GraphName,
@@ -122,6 +128,7 @@ pub struct TopicSummary {
 
 /// A node's parameter. Its value is a truth value, a number, a text, a list of one of these, or null where it is not set.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Parameter {
     /// Its name.
     pub name: String,

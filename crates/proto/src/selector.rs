@@ -1,12 +1,14 @@
-//! Which robots an order is for. `*` is every robot; commas separate alternatives; within one, `&` joins conditions; a
-//! condition is `label=value` or a robot's name or id.
+//! Which robots an order is for. `*` is every robot; commas separate terms, each of which adds robots, or takes them away if
+//! it begins with `!`, wherever it stands; within a term, `&` joins conditions; a condition is `label=value` or a robot's
+//! name or id. Where no term adds any, those of all robots are left that none takes away.
 //!
 //! ```
 //! use task_proto::selector::Selector;
-//! let selector: Selector = "site=lab&base=turtlebot,spare-1".parse().unwrap();
-//! assert_eq!(selector.to_string(), "site=lab&base=turtlebot,spare-1");
+//! let selector: Selector = "site=lab&base=turtlebot,spare-1,!arm".parse().unwrap();
+//! assert_eq!(selector.to_string(), "site=lab&base=turtlebot,spare-1,!arm");
 //! ```
 
+use std::collections::HashSet;
 use std::fmt;
 use std::str::FromStr;
 
@@ -17,8 +19,26 @@ use crate::{RobotId, RobotName};
 
 /// A parsed selector.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(value_type = String, example = "site=lab,spare-1"))]
 #[serde(try_from = "String", into = "String")]
-pub struct Selector(Vec<Vec<Condition>>);
+pub struct Selector(Box<Parsed>);
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Parsed {
+    /// As it was written, without the spaces.
+    text: String,
+    adds: Terms,
+    takes_away: Terms,
+}
+
+/// Robots that meet one of the terms.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+struct Terms {
+    /// Terms that are but a name or an id: as many as there are robots, and so looked up.
+    named: HashSet<RobotName>,
+    /// The others: a robot has to meet all conditions of one.
+    described: Vec<Vec<Condition>>,
+}
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum Condition {
@@ -29,48 +49,82 @@ enum Condition {
 
 /// A text that is not a selector.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{part:?} in the selector is none of \"*\", a robot's name or id, and label=value")]
-pub struct InvalidSelector {
-    part: String,
+pub enum InvalidSelector {
+    /// One of its parts is nothing that there is.
+    #[error(
+        "{0:?} in the selector is none of \"*\", a robot's name or id, and label=value, with or without \"!\" before it"
+    )]
+    Part(String),
+    /// It is longer than [`MAX_SELECTOR_BYTES`].
+    #[error("a selector of {0} bytes is too long: it may have {MAX_SELECTOR_BYTES}")]
+    TooLong(usize),
 }
 
-/// The most bytes a selector's text may have.
-const MAX_SELECTOR_BYTES: usize = 64 * 1024;
+/// The most bytes a selector's text may have: ten thousand robots by their ids.
+pub const MAX_SELECTOR_BYTES: usize = 200 * 1024;
 
 impl Selector {
     /// Whether a robot with this id, name and labels is meant.
     pub fn matches(&self, id: &RobotId, name: &RobotName, labels: &Labels) -> bool {
-        self.0.iter().any(|all| {
-            all.iter().all(|condition| match condition {
-                Condition::Everyone => true,
-                Condition::Label(key, value) => labels.get(key) == Some(value),
-                Condition::NameOrId(text) => text == name || text.as_str() == id.as_str(),
-            })
-        })
+        let Parsed { adds, takes_away, .. } = &*self.0;
+        (adds.is_empty() || adds.have(id, name, labels)) && !takes_away.have(id, name, labels)
+    }
+}
+
+impl Terms {
+    fn is_empty(&self) -> bool {
+        self.named.is_empty() && self.described.is_empty()
+    }
+
+    fn have(&self, id: &RobotId, name: &RobotName, labels: &Labels) -> bool {
+        let is_met = |condition: &Condition| match condition {
+            Condition::Everyone => true,
+            Condition::Label(key, value) => labels.get(key) == Some(value),
+            Condition::NameOrId(text) => text == name || text.as_str() == id.as_str(),
+        };
+        self.named.contains(name.as_str())
+            || self.named.contains(id.as_str())
+            || self.described.iter().any(|all| all.iter().all(is_met))
+    }
+
+    fn add(&mut self, mut all: Vec<Condition>) {
+        match (all.pop(), all.is_empty()) {
+            (Some(Condition::NameOrId(text)), true) => _ = self.named.insert(text),
+            (last, _) => self.described.push(all.into_iter().chain(last).collect()),
+        }
+    }
+}
+
+impl FromStr for Condition {
+    type Err = InvalidSelector;
+    fn from_str(part: &str) -> Result<Self, InvalidSelector> {
+        let invalid = || InvalidSelector::Part(part.chars().take(80).collect());
+        if part == "*" {
+            return Ok(Self::Everyone);
+        }
+        if let Some((key, value)) = part.split_once('=') {
+            let key = key.parse().map_err(|_| invalid())?;
+            return Ok(Self::Label(key, value.parse().map_err(|_| invalid())?));
+        }
+        part.parse().map(Self::NameOrId).map_err(|_| invalid())
     }
 }
 
 impl FromStr for Selector {
     type Err = InvalidSelector;
     fn from_str(text: &str) -> Result<Self, InvalidSelector> {
-        let invalid = |part: &str| InvalidSelector { part: part.chars().take(80).collect() };
         if text.len() > MAX_SELECTOR_BYTES {
-            return Err(invalid(text));
+            return Err(InvalidSelector::TooLong(text.len()));
         }
-        let condition = |part: &str| {
-            let part = part.trim();
-            if part == "*" {
-                return Ok(Condition::Everyone);
-            }
-            if let Some((key, value)) = part.split_once('=') {
-                let key = key.parse().map_err(|_| invalid(part))?;
-                return Ok(Condition::Label(key, value.parse().map_err(|_| invalid(part))?));
-            }
-            part.parse().map(Condition::NameOrId).map_err(|_| invalid(part))
-        };
-        let alternatives: Result<_, _> =
-            text.split(',').map(|all| all.split('&').map(condition).collect::<Result<Vec<_>, _>>()).collect();
-        alternatives.map(Self)
+        let (mut adds, mut takes_away) = (Terms::default(), Terms::default());
+        for term in text.split(',') {
+            let without = term.trim_start().strip_prefix('!');
+            let all = without.unwrap_or(term).split('&').map(|part| part.trim().parse()).collect::<Result<_, _>>()?;
+            if without.is_some() { takes_away.add(all) } else { adds.add(all) }
+        }
+        // Within what is valid there are none.
+        let text = text.split_whitespace().collect();
+        Ok(Self(Box::new(Parsed { text, adds, takes_away })))
     }
 }
 
@@ -83,24 +137,13 @@ impl TryFrom<String> for Selector {
 
 impl From<Selector> for String {
     fn from(selector: Selector) -> String {
-        selector.to_string()
+        selector.0.text
     }
 }
 
 impl fmt::Display for Selector {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        for (i, all) in self.0.iter().enumerate() {
-            f.write_str(if i > 0 { "," } else { "" })?;
-            for (j, condition) in all.iter().enumerate() {
-                f.write_str(if j > 0 { "&" } else { "" })?;
-                match condition {
-                    Condition::Everyone => f.write_str("*")?,
-                    Condition::Label(key, value) => write!(f, "{key}={value}")?,
-                    Condition::NameOrId(text) => write!(f, "{text}")?,
-                }
-            }
-        }
-        Ok(())
+        f.write_str(&self.0.text)
     }
 }
 
@@ -115,8 +158,32 @@ mod tests {
         let labels: Labels = [("site", "lab"), ("base", "turtlebot")]
             .map(|(k, v)| (k.parse().expect("valid"), v.parse().expect("valid")))
             .into();
-        let yes = ["*", "Atlas-1", id.as_str(), "site=lab", "site=lab&base=turtlebot", "nobody,site=lab", "*&site=lab"];
-        let no = ["atlas-1", "site=field", "site=lab&base=husky", "Atlas-1&site=field"];
+        let yes = [
+            "*",
+            "Atlas-1",
+            id.as_str(),
+            "site=lab",
+            "site=lab&base=turtlebot",
+            "nobody,site=lab",
+            "*&site=lab",
+            "!Atlas-2",
+            "!site=lab&base=husky",
+            "site=lab,!arm",
+            "!arm,!site=field",
+        ];
+        let no = [
+            "atlas-1",
+            "site=field",
+            "site=lab&base=husky",
+            "Atlas-1&site=field",
+            "!Atlas-1",
+            "!*",
+            "*,!*",
+            "site=lab,!Atlas-1",
+            "!Atlas-1,site=lab",
+            "!site=lab&base=turtlebot",
+            "nobody,!arm",
+        ];
         for (text, expected) in yes.map(|t| (t, true)).into_iter().chain(no.map(|t| (t, false))) {
             let selector: Selector = text.parse().expect(text);
             assert_eq!(selector.matches(&id, &name, &labels), expected, "{text}");
@@ -126,8 +193,30 @@ mod tests {
 
     #[test]
     fn nonsense_is_refused_by_part() {
-        for bad in ["", ",", "a,,b", "a&", "=x", "a b", "site=l ab", "**"] {
+        for bad in ["", ",", "a,,b", "a&", "=x", "a b", "site=l ab", "**", "!", "!!a", "a&!b", "!,a"] {
             assert!(bad.parse::<Selector>().is_err(), "{bad:?}");
         }
+    }
+
+    #[test]
+    fn as_many_robots_are_meant_by_id_as_there_are() {
+        let robots: Vec<RobotId> = (0..10_000).map(|_| RobotId::random()).collect();
+        let (name, labels): (RobotName, _) = ("atlas".parse().expect("valid"), Labels::new());
+        let stranger = RobotId::random();
+        for (without, is_meant) in [("", true), ("!", false)] {
+            let text = robots.iter().map(|id| format!("{without}{id}")).collect::<Vec<_>>().join(",");
+            let selector: Selector = text.parse().expect("it fits");
+            assert!(robots.iter().all(|id| selector.matches(id, &name, &labels) == is_meant));
+            assert_eq!(selector.matches(&stranger, &name, &labels), !is_meant);
+            assert_eq!(selector.to_string(), text);
+        }
+        let text = "a,".repeat(MAX_SELECTOR_BYTES / 2) + "a";
+        assert_eq!(text.parse::<Selector>(), Err(InvalidSelector::TooLong(MAX_SELECTOR_BYTES + 1)));
+    }
+
+    #[test]
+    fn spaces_between_the_parts_are_left_out() {
+        let selector: Selector = " site=lab & arm,! cart ".parse().expect("valid");
+        assert_eq!(selector.to_string(), "site=lab&arm,!cart");
     }
 }

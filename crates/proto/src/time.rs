@@ -1,4 +1,7 @@
-//! Civil time, in UTC, of milliseconds since the Unix epoch, and back. It never asks what time it is.
+//! Civil time, in UTC, of milliseconds since the Unix epoch, and back; and lengths of time as people say them. It never asks what
+//! time it is.
+
+use std::time::Duration;
 
 /// The last millisecond of the year 9999: what lies beyond has no text of its own.
 const LAST_MS: u64 = 253_402_300_799_999;
@@ -47,6 +50,16 @@ pub fn parse_timestamp(text: &str) -> Option<u64> {
     Some((((days * 24 + hour) * 60 + minute) * 60 + second) * 1000 + millisecond)
 }
 
+/// A time in its two largest units.
+pub fn span(time: Duration) -> String {
+    match time.as_secs() {
+        seconds @ ..60 => format!("{seconds} s"),
+        seconds @ 60..3600 => format!("{} min {} s", seconds / 60, seconds % 60),
+        seconds @ 3600..86_400 => format!("{} h {} min", seconds / 3600, seconds / 60 % 60),
+        seconds => format!("{} d {} h", seconds / 86_400, seconds / 3600 % 24),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -79,5 +92,11 @@ mod tests {
         ] {
             assert_eq!(parse_timestamp(text), None, "{text}");
         }
+    }
+
+    #[test]
+    fn times_have_two_units() {
+        let spans = [5, 61, 7260, 90_000].map(|seconds| span(Duration::from_secs(seconds)));
+        assert_eq!(spans, ["5 s", "1 min 1 s", "2 h 1 min", "1 d 1 h"]);
     }
 }

@@ -19,6 +19,7 @@ use crate::{Digest, RobotId};
 
 /// The levels all topics start with: no leading or trailing `/`, no wildcard, at most 64 bytes.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(value_type = String, pattern = "^[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*$", example = "tasks"))]
 #[serde(try_from = "String", into = "String")]
 pub struct TopicPrefix(String);
 
@@ -45,7 +46,7 @@ pub enum RobotTopic {
     Report,
     /// Robot to server: a [`crate::report::Status`]; its last will as well.
     Status,
-    /// Robot to server: measurements.
+    /// Robot to server: a [`crate::vitals::Telemetry`].
     Telemetry,
     /// Robot to server: log lines.
     Log,

@@ -7,6 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use task_proto::{DeploymentId, RobotId, TaskName};
 use tokio::sync::{Notify, broadcast, watch};
 
+use crate::happening::Happening;
 use crate::part_requests::PartRequests;
 use crate::store::KnownRobot;
 
@@ -26,6 +27,8 @@ pub enum Change {
     Deployment(DeploymentId),
     /// A package was pushed or deleted.
     Package(TaskName),
+    /// The feed has an entry with this number.
+    Feed(u64),
 }
 
 /// What a write has changed, collected on the way and announced after its commit.
@@ -37,12 +40,15 @@ pub struct Consequences {
     pub rings: BTreeSet<RobotId>,
     /// Deployments that are new or have changed.
     pub deployments: BTreeSet<DeploymentId>,
+    /// What is worth a look.
+    pub happenings: Vec<Happening>,
 }
 
 /// Where changes are announced. Clones announce to the same listeners.
 #[derive(Debug, Clone)]
 pub struct Changes {
     notices: broadcast::Sender<Change>,
+    happenings: broadcast::Sender<Happening>,
     bells: Arc<Bells>,
     rights: Arc<watch::Sender<()>>,
     part_requests: PartRequests,
@@ -69,6 +75,7 @@ impl Changes {
     pub fn new() -> Self {
         Self {
             notices: broadcast::Sender::new(NOTICES),
+            happenings: broadcast::Sender::new(NOTICES),
             bells: Arc::default(),
             rights: Arc::new(watch::Sender::new(())),
             part_requests: PartRequests::default(),
@@ -100,6 +107,16 @@ impl Changes {
         let _ = self.notices.send(change);
     }
 
+    /// Tells the feed that something has happened; nobody listening is fine.
+    pub fn happened(&self, happening: Happening) {
+        let _ = self.happenings.send(happening);
+    }
+
+    /// Everything that happens from now on.
+    pub fn happenings(&self) -> broadcast::Receiver<Happening> {
+        self.happenings.subscribe()
+    }
+
     /// Announces all that a write has changed. To be called after its commit.
     pub fn publish(&self, consequences: Consequences) {
         for robot in consequences.robots.union(&consequences.rings) {
@@ -108,6 +125,7 @@ impl Changes {
         for deployment in consequences.deployments {
             self.announce(Change::Deployment(deployment));
         }
+        consequences.happenings.into_iter().for_each(|happening| self.happened(happening));
         self.ring(consequences.rings);
     }
 

@@ -73,6 +73,8 @@ pub struct Config {
     pub oidc: OidcSettings,
     /// The most bytes one blob may have.
     pub max_blob_bytes: u64,
+    /// The most bytes that are unpacked of a package that comes as a directory.
+    pub max_upload_bytes: u64,
     /// How packages travel to robots.
     pub delivery: DeliverySettings,
     /// What bounds the transfers of packages over HTTP.
@@ -274,6 +276,7 @@ impl Config {
             trusted_proxies: Vec::new(),
             oidc: OidcSettings::default(),
             max_blob_bytes: 16 << 30,
+            max_upload_bytes: 4 << 30,
             delivery: DeliverySettings::default(),
             transfers: TransferLimits::default(),
             robots: ConductLimits::default(),

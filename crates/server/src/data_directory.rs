@@ -20,6 +20,13 @@ const AUTHORITY_KEY: &str = "ca.key";
 const AUTHORITY_CERTIFICATE: &str = "ca.pem";
 const ADDRESSES: &str = "addresses.json";
 
+/// What may still be written on the file system that holds `path`, and its size, in bytes.
+pub(crate) fn room(path: &Path) -> Option<(u64, u64)> {
+    let stat = nix::sys::statvfs::statvfs(path).ok()?;
+    let block = stat.fragment_size();
+    Some((stat.blocks_available().saturating_mul(block), stat.blocks().saturating_mul(block)))
+}
+
 /// A directory that is ours until this is dropped.
 #[derive(Debug)]
 pub struct DataDirectory {
@@ -45,6 +52,12 @@ impl Addresses {
         let scheme = if self.ca_pin.is_some() { "https" } else { "http" };
         format!("{scheme}://{}", self.http)
     }
+}
+
+/// Whether a server runs from the directory at `path`.
+pub fn is_locked(path: &Path) -> bool {
+    let lock = File::open(path.join(LOCK));
+    lock.is_ok_and(|lock| matches!(lock.try_lock_shared(), Err(TryLockError::WouldBlock)))
 }
 
 /// Why the directory can't be used.
@@ -92,6 +105,18 @@ impl DataDirectory {
     /// Where it is.
     pub fn path(&self) -> &Path {
         &self.path
+    }
+
+    /// An empty directory in it; what an earlier server left there is gone.
+    pub fn fresh_directory(&self, name: &str) -> Result<PathBuf, DataError> {
+        let path = self.path.join(name);
+        let io_error = |source| DataError::Io { path: path.clone(), source };
+        match std::fs::remove_dir_all(&path) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(io_error(error)),
+            _ => {}
+        }
+        DirBuilder::new().mode(0o700).create(&path).map_err(io_error)?;
+        Ok(path)
     }
 
     /// The path of the operator's token.
@@ -223,7 +248,9 @@ mod tests {
         let directory = tempfile::tempdir().expect("temp dir");
         let first = DataDirectory::open(directory.path()).expect("opens");
         assert!(matches!(DataDirectory::open(directory.path()), Err(DataError::InUse { .. })));
+        assert!(is_locked(directory.path()));
         drop(first);
+        assert!(!is_locked(directory.path()));
         assert!(DataDirectory::open(directory.path()).is_ok());
     }
 }

@@ -4,7 +4,7 @@
 use std::fmt;
 
 use serde::Serialize;
-use task_proto::api::{DeliveryChoice, DeliveryDecision};
+use task_proto::api::{DeliveryChoice, DeliveryDecision, RuleView};
 use task_proto::desired::Delivery;
 
 /// The most rules an operator may write.
@@ -160,6 +160,20 @@ impl Rules {
         vec![Rule { name: "tiny".to_owned(), conditions: Vec::new(), mechanism: Delivery::Inline }]
     }
 
+    /// All of them in their order, in words, with the last resort.
+    pub fn views(&self) -> Vec<RuleView> {
+        let said = |rule: &Rule| rule.conditions.iter().map(Condition::words).collect::<Vec<_>>().join(", ");
+        let last = Rule { name: OTHERWISE.to_owned(), conditions: Vec::new(), mechanism: Delivery::PushPull };
+        let view = |(order, rule): (u64, &Rule)| RuleView {
+            order,
+            name: rule.name.clone(),
+            condition: said(rule),
+            mechanism: rule.mechanism,
+            own: !Self::is_reserved(&rule.name),
+        };
+        (1..).zip(self.0.iter().chain([&last])).map(view).collect()
+    }
+
     /// Whether `name` is taken by a rule that the operator did not write.
     pub fn is_reserved(name: &str) -> bool {
         [ORDERED, FELL_BEHIND, OTHERWISE].contains(&name) || Self::built_in().iter().any(|rule| rule.name == name)
@@ -243,6 +257,17 @@ impl Condition {
             }
             Self::Flag(flag, _) if flag.of(inputs) => flag.name().to_owned(),
             Self::Flag(flag, _) => format!("not {}", flag.name()),
+        }
+    }
+
+    /// What it asks for: `size ≤ 256 KB`.
+    fn words(&self) -> String {
+        match *self {
+            Self::Measure(quantity, comparison, value) => {
+                format!("{} {} {}", quantity.shown(), comparison.sign(), quantity.unit().show(value))
+            }
+            Self::Flag(flag, true) => flag.name().to_owned(),
+            Self::Flag(flag, false) => format!("not {}", flag.name()),
         }
     }
 

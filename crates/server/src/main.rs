@@ -5,10 +5,11 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::Context as _;
-use clap::{Parser, Subcommand};
+use clap::Parser as _;
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use task_proto::line::OneLineEach;
 use taskd::clock::Clock;
+use taskd::command_line::{Command, CommandLine};
 use taskd::commands;
 use taskd::config::{Config, ConfigError, ServeFlags};
 use taskd::serve::Server;
@@ -27,29 +28,8 @@ const TASKS_PER_LOOK: u32 = 7;
 /// Open files beside connections: the database, blobs that travel, the system's own.
 const OTHER_FILES: usize = 500;
 
-/// See [`commands::Outcome`].
-const EXIT_CODES: &str = "Exit codes: 0 done, 1 failed, 2 the command line, a setting or the package is wrong or no robot \
-                          is meant, 3 some robots failed, 4 not allowed, 5 not done in time";
-
-/// Distributes task packages to robots and runs them there
-#[derive(Parser)]
-#[command(name = "taskd", version, propagate_version = true, after_help = EXIT_CODES)]
-struct CommandLine {
-    #[command(flatten)]
-    connection: commands::Connection,
-    #[command(subcommand)]
-    command: Command,
-}
-
-#[derive(Subcommand)]
-enum Command {
-    /// Run the server
-    Serve(ServeFlags),
-    #[command(flatten)]
-    Operator(commands::Command),
-}
-
 fn main() -> ExitCode {
+    commands::complete(CommandLine::describe);
     let CommandLine { connection, command } = CommandLine::parse();
     // Sockets are looked at after so many tasks: those that hand out blobs take long, and would keep everybody waiting.
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().event_interval(TASKS_PER_LOOK).build();
@@ -59,7 +39,7 @@ fn main() -> ExitCode {
     };
     let code = match command {
         Command::Serve(flags) => runtime.block_on(serve(&flags)).unwrap_or_else(|error| complain(&error)),
-        Command::Operator(command) => runtime.block_on(commands::run(&connection, command)),
+        Command::Operator(command) => runtime.block_on(commands::run(&connection, command, CommandLine::describe)),
     };
     runtime.shutdown_timeout(LEFTOVER_PATIENCE);
     code
@@ -178,26 +158,4 @@ fn complain(error: &anyhow::Error) -> ExitCode {
     let _ = writeln!(std::io::stderr(), "taskd: {error:#}");
     let outcome = if error.is::<ConfigError>() { commands::Outcome::Usage } else { commands::Outcome::Failed };
     outcome.into()
-}
-
-#[cfg(test)]
-mod tests {
-    use clap::CommandFactory as _;
-
-    use super::*;
-
-    #[test]
-    fn the_command_line_is_consistent() {
-        CommandLine::command().debug_assert();
-    }
-
-    #[test]
-    fn the_data_directory_may_be_named_before_the_command_or_after_it() {
-        for line in [["taskd", "--data", "/d", "serve"], ["taskd", "serve", "--data", "/d"]] {
-            let Command::Serve(flags) = CommandLine::try_parse_from(line).expect("parses").command else {
-                panic!("{line:?}")
-            };
-            assert_eq!(flags.settings, [("data", "/d".to_owned())]);
-        }
-    }
 }

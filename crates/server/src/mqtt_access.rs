@@ -131,6 +131,7 @@ fn acl(user_name: &str, prefix: &TopicPrefix) -> String {
          topic read {prefix}/r/+/status\n\
          topic read {prefix}/r/+/reply\n\
          topic read {prefix}/r/+/log\n\
+         topic read {prefix}/r/+/telemetry\n\
          topic readwrite {prefix}/{CANARY_LEVEL}\n\
          \n\
          pattern read {prefix}/r/%u/desired\n\

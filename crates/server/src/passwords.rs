@@ -198,11 +198,11 @@ mod tests {
     #[tokio::test]
     async fn a_flood_is_turned_away_and_the_rest_gets_its_turn() {
         let passwords = Passwords::default();
-        let places = passwords.places.available_permits();
+        let (places, held) = (passwords.places.available_permits(), passwords.turns.available_permits());
+        assert!((1..=4).contains(&held) && places == held + MOST_WAITING, "{held} at once, {places} in all");
         let mut flood = tokio::task::JoinSet::new();
         // What is being checked is not let go before all have come.
         let gate = Arc::new(std::sync::Barrier::new(2));
-        let held = passwords.turns.available_permits();
         for _ in 0..held {
             let (passwords, gate) = (passwords.clone(), gate.clone());
             flood.spawn(async move {
@@ -224,7 +224,7 @@ mod tests {
         while passwords.places.available_permits() > 0 {
             tokio::task::yield_now().await;
         }
-        assert!(matches!(passwords.verify("correct horse battery", None).await, Err(PasswordError::Busy)));
+        let turned_away = passwords.verify("correct horse battery", None).await;
         for _ in 0..held {
             let gate = gate.clone();
             tokio::task::spawn_blocking(move || {
@@ -234,5 +234,20 @@ mod tests {
             .expect("let go");
         }
         assert!(flood.join_all().await.into_iter().all(|is_done| is_done));
+        assert!(matches!(turned_away, Err(PasswordError::Busy)), "{turned_away:?}");
+    }
+
+    #[tokio::test]
+    async fn a_turn_rests_for_as_long_as_it_has_worked() {
+        let passwords = Passwords::default();
+        let all = u32::try_from(passwords.turns.available_permits()).expect("few");
+        let work = || {
+            let begun = Instant::now();
+            hashed("correct horse battery").expect("hashed");
+            (begun.elapsed(), Instant::now())
+        };
+        let (worked, done_at) = passwords.work(work).await.expect("a turn");
+        let _every_turn = passwords.turns.acquire_many(all).await.expect("open");
+        assert!(done_at.elapsed() >= worked, "{:?} after {worked:?}", done_at.elapsed());
     }
 }

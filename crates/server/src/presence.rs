@@ -108,6 +108,11 @@ impl Presence {
         self.get(robot, now_ms).is_some_and(|sighting| sighting.online)
     }
 
+    /// Whether it is connected over MQTT.
+    pub fn is_connected(&self, robot: &RobotId) -> bool {
+        self.robots().get(robot).is_some_and(|sightings| sightings.connection.is_some())
+    }
+
     /// Robots without a connection that were online at `since_ms` and no longer are at `now_ms`, because they were not
     /// heard for the window.
     pub fn fell_silent(&self, since_ms: u64, now_ms: u64) -> Vec<RobotId> {

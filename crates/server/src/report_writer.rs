@@ -7,18 +7,22 @@ mod memory;
 
 use std::collections::{BTreeSet, HashMap};
 use std::hash::{DefaultHasher, Hasher as _};
+use std::sync::Arc;
 use std::time::Duration;
 
-use task_proto::api::ReportReply;
-use task_proto::report::{Report, TaskReport};
+use task_proto::api::{FeedKind, ReportReply};
+use task_proto::report::{Condition, Phase, Report, TaskReport};
 use task_proto::{DeploymentId, Generation, RobotId};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
+use tokio::time::Instant;
 
 use crate::advance::advance;
 use crate::changes::{Changes, Consequences};
 use crate::chooser::Chooser;
 use crate::clock::Clock;
+use crate::happening::{Happening, TaskNews};
+use crate::report_meter::ReportMeter;
 use crate::store::{OpenAssignment, ReportedRobot, Store, StoreError, Write};
 use memory::Memory;
 
@@ -39,6 +43,7 @@ const DISK_STEP_BYTES: u64 = 16 << 20;
 #[derive(Debug, Clone)]
 pub struct ReportWriter {
     queue: mpsc::Sender<Submission>,
+    meter: ReportMeter,
 }
 
 /// Why a report was not stored. The robot keeps it and sends it again.
@@ -70,16 +75,25 @@ impl ReportWriter {
     /// Starts the writer. The task ends, after all that was handed in, when the last clone is dropped.
     pub fn start(store: Store, clock: Clock, changes: Changes, chooser: Chooser) -> (Self, JoinHandle<()>) {
         let (queue, submissions) = mpsc::channel(QUEUE);
-        (Self { queue }, tokio::spawn(write_all(submissions, store, clock, changes, chooser)))
+        let meter = ReportMeter::new(Instant::now());
+        (Self { queue, meter }, tokio::spawn(write_all(submissions, store, clock, changes, chooser)))
     }
 
     /// Stores `report`, whose `robot_id` the caller has authenticated by the robot's token of this number. Resolves after
     /// the commit.
     pub async fn submit(&self, report: Report, token_number: u64) -> Result<ReportReply, ReportError> {
+        let came = Instant::now();
         let (answer, answered) = oneshot::channel();
         let submission = Submission { fingerprint: fingerprint(&report), report, token_number, answer };
         self.queue.send_timeout(submission, PATIENCE).await.map_err(|_| ReportError::Busy)?;
-        answered.await.map_err(|_| ReportError::Busy)?
+        let reply = answered.await.map_err(|_| ReportError::Busy)??;
+        self.meter.stored(Instant::now(), came.elapsed());
+        Ok(reply)
+    }
+
+    /// What counts them.
+    pub fn meter(&self) -> &ReportMeter {
+        &self.meter
     }
 }
 
@@ -197,7 +211,7 @@ async fn write_batch(
     reports: &[&Submission],
     now_ms: u64,
 ) -> Result<(Answers, Consequences), StoreError> {
-    let mut write = store.begin_reports().await?;
+    let mut write = store.begin_keeping_rights().await?;
     let turn = write.turn();
     memory.learn(&mut write, reports.iter().map(|submission| &submission.report.robot_id)).await?;
     // A report that is older than the stored one is acknowledged, so that it is not sent again, and ignored.
@@ -210,7 +224,7 @@ async fn write_batch(
     let news: Vec<&Submission> = reports.iter().copied().filter(is_news).collect();
     let mut consequences = Consequences::default();
     consequences.robots.extend(news.iter().map(|submission| submission.report.robot_id.clone()));
-    let moved = write_standings(&mut write, memory, &news, now_ms).await?;
+    let moved = write_standings(&mut write, memory, &news, now_ms, &mut consequences.happenings).await?;
     write_reports(&mut write, memory, &news, now_ms).await?;
     consequences.deployments.extend(moved.iter().cloned());
     let rolls = advance_waiting(&mut write, chooser, memory, moved, now_ms, &mut consequences).await?;
@@ -223,6 +237,7 @@ async fn write_batch(
     let rung: Vec<RobotId> = consequences.rings.iter().filter(|robot| answers.contains_key(*robot)).cloned().collect();
     answers.extend(write.reported_robots(&rung).await?.into_iter().map(answer));
     write.commit().await?;
+    consequences.happenings.extend(news.iter().flat_map(|submission| newly_wrong(memory, &submission.report)));
     if rolls {
         memory.forget();
     } else {
@@ -265,6 +280,7 @@ async fn write_standings(
     memory: &mut Memory,
     news: &[&Submission],
     now_ms: u64,
+    happenings: &mut Vec<Happening>,
 ) -> Result<BTreeSet<DeploymentId>, StoreError> {
     let mut deployments = BTreeSet::new();
     let (mut moved, mut progressed) = (Vec::new(), Vec::new());
@@ -277,9 +293,13 @@ async fn write_standings(
             };
             let Some(next) = next else { continue };
             let is_moved = next.phase != assignment.standing.phase;
+            let tries_again = next.attempts > assignment.standing.attempts;
             assignment.standing = next;
             if is_moved {
                 deployments.insert(assignment.deployment.clone());
+                happenings.extend(worth_a_look(&known.robot, assignment));
+            }
+            if is_moved || tries_again {
                 moved.push(assignment.clone());
             } else {
                 progressed.push(assignment.clone());
@@ -311,6 +331,27 @@ async fn write_reports(
     }
     write.store_reports(&whole, now_ms).await?;
     write.store_repeated(&repeated, now_ms).await
+}
+
+/// What a robot did not say was wrong with it before.
+fn newly_wrong(memory: &mut Memory, report: &Report) -> Vec<Happening> {
+    let news = memory.new_conditions(&report.robot_id, &report.conditions).into_iter();
+    let text = |condition: &Condition| format!("{}: {}", condition.code.replace('_', " "), condition.text);
+    news.map(|one| Happening::Robot(report.robot_id.clone(), FeedKind::RobotCondition, text(one))).collect()
+}
+
+/// A phase that is worth a look, or that mends one.
+fn worth_a_look(robot: &ReportedRobot, assignment: &OpenAssignment) -> Option<Happening> {
+    let OpenAssignment { deployment, standing, .. } = assignment;
+    matches!(standing.phase, Phase::Failed | Phase::RolledBack | Phase::Running | Phase::Succeeded).then(|| {
+        Happening::Task(Arc::new(TaskNews {
+            robot: robot.id.clone(),
+            name: robot.name.clone(),
+            deployment: deployment.clone(),
+            phase: standing.phase,
+            failure: standing.failure.clone(),
+        }))
+    })
 }
 
 fn task_of<'a>(report: &'a Report, assignment: &OpenAssignment) -> Option<&'a TaskReport> {

@@ -19,16 +19,14 @@ const MAX_UNDER_WAY: usize = 1024;
 #[derive(Debug, thiserror::Error)]
 pub enum RequestError {
     /// The robot is not there to be asked.
-    #[error("{0} is not connected over MQTT, so it can't be asked")]
-    NotConnected(RobotId),
+    #[error("the robot is not connected over MQTT, so it can't be asked")]
+    NotConnected,
     /// It, or the server, has enough to answer already.
     #[error("too many questions are under way; try again")]
     Busy,
     /// It said nothing in time.
-    #[error("{robot} did not answer within {} s", .patience.as_secs_f64())]
+    #[error("the robot did not answer within {} s", .patience.as_secs_f64())]
     TimedOut {
-        /// Which robot.
-        robot: RobotId,
         /// How long it had.
         patience: Duration,
     },
@@ -66,7 +64,7 @@ impl Requests {
         let payload = serde_json::to_vec(&request)?;
         let (place, reply) = self.expect(robot, request.id)?;
         broker.ask(robot, payload.into()).map_err(|error| match error {
-            NotAsked::NotConnected => RequestError::NotConnected(robot.clone()),
+            NotAsked::NotConnected => RequestError::NotConnected,
             NotAsked::Busy => RequestError::Busy,
         })?;
         let outcome = tokio::time::timeout(patience, reply).await;
@@ -74,7 +72,7 @@ impl Requests {
         match outcome {
             Ok(Ok(Outcome::Answer(answer))) => Ok(answer),
             Ok(Ok(Outcome::Refusal(refusal))) => Err(RequestError::Refused(refusal)),
-            Ok(Err(_)) | Err(_) => Err(RequestError::TimedOut { robot: robot.clone(), patience }),
+            Ok(Err(_)) | Err(_) => Err(RequestError::TimedOut { patience }),
         }
     }
 

@@ -5,6 +5,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use task_proto::api::{FeedKind, ListenerView};
 use task_proto::envelope::PublicKey;
 use tokio::task::JoinHandle;
 use tokio::time::{Interval, MissedTickBehavior};
@@ -24,9 +25,12 @@ use crate::config::{Config, TlsSettings};
 use crate::data_directory::{Addresses, DataDirectory, DataError};
 use crate::downlink::Downlink;
 use crate::fan_out::FanOutWorker;
+use crate::feed::{Feed, FeedSource};
 use crate::gatekeeper::StoreGatekeeper;
+use crate::happening::Happening;
 use crate::http::events::{EventFeed, EventSource};
 use crate::http::traffic::HttpTotals;
+use crate::http::upload::UploadSpace;
 use crate::http::{App, AppParts, listener};
 use crate::mqtt_access::MqttAccess;
 use crate::oidc::{OidcSetUpError, Provider};
@@ -34,6 +38,8 @@ use crate::presence::Presence;
 use crate::report_writer::ReportWriter;
 use crate::requests::Requests;
 use crate::robot_logs::RobotLogs;
+use crate::robot_vitals::RobotVitals;
+use crate::server_facts::ServerFacts;
 use crate::store::{Store, StoreError, sqlite_url};
 use crate::tls::{Tls, TlsError};
 use crate::transfers::Transfers;
@@ -109,36 +115,35 @@ impl Server {
         let key = data.signing_key()?;
         let public_key = key.public_key();
         let tls = config.encrypts().then(|| Tls::open(tls_settings(&config), &data, clock.clone())).transpose()?;
-        let store =
-            Store::open(&config.database.clone().unwrap_or_else(|| sqlite_url(&data.path().join("taskd.sqlite"))))
-                .await?;
+        let url = config.database.clone().unwrap_or_else(|| sqlite_url(&data.path().join("taskd.sqlite")));
+        let store = Store::open(&url).await?;
         register_operator(&store, &data, &clock).await?;
         let blobs = Blobs::open(data.path(), blob_settings(&config))?;
         let http = listen(config.http).map_err(|source| ServeError::Listen { address: config.http, source })?;
         let http_address = http.local_addr().map_err(|source| ServeError::Listen { address: config.http, source })?;
 
-        let changes = Changes::new();
-        let presence = Arc::new(Presence::new(milliseconds(config.presence_timeout)));
+        let (changes, presence) = (Changes::new(), Arc::new(Presence::new(milliseconds(config.presence_timeout))));
         let load = Arc::new(ServerLoad::default());
         let chooser = Chooser::new(&config.delivery, presence.clone(), load.clone());
         let settings = action_settings(&config, tls.as_ref());
         let actions = Actions::new(store.clone(), clock.clone(), changes.clone(), key, settings, chooser.clone());
         let (writer, reports) = ReportWriter::start(store.clone(), clock.clone(), changes.clone(), chooser);
-        let (requests, logs) = (Requests::default(), RobotLogs::new());
-        let (heard, said) = (requests.clone(), logs.clone());
-        let uplink = Uplink::new(writer.clone(), heard, said, presence.clone(), changes.clone(), clock.clone());
+        let (requests, logs, vitals) = (Requests::default(), RobotLogs::new(), RobotVitals::default());
+        let (heard, said, done) = (requests.clone(), logs.clone(), vitals.clone());
+        let uplink = Uplink::new(writer.clone(), heard, said, done, presence.clone(), changes.clone(), clock.clone());
         let gatekeeper = StoreGatekeeper { store: store.clone(), clock: clock.clone() };
         let conduct = Conduct::new(config.robots);
         let broker = broker_config(&config, tls.clone(), conduct.clone());
         let (broker, mqtt) =
             start_broker(&config, broker, &data, &public_key, Arc::new(gatekeeper), Arc::new(uplink)).await?;
 
-        let provider = (!config.oidc.issuer.is_empty()).then(|| Provider::new(config.oidc.clone())).transpose()?;
-        let provider = provider.map(Arc::new);
+        let has_provider = !config.oidc.issuer.is_empty();
+        let provider = has_provider.then(|| Provider::new(config.oidc.clone())).transpose()?.map(Arc::new);
         let transfers = Transfers::new(&config.transfers, config.delivery.site_label.clone());
-        let (stop, tasks) = (CancellationToken::new(), TaskTracker::new());
-        let http_traffic = Arc::new(HttpTotals::default());
+        let (stop, tasks, http_traffic) =
+            (CancellationToken::new(), TaskTracker::new(), Arc::new(HttpTotals::default()));
         let app = App::new(AppParts {
+            feed: Feed::new(clock.now_ms()),
             clock,
             store: store.clone(),
             actions,
@@ -148,13 +153,17 @@ impl Server {
             broker: broker.clone(),
             requests,
             logs,
+            vitals,
             blobs,
             transfers,
+            uploads: UploadSpace::new(data.fresh_directory("incoming")?, config.max_upload_bytes),
             sessions: Arc::default(),
             visits: Arc::default(),
             conduct,
             provider,
             attempts: Arc::default(),
+            facts: Arc::new(ServerFacts::new(&config, listeners(http_address, &broker, tls.is_some()))),
+            slow_figures: Arc::default(),
             events: EventFeed::new(),
             key: public_key,
             ca_pin: tls.as_ref().map(Tls::pin),
@@ -248,6 +257,8 @@ fn start_tasks(tasks: &TaskTracker, app: &App, config: &Config) {
         store: app.store.clone(),
         presence: app.presence.clone(),
         conduct: app.conduct.clone(),
+        vitals: app.vitals.clone(),
+        feed: app.feed.clone(),
         clock: app.clock.clone(),
     };
     tasks.spawn(app.events.clone().run(source, app.changes.clone(), app.stop.clone()));
@@ -263,6 +274,13 @@ fn start_tasks(tasks: &TaskTracker, app: &App, config: &Config) {
         settings: config.delivery.clone(),
     };
     tasks.spawn(worker.run(app.stop.clone()));
+    let source = FeedSource {
+        store: app.store.clone(),
+        broker: app.broker.clone(),
+        clock: app.clock.clone(),
+        data: app.data.clone(),
+    };
+    tasks.spawn(app.feed.clone().run(source, app.changes.clone(), app.stop.clone()));
     tasks.spawn(notice_silence(app.clone()));
     tasks.spawn(show_conduct(app.clone()));
 }
@@ -293,13 +311,19 @@ async fn show_conduct(app: App) {
             }
             news = app.conduct.news() => news,
         };
-        news.into_iter().for_each(|robot| app.changes.announce(Change::Robot(robot)));
+        for robot in news {
+            if let Some(text) = app.conduct.trouble(&robot) {
+                app.changes.happened(Happening::Robot(robot.clone(), FeedKind::RobotMisbehaved, text));
+            }
+            app.changes.announce(Change::Robot(robot));
+        }
     }
 }
 
 async fn watch_load(app: App, load: Arc<ServerLoad>) {
     let mut ticks = ticks(LOAD_INTERVAL);
     while next_tick(&mut ticks, &app.stop).await {
+        app.transfers.look();
         load.set(app.transfers.running(), app.broker.queued_part_bytes() as u64);
     }
 }
@@ -310,6 +334,7 @@ async fn notice_silence(app: App) {
     while next_tick(&mut ticks, &app.stop).await {
         let now_ms = app.clock.now_ms();
         for robot in app.presence.fell_silent(since_ms, now_ms) {
+            app.changes.happened(Happening::Presence(robot.clone(), false));
             app.changes.announce(Change::Robot(robot));
         }
         since_ms = now_ms;
@@ -407,6 +432,16 @@ async fn start_broker(
     // The same over restarts, so that a session which the network forgot ends when the next begins.
     let client_id = format!("taskd-{}", key.id());
     Ok((Broker::connect(ExternalConfig { url: url.clone(), pin: config.broker_pin, client_id, prefix }, inbox), access))
+}
+
+/// Where the server listens, as bound.
+fn listeners(http: SocketAddr, broker: &Broker, tls: bool) -> Vec<ListenerView> {
+    let view =
+        |kind: &str, address: SocketAddr| ListenerView { kind: kind.to_owned(), address: address.to_string(), tls };
+    [("http", Some(http)), ("mqtt", broker.local_addr())]
+        .into_iter()
+        .filter_map(|(kind, address)| Some(view(kind, address?)))
+        .collect()
 }
 
 fn broker_config(config: &Config, tls: Option<Tls>, conduct: Arc<Conduct>) -> BrokerConfig {

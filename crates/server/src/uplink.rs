@@ -1,4 +1,4 @@
-//! What robots say over MQTT: reports go to the writer, replies to whoever asked, log lines to memory, connections to
+//! What robots say over MQTT: reports go to the writer, replies to whoever asked, log lines and vitals to memory, connections to
 //! presence. The broker has proven who speaks; what is said is checked here. It never answers by itself: robots that
 //! are behind are put on the list of those to ring.
 
@@ -14,14 +14,17 @@ use task_proto::log::{LogBatch, MAX_BATCH_BYTES};
 use task_proto::report::{Report, Status};
 use task_proto::request::{MAX_REPLY_BYTES, Reply};
 use task_proto::topic::RobotTopic;
+use task_proto::vitals::{MAX_TELEMETRY_BYTES, Telemetry};
 
 use crate::broker::{Inbox, NotStored, RobotMessage};
 use crate::changes::{Change, Changes};
 use crate::clock::Clock;
+use crate::happening::Happening;
 use crate::presence::Presence;
 use crate::report_writer::{ReportError, ReportWriter};
 use crate::requests::Requests;
 use crate::robot_logs::RobotLogs;
+use crate::robot_vitals::RobotVitals;
 
 /// The largest report and status that are read.
 const MAX_REPORT_BYTES: usize = 1024 * 1024;
@@ -34,6 +37,7 @@ pub struct Uplink {
     reports: ReportWriter,
     requests: Requests,
     logs: RobotLogs,
+    vitals: RobotVitals,
     presence: Arc<Presence>,
     changes: Changes,
     clock: Clock,
@@ -47,11 +51,12 @@ impl Uplink {
         reports: ReportWriter,
         requests: Requests,
         logs: RobotLogs,
+        vitals: RobotVitals,
         presence: Arc<Presence>,
         changes: Changes,
         clock: Clock,
     ) -> Self {
-        Self { reports, requests, logs, presence, changes, clock, reminded_ms: Mutex::default() }
+        Self { reports, requests, logs, vitals, presence, changes, clock, reminded_ms: Mutex::default() }
     }
 
     async fn take_report(&self, message: &RobotMessage) -> Result<(), NotStored> {
@@ -105,6 +110,19 @@ impl Uplink {
         }
     }
 
+    fn take_telemetry(&self, message: &RobotMessage) {
+        match parsed::<Telemetry>(message, MAX_TELEMETRY_BYTES) {
+            Some(said) if said.robot_id == message.robot => {
+                self.vitals.take(&message.robot, said.vitals, self.clock.now_ms());
+                self.changes.announce(Change::Robot(said.robot_id));
+            }
+            Some(said) => {
+                tracing::warn!(robot = %message.robot, claimed = %said.robot_id, "vitals in another robot's name are dropped");
+            }
+            None => {}
+        }
+    }
+
     fn saw_instance(&self, message: &RobotMessage, instance: &task_proto::InstanceId) {
         let now_ms = self.clock.now_ms();
         let was_duplicate = self.presence.is_duplicate(&message.robot, now_ms);
@@ -136,7 +154,8 @@ impl Inbox for Uplink {
                     }
                 }
                 RobotTopic::Log => self.take_lines(&message),
-                _ => {}
+                RobotTopic::Telemetry => self.take_telemetry(&message),
+                RobotTopic::Desired | RobotTopic::Request => {}
             }
             Ok(())
         }
@@ -144,8 +163,12 @@ impl Inbox for Uplink {
     }
 
     fn connected(&self, robot: &RobotId, peer: Option<SocketAddr>, connection: u64) {
+        let was_online = self.presence.is_online(robot, self.clock.now_ms());
         self.presence.connected(robot, peer, connection, self.clock.now_ms());
         self.changes.announce(Change::Robot(robot.clone()));
+        if !was_online {
+            self.changes.happened(Happening::Presence(robot.clone(), true));
+        }
         self.changes.ring([robot.clone()]);
         self.logs.connected(robot);
     }
@@ -154,6 +177,7 @@ impl Inbox for Uplink {
         self.presence.disconnected(robot, connection, self.clock.now_ms());
         self.reminded_ms.lock().unwrap_or_else(PoisonError::into_inner).remove(robot);
         self.changes.announce(Change::Robot(robot.clone()));
+        self.changes.happened(Happening::Presence(robot.clone(), self.presence.is_online(robot, self.clock.now_ms())));
     }
 
     fn everyone_may_be_there(&self) {
@@ -167,6 +191,7 @@ pub fn heard(presence: &Presence, changes: &Changes, robot: &RobotId, peer: Sock
     presence.seen(robot, peer, now_ms);
     if !was_online {
         changes.announce(Change::Robot(robot.clone()));
+        changes.happened(Happening::Presence(robot.clone(), true));
     }
 }
 

@@ -23,12 +23,27 @@ const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; i
      connect-src 'self'; worker-src 'self'; manifest-src 'self'; base-uri 'none'; form-action 'none'; \
      frame-ancestors 'none'";
 
-/// `GET /` (anyone): the page. It holds no data; that needs a session.
+/// The page. It holds no data; that needs a session.
+#[utoipa::path(get, path = "/", tag = "server",
+    responses((status = 200, description = "The page.", body = String, content_type = "text/html"),
+        (status = 304, description = "It is still the one that `If-None-Match` names.")))]
 pub async fn index(headers: HeaderMap) -> Result<Response, ApiError> {
     serve("index.html", &headers)
 }
 
-/// `GET /ui/{*file}` (anyone): what the page consists of.
+/// The API's description, to read and to try out.
+#[utoipa::path(get, path = "/api/docs", tag = "server",
+    responses((status = 200, description = "The page.", body = String, content_type = "text/html"),
+        (status = 304, description = "It is still the one that `If-None-Match` names.")))]
+pub async fn docs(headers: HeaderMap) -> Result<Response, ApiError> {
+    serve("docs.html", &headers)
+}
+
+/// What the page consists of.
+#[utoipa::path(get, path = "/ui/{file}", tag = "server",
+    params(("file" = String, Path, description = "Its path, which may have slashes.")),
+    responses((status = 200, description = "The file.", body = String, content_type = "text/plain"),
+        (status = 304, description = "It is still the one that `If-None-Match` names.")))]
 pub async fn file(PathParam(path): PathParam<String>, headers: HeaderMap) -> Result<Response, ApiError> {
     serve(&path, &headers)
 }
@@ -50,7 +65,7 @@ fn tag(file: &EmbeddedFile) -> String {
 }
 
 /// Whether the caller has the file already: one of its tags is this one, compared weakly as RFC 9110 asks for.
-fn is_known(headers: &HeaderMap, tag: &str) -> bool {
+pub fn is_known(headers: &HeaderMap, tag: &str) -> bool {
     let given = headers.get_all(header::IF_NONE_MATCH).iter().filter_map(|value| value.to_str().ok());
     given.flat_map(|tags| tags.split(',')).map(str::trim).any(|one| one == "*" || one.trim_start_matches("W/") == tag)
 }

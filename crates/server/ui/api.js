@@ -6,31 +6,94 @@ const PATIENCE_MS = 30_000;
 /** The server does not know who is asking: time to sign in. */
 export class SignedOut extends Error {}
 
-/** Asks the server; answers the parsed body. Throws `SignedOut` on 401 and an `Error` a person can read on the rest. */
-async function ask(method, path, body) {
-  const response = await fetch(BASE + path, {
+/** The server refused: `code` is for programs, the message for people. */
+class Refused extends Error {
+  constructor(status, error) {
+    super(error?.message ?? `the server answered ${status}`);
+    this.status = status;
+    this.code = error?.code;
+  }
+}
+
+/** Asks the server; answers the parsed body. Throws `SignedOut` on 401 and `Refused` on the rest. */
+async function ask(method, path, { body, query = {}, headers = {}, revive } = {}) {
+  const given = Object.entries(query).filter(([, value]) => value !== undefined && value !== null && value !== '');
+  const search = given.length ? `?${new URLSearchParams(given)}` : '';
+  const response = await fetch(BASE + path + search, {
     method,
-    headers: body ? { 'content-type': 'application/json' } : {},
+    headers: body ? { 'content-type': 'application/json', ...headers } : headers,
     body: body && JSON.stringify(body),
     signal: AbortSignal.timeout(PATIENCE_MS),
   });
-  if (response.ok) return response.status === 204 ? null : response.json();
+  if (response.ok) return response.status === 204 ? null : JSON.parse(await response.text(), revive);
   const said = await response.json().catch(() => null);
-  const message = said?.error?.message ?? `the server answered ${response.status}`;
-  throw response.status === 401 ? new SignedOut(message) : new Error(message);
+  if (response.status === 401) throw new SignedOut(said?.error?.message);
+  throw new Refused(response.status, said?.error);
 }
 
-export const session = () => ask('GET', '/session');
+export const get = (path, query) => ask('GET', path, { query });
+export const post = (path, body, headers) => ask('POST', path, { body, headers });
+export const patch = (path, body) => ask('PATCH', path, { body });
+export const remove = (path) => ask('DELETE', path);
+
+/**
+ * Sends a file's bytes, for as long as it takes; answers the parsed body. `told` gets how many have gone. By the older kind of
+ * request, because `fetch` does not say that. `signal` breaks it off.
+ */
+export function upload(path, blob, type, { told, signal }) {
+  return new Promise((resolve, reject) => {
+    signal.throwIfAborted();
+    const request = new XMLHttpRequest();
+    request.open('POST', BASE + path);
+    request.setRequestHeader('content-type', type);
+    request.upload.onprogress = ({ loaded }) => told(loaded);
+    request.onerror = () => reject(new Error('The connection broke.'));
+    request.onabort = () => reject(new Error('Broken off.'));
+    request.onload = () => {
+      const said = parsed(request.responseText);
+      if (request.status < 300) resolve(said);
+      else if (request.status === 401) reject(new SignedOut(said?.error?.message));
+      else reject(new Refused(request.status, said?.error));
+    };
+    signal.addEventListener('abort', () => request.abort());
+    request.send(blob);
+  });
+}
+
+function parsed(text) {
+  try {
+    return JSON.parse(text);
+  } catch {
+    return null;
+  }
+}
+
+/** An order that may be sent again without ordering it twice: with the same key as long as the same thing is meant. */
+export const order = (path, body, key) => post(path, body, { 'idempotency-key': key });
+
+/** A key for one order. The browser's own UUIDs need https. */
+export const newKey = () => Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) => byte.toString(16).padStart(2, '0')).join('');
+
+export const session = () => get('/session');
 /** With `{ user, password }` or `{ token }`. */
-export const signIn = (who) => ask('POST', '/session', who);
-export const me = () => ask('GET', '/me');
-export const signOut = () => ask('DELETE', '/session');
-export const server = () => ask('GET', '/server');
+export const signIn = (who) => post('/session', who);
+export const signOut = () => remove('/session');
 
-export const robotOutputs = async (robot) => ask('GET', `/outputs?robot=${robot}`);
+/** The newest deployments, or those after `before`: a page of them. */
+export const deployments = (before) => get('/deployments', { limit: 200, before });
 
-/** Everything the page shows, as it is now. */
-export async function lists() {
-  const [robots, deployments] = await Promise.all(['/robots', '/deployments'].map((path) => ask('GET', path)));
-  return { robots: robots.robots, deployments: deployments.deployments };
+const PAGE = 1_000;
+
+/** All robots, page by page, so that the first are drawn while the rest is on its way. */
+export async function* robots() {
+  // The first page is what fits the screen, and comes at once.
+  for (let after, limit = 100; ; limit = PAGE) {
+    const page = await get('/robots', { limit, after });
+    yield page.robots;
+    if (!page.next) return;
+    after = page.next;
+  }
 }
+
+/** Asks a robot something; answers what it answered, read with `revive` as by `JSON.parse`. Throws what it refused. */
+export const askRobot = (robot, question, revive) => ask('POST', `/robots/${robot}/ask`, { body: question, revive });

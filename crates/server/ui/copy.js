@@ -8,6 +8,9 @@ export const command = (text) => html`
     <button class="plain" aria-label=${`Copy: ${text}`} @click=${(event) => copy(text, event.currentTarget)}>Copy</button>
   </div>`;
 
+/** A small button that copies a text which is shown in short beside it. */
+export const copyButton = (text, what) => html`<button class="plain link copy" aria-label=${`Copy ${what}`} @click=${(event) => copy(text, event.currentTarget)}>Copy</button>`;
+
 async function copy(text, button) {
   const isCopied = (await navigator.clipboard?.writeText(text).then(() => true, () => false)) || copyBySelection(text);
   button.textContent = isCopied ? 'Copied' : 'Select it';

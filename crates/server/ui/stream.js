@@ -11,15 +11,15 @@ const LONGEST_LINE = 16 * 1024 * 1024;
 
 /**
  * Opens the stream. `tell` gets `{events: [...]}` and `{state}`, one of `open`, `waiting` (with `retry_at`) and `signed_out`,
- * after which nothing follows. Returns a function that ends it.
+ * after which nothing follows. Returns a function that ends it. `url` is whose events: all there are, or a robot's lines.
  */
-export function openStream(tell) {
+export function openStream(tell, url = URL_OF_EVENTS) {
   const end = new AbortController();
-  follow(tell, end.signal);
+  follow(tell, url, end.signal);
   return () => end.abort();
 }
 
-async function follow(tell, end) {
+async function follow(tell, url, end) {
   let pause = FIRST_PAUSE_MS;
   while (!end.aborted) {
     let wasOpen = false;
@@ -27,27 +27,35 @@ async function follow(tell, end) {
       wasOpen = true;
       tell({ state: 'open' });
     };
-    const status = await read(tell, opened, end);
+    const status = await read(tell, url, opened, end);
     if (end.aborted) return;
     if (status === 401) return tell({ state: 'signed_out' });
     pause = wasOpen ? FIRST_PAUSE_MS : Math.min(pause * 2, LONGEST_PAUSE_MS);
     // Spread out, so that a restarted server is not met by every page at once.
     const wait = pause * (0.5 + Math.random() / 2);
     tell({ state: 'waiting', retry_at: Date.now() + wait });
-    await new Promise((resume) => {
-      setTimeout(resume, wait);
-      end.addEventListener('abort', resume, { once: true });
-    });
+    await rest(wait, end);
   }
 }
 
+/** Waits that long, or until the end. */
+const rest = (ms, end) => new Promise((resume) => {
+  const done = () => {
+    clearTimeout(timer);
+    end.removeEventListener('abort', done);
+    resume();
+  };
+  const timer = setTimeout(done, ms);
+  end.addEventListener('abort', done);
+});
+
 /** Reads one connection to its end. Answers the HTTP status, or nothing if there was none. */
-async function read(tell, opened, end) {
+async function read(tell, url, opened, end) {
   const silence = new AbortController();
   let watchdog = setTimeout(() => silence.abort(), SILENCE_MS);
   try {
     const signal = AbortSignal.any([end, silence.signal]);
-    const response = await fetch(URL_OF_EVENTS, { headers: { accept: 'text/event-stream' }, cache: 'no-store', signal });
+    const response = await fetch(url, { headers: { accept: 'text/event-stream' }, cache: 'no-store', signal });
     if (!response.ok) return response.status;
     opened();
     let rest = '';

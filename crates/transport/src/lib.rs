@@ -4,10 +4,12 @@
 mod client_key;
 mod dial;
 mod line;
+mod probe;
 mod trust;
 pub mod websocket;
 
 pub use client_key::{CertificateError, ClientKey, InvalidKey, key_in};
 pub use dial::{DialError, Duplex, Route, dial};
 pub use line::{Line, LineError};
+pub use probe::{Probed, certificate_end_ms, greet_mqtt};
 pub use trust::{BUILT_MS, Clock, Trust, WrongServer, pin_of};

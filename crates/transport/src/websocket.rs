@@ -368,6 +368,20 @@ mod tests {
         assert!(error.is_err());
     }
 
+    #[tokio::test]
+    async fn a_head_without_an_end_is_not_gathered() {
+        let (client, mut server) = duplex(4096);
+        let endless = async move {
+            let _ = server.write_all(b"HTTP/1.1 101 Fine\r\nx: ").await;
+            for _ in 0..10 {
+                let _ = server.write_all(&[b'y'; MAX_HEAD_BYTES]).await;
+            }
+        };
+        let (error, ()) = tokio::join!(WebSocket::connect(client, "server", "/mqtt"), endless);
+        let error = error.expect_err("none").to_string();
+        assert!(error.contains("the answer's head is too long"), "{error}");
+    }
+
     #[test]
     fn only_a_request_for_mqtt_is_granted() {
         let good = [

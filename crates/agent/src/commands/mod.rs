@@ -4,6 +4,7 @@
 use std::path::PathBuf;
 
 use anyhow::ensure;
+use clap::ValueEnum;
 use rustls::ClientConfig;
 use task_proto::CaPin;
 use task_transport::{ClientKey, Trust};
@@ -12,8 +13,10 @@ use crate::clock;
 
 mod approval;
 pub mod configure;
+pub mod doctor;
 pub mod enroll;
 pub mod hold;
+pub mod man;
 pub mod run;
 pub mod shim;
 pub mod status;
@@ -27,6 +30,15 @@ pub struct DataDir {
     /// Directory of the robot's identity, settings, ledger and tasks
     #[arg(long, env = "TASK_AGENT_DATA", value_name = "DIR", default_value = DEFAULT_DATA_DIR)]
     pub data: PathBuf,
+}
+
+/// How to print the result.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum Output {
+    /// For people.
+    Table,
+    /// For programs.
+    Json,
 }
 
 /// Whoever knows the server by a pin says nothing to it in plain text. `setting` is what gave the server's address.

@@ -25,13 +25,14 @@ use crate::graph_answers::GraphAnswers;
 use crate::identity::Identity;
 use crate::layout::DataDir as Layout;
 use crate::ledger::{Found, Ledger};
-use crate::link::{self, Heard, Intervals, Shared, Talk};
+use crate::link::{self, Heard, Intervals, Message, Shared, Talk};
 use crate::logs::Logs;
 use crate::logs::forwarder::Forwarder;
 use crate::mqtt::{self, MqttAccess, Ways};
 use crate::outputs::Registry;
 use crate::rotation::Rotation;
 use crate::server::{self, Server};
+use crate::vitals::{self, Gauge, Places};
 use crate::{clock, confinement, endpoint, process};
 
 /// Messages from the link that the driver has not taken yet.
@@ -76,7 +77,9 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
     let credential = Credential::from(identity.token.clone());
     let shutdown = CancellationToken::new();
     let shared = Shared::new(shutdown.clone());
-    let fetcher = Fetcher::new(client.clone(), base.clone(), credential.clone(), data.clone(), fetch_settings(&config));
+    let fetcher =
+        Fetcher::new(client.clone(), base.clone(), credential.clone(), data.clone(), FetchSettings::default());
+    fetcher.limit(&config.limits);
     let fetcher = (fetcher.measured_by(shared.meter.clone()), shared.listening.clone());
     let registry = Registry::new(client.clone(), base.clone(), credential.clone());
     let robot = Arc::new(Robot::new(data.clone(), fetcher, registry, &config, &identity.robot_id, identity.mac));
@@ -88,7 +91,6 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
         boot_id: process::boot_id().context("cannot read the kernel's boot id")?,
         name: config.name.clone(),
         labels: config.labels.clone(),
-        parallel_tasks: config.parallel_tasks,
     };
     let status = Status { online: true, start: ledger.start + 1, instance, connection: 0 };
     let driver = Driver::new(robot.clone(), speaker, shared.clone(), ledger, lost).await;
@@ -106,6 +108,14 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
         lifetime: config.token_lifetime,
     };
     tokio::spawn(rotation.run(shared.clone(), clock::wall_ms));
+    let telemetry = vitals::Sender {
+        robot_id: identity.robot_id.clone(),
+        interval: config.vitals_interval,
+        source: Gauge::new(Places::of_this_machine(data.root())),
+        server: server.clone(),
+    };
+    let (said, messages_out) = mpsc::channel(QUEUED_MESSAGES);
+    tokio::spawn(telemetry.run(shared.clone(), said.clone()));
     if config.mqtt {
         let host = base.host_str().map(str::to_owned).unwrap_or_default();
         let (port, prefix) = (identity.mqtt.port, identity.mqtt.prefix.clone());
@@ -114,7 +124,8 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
         let (robot_id, message_bytes) = (identity.robot_id, mqtt::MESSAGE_BYTES);
         let ways = Ways::new(&base, Arc::new(tls), config.mqtt_transport);
         let access = MqttAccess { host, port, prefix, robot: robot_id, token: credential, status, message_bytes, ways };
-        converse(access, shared, heard, data, &config, robot);
+        let talk = (said, messages_out);
+        converse(access, shared, heard, data, robot, talk);
     } else {
         // Nobody is to wait for a session, or for parts.
         shared.mqtt_tried.send_replace(true);
@@ -133,16 +144,16 @@ fn converse(
     shared: Shared,
     heard: mpsc::Sender<Heard>,
     data: Layout,
-    config: &Config,
     robot: Arc<Robot>,
+    (messages, said): (mpsc::Sender<Message>, mpsc::Receiver<Message>),
 ) {
     let robot_id = access.robot.clone();
+    let vitals = vitals::Asked::new(Places::of_this_machine(data.root()));
     let logs = Logs::new(data.clone());
-    let forwarder = Forwarder::new(robot_id.clone(), data, config.forward, logs.following());
+    let forwarder = Forwarder::new(robot_id.clone(), data, robot.forward(), logs.following());
     let (requests, asked) = mpsc::channel(QUEUED_QUESTIONS);
-    let (messages, said) = mpsc::channel(QUEUED_MESSAGES);
     let (batches, lines) = mpsc::channel(1);
-    tokio::spawn(Answers { robot_id, logs, graph: GraphAnswers { robot } }.run(asked, messages));
+    tokio::spawn(Answers { robot_id, logs, graph: GraphAnswers { robot }, vitals }.run(asked, messages));
     tokio::spawn(forwarder.run(shared.mqtt_up.subscribe(), batches));
     tokio::spawn(mqtt::run(access, shared, heard, Talk { requests, messages: said, lines }));
 }
@@ -186,15 +197,6 @@ fn open_ledger(data: &Layout) -> anyhow::Result<(Ledger, Option<String>)> {
             (rebuilt(), Some(text))
         }
     })
-}
-
-fn fetch_settings(config: &Config) -> FetchSettings {
-    let mut settings = FetchSettings::default();
-    let limits = &config.limits;
-    settings.limits.bytes = limits.archive_bytes.unwrap_or(settings.limits.bytes);
-    settings.limits.entries = limits.archive_entries.unwrap_or(settings.limits.entries);
-    settings.reserve_bytes = limits.disk_reserve_bytes.unwrap_or(settings.reserve_bytes);
-    settings
 }
 
 async fn cancel_on_signal(shutdown: CancellationToken) {

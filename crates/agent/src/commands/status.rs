@@ -3,10 +3,9 @@
 
 use std::process::ExitCode;
 
-use clap::ValueEnum;
 use serde_json::json;
 
-use super::{DataDir, say};
+use super::{DataDir, Output, say};
 use crate::effects::HOLD_FILE;
 use crate::identity::Identity;
 use crate::layout::DataDir as Layout;
@@ -20,15 +19,6 @@ pub struct Arguments {
     output: Output,
     #[command(flatten)]
     data: DataDir,
-}
-
-/// How to print the result.
-#[derive(Debug, Clone, Copy, ValueEnum)]
-enum Output {
-    /// For people.
-    Table,
-    /// For programs.
-    Json,
 }
 
 /// Prints the status.
@@ -106,7 +96,7 @@ fn task_json(record: &TaskRecord) -> serde_json::Value {
 }
 
 /// Whether an agent holds the data directory's lock.
-fn agent_runs(data: &Layout) -> bool {
+pub(super) fn agent_runs(data: &Layout) -> bool {
     let lock = std::fs::File::open(data.root().join("lock"));
     lock.is_ok_and(|file| matches!(file.try_lock_shared(), Err(std::fs::TryLockError::WouldBlock)))
 }

@@ -167,6 +167,7 @@ fn task_report(task: &TaskName, record: &TaskRecord, view: Option<&View>, now_ms
             Some(ActiveVersion {
                 deployment: active.deployment.clone(),
                 version: active.package.version.clone(),
+                manifest: Some(active.package.manifest.digest),
                 pid: pid?,
             })
         }),

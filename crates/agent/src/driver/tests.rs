@@ -59,7 +59,6 @@ impl Bench {
             boot_id: "boot".to_owned(),
             name: Some("atlas".parse().expect("valid")),
             labels: None,
-            parallel_tasks: 2,
         };
         let driver = Driver::new(fake.clone(), speaker, shared.clone(), ledger, None).await;
         let (heard, messages) = mpsc::channel(4);
@@ -75,6 +74,7 @@ impl Bench {
             expires_at_ms: now_ms + 1_000_000,
             tasks,
             evidence: Default::default(),
+            settings: Default::default(),
         };
         let payload = serde_json::to_vec(&state).expect("json");
         let envelope = Box::new(Envelope::seal(DESIRED_STATE_TYPE, &payload, key));

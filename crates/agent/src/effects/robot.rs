@@ -4,23 +4,25 @@
 use std::collections::BTreeMap;
 use std::error::Error;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, PoisonError, RwLock};
+use std::sync::{Arc, RwLock};
 use std::time::Duration;
 
 use bytes::Bytes;
 use task_proto::desired::{BlobRef, DesiredState, PackageRef};
 use task_proto::manifest::{BuildTool, TaskManifest};
-use task_proto::report::{Failure, FailureCode, HostFacts, Isolation, Progress, RosFacts};
+use task_proto::report::{Failure, FailureCode, HostFacts, Isolation, Progress};
+use task_proto::settings::RobotSettings;
 use task_proto::{Digest, MacAddress, RobotId, TaskName};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
+use self::held::Held;
 pub(crate) use self::outcomes::chain;
 use self::outcomes::{build_failure, fetch_failure, finally, later, millis, outputs_code, pulled};
 use super::{Effects, Now};
-use crate::builder::{self, BuildLimits, BuildOrder};
+use crate::builder::{self, BuildOrder};
 use crate::cgroup::{Cgroups, RunLimits};
-use crate::config::Config;
+use crate::config::{Config, ForwardSettings};
 use crate::fetch::{self, Asks, Fetcher};
 use crate::gate::Gate;
 use crate::graph_access::GraphAccess;
@@ -37,23 +39,20 @@ use crate::run_dir::{LogSpec, RunSpec};
 use crate::supervisor::{Observed, Supervisor, SupervisorError};
 use crate::task_user::{TaskUser, TaskUserError};
 use crate::trust::{Trust, Use};
-use crate::underlay::{self, Places};
 use crate::vouching::Vouching;
 use crate::watcher::{Watched, Watcher};
-use crate::{battery, clock, disk, durable, environment, installation, launch, logs, script, survey};
+use crate::{battery, clock, disk, durable, environment, installation, launch, logs, script};
 
 mod graph;
+mod held;
 mod outcomes;
+mod ros;
 mod signers;
 
 /// Written into a version's directory once it is built.
 const BUILT_MARKER: &str = "built";
-/// How many bytes a run may bring back, unless the robot's settings say otherwise.
-const OUTPUT_BYTES: u64 = 4 << 30;
 /// Written into a run's directory before its start: what the ledger says of the run, should the ledger be lost.
 const RUN_RECORD: &str = "run.json";
-/// Where looking into ROS installations has its files.
-const SURVEY_DIR: &str = "survey";
 /// How much of a log's end goes, without its times, into a failure's text.
 const TAIL_BYTES: u64 = 3072;
 
@@ -67,20 +66,18 @@ pub struct Robot {
     gate: Option<Gate>,
     registry: Registry,
     robot: RobotId,
-    output_bytes: u64,
     supervisor: Supervisor,
     watcher: Watcher,
     graph: GraphAccess,
-    /// The configured setup files.
-    underlays: Vec<PathBuf>,
     /// The ROS that was last seen.
     ros: RwLock<Vec<Installation>>,
-    environment: BTreeMap<String, String>,
-    build_limits: BuildLimits,
+    /// Its own settings.
+    own: Config,
+    /// What holds of them and of what the server says.
+    held: RwLock<Arc<Held>>,
+    forward: watch::Sender<ForwardSettings>,
     cgroups: Option<Cgroups>,
     task_user: Result<Option<TaskUser>, TaskUserError>,
-    task_limits: RunLimits,
-    log_bytes: Option<u64>,
     mac: MacAddress,
 }
 
@@ -94,27 +91,16 @@ impl Robot {
         robot: &RobotId,
         mac: MacAddress,
     ) -> Self {
-        let mut settings: BTreeMap<String, String> = environment::ROS_VARIABLES
-            .iter()
-            .filter_map(|name| Some(((*name).to_owned(), std::env::var(name).ok()?)))
-            .collect();
-        settings.extend(config.ros_domain_id.map(|id| ("ROS_DOMAIN_ID".to_owned(), id.to_string())));
-        let mut build_limits = BuildLimits::of_this_machine();
-        if let Some(timeout_s) = config.limits.build_timeout_s {
-            build_limits.timeout = Duration::from_secs(timeout_s);
-        }
-        build_limits.memory_bytes = config.limits.build_memory_bytes.or(build_limits.memory_bytes);
-        build_limits.pids = Some(config.task_pids);
-        let memory_bytes = config.limits.task_memory_mb.map(|megabytes| megabytes << 20);
+        let held = Held::of(config, RobotSettings::default());
         let cgroups = Cgroups::find();
-        let graph = GraphAccess::of_robot(mac, data.clone(), config.limits.log_bytes);
-        let environment = environment::of_this_robot(&settings);
+        let graph = GraphAccess::of_robot(mac, data.clone());
+        graph.limit(config.limits.log_bytes);
         let fetcher = Arc::new(fetcher);
         let vouching = config.trust.clone().map(|settings| {
             let trust = Trust::open(settings, data.publishers());
             Arc::new(Vouching::new(trust, fetcher.clone(), data.clone()))
         });
-        let gate = config.gate.clone().map(|gate| Gate::new(gate, robot.clone(), environment.clone(), data.root()));
+        let gate = config.gate.clone().map(|gate| Gate::new(gate, robot.clone(), data.root()));
         Self {
             data,
             fetcher,
@@ -123,18 +109,15 @@ impl Robot {
             gate,
             registry,
             robot: robot.clone(),
-            output_bytes: config.limits.output_bytes.unwrap_or(OUTPUT_BYTES),
             watcher: Watcher::new(graph.clone(), Supervisor::of_this_program(cgroups.clone())),
             graph,
             supervisor: Supervisor::of_this_program(cgroups.clone()),
             cgroups,
             task_user: TaskUser::find(config.task_user.as_deref()),
-            task_limits: RunLimits { memory_bytes, cpu_weight: None, pids: Some(config.task_pids) },
-            ros: RwLock::new(underlay::find(&config.underlays, &Places::of_this_machine())),
-            underlays: config.underlays.clone(),
-            environment,
-            build_limits,
-            log_bytes: config.limits.log_bytes,
+            ros: RwLock::new(held.installations()),
+            own: config.clone(),
+            forward: watch::Sender::new(config.forward),
+            held: RwLock::new(held),
             mac,
         }
     }
@@ -154,7 +137,7 @@ impl Robot {
 
     fn log(&self, task: &TaskName) -> LogSpec {
         let mut log = LogSpec::at(self.data.task(task).output_log());
-        log.max_bytes = self.log_bytes.unwrap_or(log.max_bytes);
+        log.max_bytes = self.held().config.limits.log_bytes.unwrap_or(log.max_bytes);
         log
     }
 
@@ -163,24 +146,10 @@ impl Robot {
         fetch::stored_manifest(&self.data, package).map_or_else(Promise::default, |manifest| Promise::of(&manifest))
     }
 
-    fn ros_facts(&self) -> Option<RosFacts> {
-        environment::ros_facts(&self.installations(), &self.environment)
-    }
-
-    fn installations(&self) -> Vec<Installation> {
-        self.ros.read().unwrap_or_else(PoisonError::into_inner).clone()
-    }
-
-    fn setup_files(&self, manifest: &TaskManifest) -> Result<Vec<PathBuf>, StepFailure> {
-        let version = launch::of(manifest).ros;
-        let found = underlay::setup_files(&self.installations(), version, &manifest.requires.ros_distro);
-        found.map_err(|error| finally(FailureCode::REQUIREMENTS_UNMET, &error))
-    }
-
     /// Whom the task and its builds run as, once the way to its directories is open, and the environment they have.
     fn account(&self, task: &TaskName) -> Result<(Option<TaskUser>, BTreeMap<String, String>), StepFailure> {
         let user = self.task_user.clone().map_err(|error| later(FailureCode::NO_TASK_USER, &error, 0))?;
-        let mut environment = self.environment.clone();
+        let mut environment = self.held().environment.clone();
         if let Some(user) = &user {
             let home = self.data.task(task).home();
             let opened = user.make_home(&home).and_then(|()| user.let_through(&self.data.way_to(task)));
@@ -193,7 +162,7 @@ impl Robot {
 
     /// What the task may use: what its package says, else what this robot's settings say.
     fn limits(&self, manifest: &TaskManifest) -> RunLimits {
-        let (limits, settings) = (&manifest.limits, self.task_limits);
+        let (limits, settings) = (&manifest.limits, self.held().task_limits);
         RunLimits {
             memory_bytes: limits.memory_mb.map(|megabytes| megabytes << 20).or(settings.memory_bytes),
             cpu_weight: limits.cpu_weight,
@@ -226,18 +195,11 @@ impl Effects for Robot {
     }
 
     async fn look_for_ros(&self) {
-        let found = underlay::find(&self.underlays, &Places::of_this_machine());
-        let dir = self.data.root().join(SURVEY_DIR);
-        let seen = match &self.task_user {
-            Ok(user) => survey::survey(found, &self.environment, &dir, user.as_ref()).await,
-            // Setup files may be anybody's: they are never sourced as root for want of a user.
-            Err(_) => found,
-        };
-        *self.ros.write().unwrap_or_else(PoisonError::into_inner) = seen;
+        self.survey().await;
     }
 
     fn host_facts(&self) -> HostFacts {
-        let installations = self.installations();
+        let (installations, held) = (self.installations(), self.held());
         let isolates = self.cgroups.as_ref().is_some_and(Cgroups::isolates);
         HostFacts {
             agent_version: env!("CARGO_PKG_VERSION").to_owned(),
@@ -246,10 +208,11 @@ impl Effects for Robot {
             mac: Some(self.mac),
             ros_distros: installation::all_distros(&installations),
             disk_free_bytes: disk::room(self.data.root()).map_or(0, |room| room.free),
-            ros: environment::ros_facts(&installations, &self.environment),
+            ros: environment::ros_facts(&installations, &held.environment),
             battery_percent: battery::percent(Path::new(battery::SUPPLIES)),
             isolation: if isolates { Isolation::Cgroup } else { Isolation::None },
             publishers: self.vouching.as_ref().map(|vouching| vouching.version()),
+            settings: held.effective.clone(),
         }
     }
 
@@ -322,11 +285,18 @@ impl Effects for Robot {
             started_ms: process.started_ms,
             was_ready: process.ready,
         });
-        self.listen_to(&run.package);
-        self.watcher.watch(watched.unwrap_or_default(), self.promise(&run.package), self.ros_facts())
+        let watched = watched.unwrap_or_default();
+        let facts = self.ros_facts_of(&watched.dir);
+        self.listen_to(&run.package, facts.as_ref());
+        self.watcher.watch(watched, self.promise(&run.package), facts)
+    }
+
+    fn parallel_tasks(&self) -> usize {
+        self.held().config.parallel_tasks
     }
 
     fn heed(&self, state: &DesiredState) {
+        self.adopt(&state.settings);
         self.vouching.iter().for_each(|vouching| vouching.heed(state));
     }
 
@@ -393,7 +363,7 @@ impl Effects for Robot {
             underlays: self.setup_files(&manifest)?,
             environment,
             log: self.data.task(&package.name).build_log(),
-            limits: self.build_limits,
+            limits: self.held().build_limits,
             version: version.clone(),
             user,
             cgroups: self.cgroups.clone(),
@@ -405,7 +375,8 @@ impl Effects for Robot {
 
     async fn ask_gate(&self, task: &TaskName, question: &GateQuestion) -> Result<(), StepFailure> {
         let Some(gate) = &self.gate else { return Ok(()) };
-        gate.ask(task, question).await.map_err(|failure| StepFailure { failure, retry_after_ms: Some(0) })
+        let answer = gate.ask(task, question, &self.held().environment).await;
+        answer.map_err(|failure| StepFailure { failure, retry_after_ms: Some(0) })
     }
 
     async fn start(&self, task: &TaskName, run: &ActiveRun) -> Result<u32, StepFailure> {
@@ -442,7 +413,8 @@ impl Effects for Robot {
         for other in other_runs(&task_dir.run(), Some(&run_dir)) {
             self.supervisor.stop(&other, Duration::ZERO).await.map_err(|error| failed(&error))?;
         }
-        self.watcher.before_start(&Promise::of(&manifest), self.ros_facts().as_ref()).await.map_err(|failure| {
+        let facts = self.ros_facts_in(&spec.environment);
+        self.watcher.before_start(&Promise::of(&manifest), facts.as_ref()).await.map_err(|failure| {
             // Whoever has the name may go away: a run that was ready before waits for that.
             StepFailure { failure, retry_after_ms: run.ever_ready.then_some(0) }
         })?;
@@ -459,7 +431,8 @@ impl Effects for Robot {
         let Some(process) = &run.process else { return Ok(()) };
         let grace = Duration::from_secs(u64::from(run.rules.stop_timeout_s));
         let dir = self.run_dir(task, process);
-        self.watcher.wind_down(&dir, &self.promise(&run.package), self.ros_facts().as_ref(), grace / 2).await;
+        let facts = self.ros_facts_of(&dir);
+        self.watcher.wind_down(&dir, &self.promise(&run.package), facts.as_ref(), grace / 2).await;
         let stopped = self.supervisor.stop(&dir, grace).await;
         stopped.map(drop).map_err(|error: SupervisorError| later(FailureCode::IO_ERROR, &error, 0))
     }
@@ -483,7 +456,7 @@ impl Effects for Robot {
             user: self.task_user.clone().map_err(|error| later(FailureCode::NO_TASK_USER, &error, 0))?,
             notes: self.data.task(task).uploads(),
             patterns: manifest.outputs.paths,
-            max_bytes: self.output_bytes,
+            max_bytes: self.held().output_bytes,
         };
         match outputs::bring_back(&self.registry, &order, progress, cancel).await {
             Ok(count) => {
@@ -537,4 +510,25 @@ fn other_runs(runs: &Path, kept: Option<&Path>) -> Vec<PathBuf> {
 async fn on_disk(work: impl FnOnce() -> std::io::Result<()> + Send + 'static) -> Result<(), StepFailure> {
     let done = tokio::task::spawn_blocking(work).await.map_err(std::io::Error::other);
     done.flatten().map_err(|error| later(FailureCode::IO_ERROR, &error, 0))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fetch::FetchSettings;
+
+    /// A robot whose data is in `dir` and whose own settings are `file`. Nobody is its server.
+    pub(super) fn robot(dir: &Path, file: &str) -> Robot {
+        std::fs::write(dir.join(crate::config::FILE_NAME), file).expect("written");
+        let config = Config::load(dir, std::iter::empty()).expect("loads");
+        let data = DataDir::new(dir).expect("a data directory");
+        let tls = task_transport::Trust::by(None).client_config(clock::for_certificates());
+        let client = crate::server::client(tls).expect("a client");
+        let server: reqwest::Url = "http://127.0.0.1:9/".parse().expect("a URL");
+        let fetcher =
+            Fetcher::new(client.clone(), server.clone(), "tskr_x".to_owned(), data.clone(), FetchSettings::default());
+        let registry = Registry::new(client, server, "tskr_x".to_owned());
+        let mac = "02:00:00:00:00:01".parse().expect("an address");
+        Robot::new(data, (fetcher, Listening::default()), registry, &config, &RobotId::random(), mac)
+    }
 }

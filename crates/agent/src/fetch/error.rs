@@ -4,11 +4,11 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use task_archive::Refusal;
 use task_proto::report::FailureCode;
 use task_proto::{Digest, RepositoryName};
 
 use crate::disk::{self, DiskFull, Need};
-use crate::unpack::Refusal;
 
 /// Why a pull did not end with the package in its place.
 #[derive(Debug, thiserror::Error)]

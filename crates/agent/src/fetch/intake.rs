@@ -8,6 +8,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use sha2::{Digest as _, Sha256};
+use task_archive::{Limits, UnpackError};
 use task_proto::Digest;
 use task_proto::desired::{BlobRef, PackageRef};
 use task_proto::manifest::ContentFacts;
@@ -18,7 +19,6 @@ use tokio_util::sync::CancellationToken;
 use super::{FetchError, Fetcher};
 use crate::disk::Need;
 use crate::durable;
-use crate::unpack::{self, Limits, UnpackError};
 
 /// One try to get a package's content unpacked.
 pub(super) struct Intake {
@@ -50,7 +50,7 @@ impl Intake {
             blob,
             part: fetcher.data.blob_part(&blob.digest),
             staging: fetcher.data.staging().join(package.manifest.digest.hex()),
-            limits: fetcher.settings.limits,
+            limits: fetcher.settings().limits,
             present,
             receiver,
             progress,
@@ -79,8 +79,11 @@ impl Intake {
     fn unpack(self, facts: &ContentFacts) -> Result<(), FetchError> {
         let (blob, limits, staging) = (self.blob, self.limits, self.staging.clone());
         durable::remove_dir_all(&staging).map_err(|source| FetchError::disk(&staging, source))?;
+        if let Some(parent) = staging.parent() {
+            durable::create_dir_all(parent).map_err(|source| FetchError::disk(parent, source))?;
+        }
         let mut bytes = Bytestream::open(self)?;
-        let unpacked = unpack::unpack(&mut bytes, blob.size, facts, &limits, &staging);
+        let unpacked = task_archive::unpack(&mut bytes, blob.size, facts, &limits, &staging);
         if let Err(UnpackError::Disk { path, source }) = unpacked {
             return Err(FetchError::Disk { path, source });
         }

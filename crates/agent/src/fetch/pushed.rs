@@ -142,7 +142,7 @@ impl<'a> Gathering<'a> {
             map,
             is_cut: false,
             files,
-            patience: fetcher.settings.parts,
+            patience: fetcher.settings().parts,
             progress,
             asks,
             turn,

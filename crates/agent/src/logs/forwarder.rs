@@ -37,7 +37,7 @@ const COUNT_INTERVAL: Duration = Duration::from_secs(5);
 
 /// Publishes lines until the agent ends.
 pub struct Forwarder {
-    settings: ForwardSettings,
+    settings: watch::Receiver<ForwardSettings>,
     following: watch::Receiver<Option<Following>>,
     gatherer: Gatherer,
 }
@@ -47,7 +47,7 @@ impl Forwarder {
     pub fn new(
         robot_id: RobotId,
         data: DataDir,
-        settings: ForwardSettings,
+        settings: watch::Receiver<ForwardSettings>,
         following: watch::Receiver<Option<Following>>,
     ) -> Self {
         let mut gatherer = Gatherer::new(robot_id, data);
@@ -63,7 +63,7 @@ impl Forwarder {
                 return;
             }
             let Ok(room) = batches.reserve().await else { return };
-            let wanted = Wanted::new(self.settings, *self.following.borrow_and_update(), Instant::now());
+            let wanted = Wanted::new(*self.settings.borrow(), *self.following.borrow_and_update(), Instant::now());
             let mut gatherer = self.gatherer;
             let gathered = tokio::task::spawn_blocking(move || {
                 if !was_up {

@@ -82,6 +82,7 @@ fn state(robot: &RobotId, generation: u64) -> DesiredState {
         expires_at_ms: u64::MAX,
         tasks: Vec::new(),
         evidence: Default::default(),
+        settings: Default::default(),
     }
 }
 

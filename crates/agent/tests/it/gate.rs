@@ -26,14 +26,14 @@ async fn ask_program(dir: &Path, program: &Path, timeout: Duration, default: Gat
     let command = vec![program.display().to_string(), "an argument".to_owned()];
     let robot: RobotId = "r0123456789abcdef".parse().expect("valid");
     let environment = BTreeMap::from([("PATH".to_owned(), "/usr/bin:/bin".to_owned())]);
-    let gate = Gate::new(GateConfig { command, timeout, default }, robot, environment, dir);
+    let gate = Gate::new(GateConfig { command, timeout, default }, robot, dir);
     let question = GateQuestion {
         step: GateStep::Switch,
         deployment: DeploymentId::random(),
         run: 3,
         version: "1.1".parse().expect("valid"),
     };
-    gate.ask(&task(), &question).await
+    gate.ask(&task(), &question, &environment).await
 }
 
 fn task() -> TaskName {

@@ -1,9 +1,11 @@
 //! What real nodes say on ROS topics is kept with the task whose process said it.
 
+use task_agent::graph_access::GraphAccess;
 use task_agent::layout::DataDir;
 use task_agent::logs::archive::Wanted;
 use task_agent::logs::{Logs, ros};
 use task_proto::log::{LogLevel, LogLine, LogSource};
+use task_proto::report::RosFacts;
 
 use crate::harness::within;
 use crate::ros::{RosNode, open};
@@ -55,4 +57,25 @@ async fn what_nodes_say_is_kept_with_their_task() {
     other.leave().await;
     graph.close().await;
     within("the end of the graph", keeping).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_nodes_say_is_kept_in_files_of_the_size_that_is_set_when_the_graph_is_opened() {
+    let temp = tempfile::tempdir().unwrap();
+    let data = DataDir::new(temp.path()).unwrap();
+    let access = GraphAccess::of_robot("02:00:00:00:00:01".parse().unwrap(), data.clone());
+    access.limit(Some(4096));
+    let facts = RosFacts { distro: "jazzy".to_owned(), rmw: None, domain_id: Some(119), localhost_only: true };
+    let graph = access.open(Some(&facts)).await.unwrap();
+    let mut node = RosNode::start("talker.py", 119, &[]).await;
+    let rotated = data.ros_log().with_extension("log.1");
+    let filled = async {
+        while !rotated.exists() {
+            node.order(&format!("warn {}", "x".repeat(1000))).await;
+        }
+    };
+    within("the file to be full", filled).await;
+    node.leave().await;
+    drop(access);
+    graph.close().await;
 }

@@ -6,6 +6,7 @@ mod agent;
 mod archive;
 mod build;
 mod contain;
+mod doctor;
 mod fetch;
 mod gate;
 mod graph;

@@ -8,7 +8,7 @@ use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::Path;
 
 use proptest::prelude::*;
-use task_agent::unpack::{Limits, Refusal, UnpackError, unpack};
+use task_archive::{Limits, Refusal, UnpackError, unpack};
 use task_proto::manifest::ContentFacts;
 
 use crate::archive::{Header, Tar, compress, seal};

@@ -173,6 +173,7 @@ impl Robot {
             expires_at_ms: u64::MAX,
             tasks: vec![order(package)],
             evidence,
+            settings: Default::default(),
         });
     }
 

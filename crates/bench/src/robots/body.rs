@@ -95,6 +95,10 @@ impl Effects for Body {
         self.health.subscribe()
     }
 
+    fn parallel_tasks(&self) -> usize {
+        self.robot.parallel_tasks()
+    }
+
     fn heed(&self, state: &DesiredState) {
         self.robot.heed(state);
     }

@@ -4,35 +4,19 @@
 
 use std::io::Write as _;
 use std::path::Path;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
-use anyhow::{Context as _, bail};
+use anyhow::Context as _;
 use clap::Args;
-use futures_util::{StreamExt as _, TryStreamExt as _};
-use task_proto::api::{CreateDeployment, DeliveryChoice, EnrollResponse};
-use task_proto::desired::{BlobRef, PackageRef, Wanted};
-use task_proto::report::{HostFacts, Phase, Progress, Report, TaskReport};
-use task_proto::topic::{RobotTopic, Topic};
-use task_proto::{DeploymentId, Digest, Generation, InstanceId};
-use tokio::io::AsyncWriteExt as _;
 
-use crate::enrolment::enrol;
+use super::reporters::{Reporter, connect, report_at};
 use crate::machine::allow_files;
-use crate::mqtt::{Heard, Link, Login, message};
 use crate::progress::{RunProgress, say};
 use crate::run::{Point, Run, RunFlags, Unit};
 use crate::taskd::{Taskd, TaskdFlags, TaskdOrder};
 
-/// Connections opened at a time.
-const CONNECTS_AT_ONCE: usize = 64;
 /// Syncs before and after each measurement.
 const SYNCS: usize = 200;
-/// One in so many reports says that the task is in another phase; the others, that it has come further in its own.
-const REPORTS_PER_PHASE: u64 = 10;
-/// How long the last acknowledgements may take.
-const PATIENCE: Duration = Duration::from_secs(60);
-/// From ordering the reports until the first is due.
-const LEAD: Duration = Duration::from_millis(500);
 
 /// What to measure.
 #[derive(Debug, Args)]
@@ -91,74 +75,6 @@ pub async fn run(flags: StatusFlags) -> anyhow::Result<Run> {
     Ok(run)
 }
 
-/// A robot that is connected and has an order to report on.
-struct Reporter {
-    link: Link,
-    topic: String,
-    report: Report,
-}
-
-async fn connect(taskd: &Taskd, count: usize) -> anyhow::Result<Vec<Reporter>> {
-    let robots = enrol(&taskd.server, count).await?;
-    let (package, version) = ("status".parse()?, "1".parse()?);
-    let manifest = taskd.server.push_package(&package, &version).await?;
-    let order =
-        CreateDeployment { delivery: DeliveryChoice::Poll, ..CreateDeployment::new(package, manifest, "*".parse()?) };
-    let deployment = taskd.server.order(&order).await?.id;
-    let connecting = robots.iter().enumerate().map(|(number, robot)| {
-        let deployment = &deployment;
-        async move {
-            let credentials = Some((robot.robot_id.as_str(), robot.token.as_str()));
-            let login = Login { client_id: robot.robot_id.as_str(), credentials };
-            let link = Link::connect(taskd.mqtt, number, &login).await?;
-            let topic = robot.mqtt.prefix.format(&Topic::Robot(robot.robot_id.clone(), RobotTopic::Report));
-            Ok(Reporter { link, topic, report: report(robot, deployment)? })
-        }
-    });
-    futures_util::stream::iter(connecting).buffered(CONNECTS_AT_ONCE).try_collect().await
-}
-
-/// What a robot says while it fetches.
-fn report(robot: &EnrollResponse, deployment: &DeploymentId) -> anyhow::Result<Report> {
-    let blob = BlobRef { digest: Digest::of(b""), size: 0 };
-    let (name, version) = ("status".parse()?, "1".parse()?);
-    let task = TaskReport {
-        task: "status".parse()?,
-        deployment: deployment.clone(),
-        package: PackageRef { name, version, manifest: blob, config: blob, content: blob },
-        wanted: Wanted::Running,
-        run: 1,
-        kind: None,
-        phase: Phase::Fetching,
-        phase_ms: 0,
-        progress: Some(Progress { done: 0, total: 0 }),
-        missing_parts: None,
-        attempts: 1,
-        restarts: 0,
-        failure: None,
-        degraded: None,
-        active: None,
-    };
-    Ok(Report {
-        robot_id: robot.robot_id.clone(),
-        start: 1,
-        instance: InstanceId::random(),
-        boot_id: "00000000-0000-0000-0000-000000000000".to_owned(),
-        seq: 0,
-        observed_generation: Generation(1),
-        uptime_ms: 0,
-        host: HostFacts {
-            agent_version: concat!("taskbench ", env!("CARGO_PKG_VERSION")).to_owned(),
-            hostname: robot.name.to_string(),
-            arch: std::env::consts::ARCH.to_owned(),
-            ..HostFacts::default()
-        },
-        conditions: Vec::new(),
-        link: None,
-        tasks: vec![task],
-    })
-}
-
 async fn measure(
     taskd: &Taskd,
     robots: &mut [Reporter],
@@ -167,19 +83,12 @@ async fn measure(
     point: &mut Point,
 ) -> anyhow::Result<()> {
     let mut syncs = sync_ms(taskd.dir())?;
-    let (count, total) = (robots.len(), usize::try_from(u64::from(rate) * seconds)?);
     let before = taskd.usage();
-    let begin = Instant::now() + LEAD;
-    let due = |number: usize| begin + Duration::from_secs_f64(number as f64 / f64::from(rate));
-    let reporting = robots.iter_mut().enumerate().map(|(first, robot)| {
-        let due: Vec<Instant> = (first..total).step_by(count).map(due).collect();
-        robot.keep_reporting(due)
-    });
-    let outcomes = futures_util::future::join_all(reporting).await;
+    let (begin, outcomes) = report_at(robots, rate, seconds).await?;
     let cpu_s = taskd.usage().cpu_s - before.cpu_s;
     let wall = begin.elapsed();
     syncs.extend(sync_ms(taskd.dir())?);
-    let mut stored = Vec::with_capacity(total);
+    let mut stored = Vec::new();
     for outcome in outcomes {
         match outcome {
             Ok(samples) => stored.extend(samples),
@@ -192,48 +101,6 @@ async fn measure(
     point.measure("stored_after", Unit::Milliseconds, stored);
     point.measure("fsync", Unit::Milliseconds, syncs);
     Ok(())
-}
-
-impl Reporter {
-    /// Reports whenever it is due, acknowledged or not; gives how long after that each report was stored, in milliseconds.
-    async fn keep_reporting(&mut self, due: Vec<Instant>) -> anyhow::Result<Vec<f64>> {
-        let mut stored = Vec::with_capacity(due.len());
-        let mut sent = 0;
-        while stored.len() < due.len() {
-            let next = due.get(sent).copied();
-            let until = next.unwrap_or_else(|| Instant::now() + PATIENCE);
-            tokio::select! {
-                heard = self.link.reader.next() => {
-                    if let Heard::Acknowledged(_) = heard? {
-                        stored.push(due[stored.len()].elapsed().as_secs_f64() * 1000.0);
-                    }
-                }
-                () = tokio::time::sleep_until(until.into()) => {
-                    if next.is_none() {
-                        bail!("no acknowledgement within {PATIENCE:?}");
-                    }
-                    self.send().await?;
-                    sent += 1;
-                }
-            }
-        }
-        Ok(stored)
-    }
-
-    async fn send(&mut self) -> anyhow::Result<()> {
-        self.report.seq += 1;
-        let seq = self.report.seq;
-        self.report.uptime_ms = seq * 1000;
-        for task in &mut self.report.tasks {
-            let phases = [Phase::Fetching, Phase::Unpacking, Phase::Staged, Phase::Starting];
-            task.phase = phases[usize::try_from(seq / REPORTS_PER_PHASE)? % phases.len()];
-            task.progress = Some(Progress { done: seq, total: u64::MAX >> 11 });
-        }
-        let packet_id = u16::try_from(seq % 65_535)? + 1;
-        let payload = serde_json::to_vec(&self.report)?;
-        let packet = message(&self.topic, packet_id, &payload)?;
-        self.link.writer.write_all(&packet).await.context("the connection broke")
-    }
 }
 
 /// What appending a page and syncing it takes, again and again, in milliseconds.

@@ -32,8 +32,7 @@ async fn a_small_package_comes_with_the_order_and_nothing_of_it_over_http() {
     let server = Server::start(&dir.path().join("server")).await;
     let proxy = Proxy::start(server.http, u64::MAX).await;
     let _robot = Robot::start_with(&server, dir.path(), "robot-1", 1, &format!("http://{}", proxy.address), &[]).await;
-    let online = async || server.robot("robot-1").await.filter(|robot| robot.online);
-    eventually("the robot to be online", online).await;
+    server.wait_online("robot-1").await;
     let package = package(dir.path(), BYTES);
     let before = proxy.bytes_to_clients();
     assert_eq!(deliver(&server, &package, "inline").await, Delivery::Inline);

@@ -179,6 +179,11 @@ impl Server {
         eventually("taskd to be ready", async || (self.readiness().await?["status"] == "ready").then_some(())).await;
     }
 
+    /// Until this robot's session has come about.
+    pub async fn wait_online(&self, robot: &str) {
+        eventually("the robot to be online", async || self.robot(robot).await?.online.then_some(())).await;
+    }
+
     /// What `/readyz` says.
     pub async fn readiness(&self) -> Option<Value> {
         self.client.get(self.url("/readyz")).send().await.ok()?.json().await.ok()
@@ -361,7 +366,8 @@ impl Robot {
         let mut command = Command::new(program("task-agent"));
         command.arg("run").arg("--data").arg(&self.data);
         if nix::unistd::geteuid().is_root() {
-            let ros = self.environment.iter().any(|(name, _)| name == "TASK_AGENT_UNDERLAYS");
+            let ros =
+                self.environment.iter().any(|(name, _)| name.starts_with("ROS_") || name == "TASK_AGENT_UNDERLAYS");
             command.env("TASK_AGENT_TASK_USER", if ros && !ros_is_for_all() { "root" } else { TASK_USER });
         }
         command.envs(self.environment.iter().map(|(k, v)| (k, v)));

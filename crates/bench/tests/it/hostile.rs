@@ -10,7 +10,7 @@ use task_proto::desired::BlobRef;
 use task_proto::oci::ImageManifest;
 use task_proto::report::Phase;
 
-use crate::harness::{Fleet, Server, eventually};
+use crate::harness::{Fleet, Server};
 
 /// One tar entry, header written by hand: the `tar` crate refuses to write most of these.
 fn entry(name: &str, kind: u8, link: &str, data: &[u8]) -> Vec<u8> {
@@ -170,5 +170,5 @@ async fn one_robots_credentials_reach_no_other_robot() {
     };
     refused.await;
     // The other robot is none the worse.
-    eventually("the other robot to be online", async || fleet.server.robot(&other).await?.online.then_some(())).await;
+    fleet.server.wait_online(&other).await;
 }

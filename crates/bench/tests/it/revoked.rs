@@ -88,7 +88,7 @@ async fn a_revoked_robot_is_out_at_once_and_keeps_what_runs() {
     let next = next["token"].as_str().expect("a token").to_owned();
     assert!(server.robot("robot-1").await.expect("there").mqtt.is_some(), "it has a session");
 
-    server.operate(["robot", "revoke", "robot-1"]).await;
+    server.operate(["robot", "revoke", "robot-1", "--yes"]).await;
 
     let cut = tokio::time::timeout(PATIENCE, async {
         loop {

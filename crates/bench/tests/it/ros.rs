@@ -23,7 +23,7 @@ const JOB_PATIENCE: Duration = Duration::from_secs(600);
 
 /// A ROS domain that nobody else on this machine has while this lives: a port that no participant of it uses is the lock.
 pub struct Domain {
-    id: String,
+    pub id: String,
     _lock: UdpSocket,
 }
 
@@ -50,23 +50,31 @@ impl Stage {
     /// A stage whose node is built.
     pub async fn start() -> Self {
         let stage = Self::bare().await;
-        build(&activate(), &stage.dir.path().join("built")).await;
+        stage.build().await;
         stage
     }
 
     /// A stage without anything built.
     pub async fn bare() -> Self {
+        Self::with(|domain| vec![("TASK_AGENT_UNDERLAYS", activate()), ("TASK_AGENT_ROS_DOMAIN_ID", domain.to_owned())])
+            .await
+    }
+
+    /// A stage whose robot has settings of its own for this domain, and nothing is built.
+    pub async fn with(own: impl FnOnce(&str) -> Vec<(&'static str, String)>) -> Self {
         let domain = Domain::free();
-        let activate = activate();
         let dir = TempDir::new().expect("temp dir");
         let server = Server::start(&dir.path().join("server")).await;
-        let settings = [
-            ("TASK_AGENT_UNDERLAYS", activate.as_str()),
-            ("TASK_AGENT_ROS_DOMAIN_ID", &domain.id),
-            ("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
-        ];
+        let own = own(&domain.id);
+        let mut settings: Vec<_> = own.iter().map(|(name, value)| (*name, value.as_str())).collect();
+        settings.push(("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"));
         let robot = Robot::start_with(&server, dir.path(), "robot-1", 1, &server.url(""), &settings).await;
         Self { robot, server, domain, dir }
+    }
+
+    /// Builds the node, for packages that are not to be built.
+    pub async fn build(&self) {
+        build(&activate(), &self.dir.path().join("built")).await;
     }
 
     /// A package whose node gets `arguments`, and whose task.toml has `rest` behind its `[run]` table. It is built already.
@@ -135,7 +143,7 @@ impl Stage {
         found[0]
     }
 
-    fn signal(&self, name: &str, signal: Signal) {
+    pub fn signal(&self, name: &str, signal: Signal) {
         kill(Pid::from_raw(self.node(name)), signal).expect("signalled");
     }
 
@@ -149,7 +157,7 @@ impl Stage {
 }
 
 /// The script that sets up ROS.
-fn activate() -> String {
+pub fn activate() -> String {
     format!("{}/bin/activate", required("TASKD_TEST_ROS"))
 }
 
@@ -181,7 +189,7 @@ pub fn copy(from: &Path, to: &Path) {
     }
 }
 
-fn pid_of(task: &RobotTask) -> u32 {
+pub fn pid_of(task: &RobotTask) -> u32 {
     task.active.as_ref().expect("a process").pid
 }
 

@@ -98,12 +98,19 @@ fn every_test_in_a_table_of_attacks_exists() {
     let crates = Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("workspace");
     let mut files = Vec::new();
     rust_files(crates, &mut files);
+    // The page's are not in Rust.
+    let page_tests = std::fs::read_dir(crates.join("server/tests/page")).expect("readable");
+    files.extend(page_tests.map(|entry| entry.expect("an entry").path()));
     let sources: Vec<String> = files.iter().map(|path| std::fs::read_to_string(path).expect("readable")).collect();
     for (name, least) in [("people.md", 20), ("security.md", 40)] {
         let page = std::fs::read_to_string(crates.join("../docs").join(name)).expect("readable page");
         let named = tests_named(&page);
         assert!(named.len() >= least, "found only {} tests in the tables of {name}", named.len());
-        let is_there = |test: &str| sources.iter().any(|source| source.contains(&format!("fn {test}(")));
+        let is_there = |test: &str| {
+            sources
+                .iter()
+                .any(|source| source.contains(&format!("fn {test}(")) || source.contains(&format!("\ntest('{test}'")))
+        };
         let absent: Vec<_> = named.iter().filter(|test| !is_there(test)).collect();
         assert!(absent.is_empty(), "docs/{name} names tests that are not there: {absent:?}");
     }

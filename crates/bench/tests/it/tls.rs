@@ -181,9 +181,9 @@ impl Proxy {
         let (certificate, key) = authority.issue();
         std::fs::write(prefix.join("proxy.pem"), certificate).expect("written");
         std::fs::write(prefix.join("proxy.key"), key).expect("written");
-        let user = if nix::unistd::geteuid().is_root() { "user root;" } else { "" };
+        // One process alone: a worker would outlive a master that is killed.
         let configuration = format!(
-            "daemon off; {user} pid nginx.pid; error_log error.log; events {{}}
+            "daemon off; master_process off; pid nginx.pid; error_log error.log; events {{}}
              http {{
                  access_log off; client_body_temp_path .; proxy_temp_path .; fastcgi_temp_path .; uwsgi_temp_path .;
                  scgi_temp_path .;

@@ -86,6 +86,35 @@ fn no_websocket_frame_does_harm() {
     run("websocket");
 }
 
+/// A stack runs out at some depth, and that ends the process: nobody can catch it.
+#[test]
+fn however_deep_it_is_nothing_does_harm() {
+    const DEPTH: usize = 200_000;
+    let nested = |before: &str, open: &str, close: &str| {
+        [before.to_owned() + &open.repeat(DEPTH), before.to_owned() + &open.repeat(DEPTH) + &close.repeat(DEPTH)]
+    };
+    let inputs = [
+        nested("", "[", "]"),
+        nested("", "{\"a\":", "}"),
+        nested("{\"tasks\":", "[", "]}"),
+        nested("{\"layers\":", "[", "]}"),
+        nested("{\"payload\":", "{\"a\":", "}"),
+        nested("a = ", "[", "]"),
+        nested("a = ", "{ a = ", " }"),
+        nested("", "a.", "a = 1"),
+        nested("[", "a.", "a]"),
+        nested("[parameters.'/a']\na = ", "[", "]"),
+        nested("", "<a>", "</a>"),
+        nested("<package format=\"3\">", "<depend>", "</depend>"),
+        nested("", "<!--", "-->"),
+        nested("", "!(", ")"),
+        nested("", "a,!", "a"),
+    ];
+    for target in TARGETS {
+        inputs.iter().flatten().for_each(|input| (target.run)(input.as_bytes()));
+    }
+}
+
 #[test]
 fn every_target_is_run_here_and_by_the_fuzzer() {
     let fuzz = directory().join("..");

@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 
 /// What was done about robots that sent more than they may, or what they may not.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct ConductTotals {
     /// How often one was slowed.

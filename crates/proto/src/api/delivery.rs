@@ -8,6 +8,7 @@ use crate::desired::Delivery;
 
 /// What an operator may order. An unknown word is refused: it would be an order half understood.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum DeliveryChoice {
     /// The server's rules decide, robot by robot.
@@ -25,6 +26,7 @@ pub enum DeliveryChoice {
 
 /// The mechanism by which one robot gets its bytes, and why that one.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct DeliveryDecision {
     /// How the bytes travel.
     pub mechanism: Delivery,

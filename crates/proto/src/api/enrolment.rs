@@ -7,6 +7,7 @@ use crate::{MacAddress, RobotId, RobotName, TokenId};
 
 /// `GET /enrollment-tokens` (administer): those that are still good for something.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct EnrollmentTokenList {
     /// The newest first, at most 1,000.
     pub tokens: Vec<EnrollmentTokenView>,
@@ -14,6 +15,7 @@ pub struct EnrollmentTokenList {
 
 /// An enrolment token, without its secret.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct EnrollmentTokenView {
     /// By which it is revoked.
     pub id: TokenId,
@@ -22,6 +24,7 @@ pub struct EnrollmentTokenView {
     pub robot: Option<RobotName>,
     /// Labels that each robot gets which uses it.
     #[serde(default)]
+    #[cfg_attr(feature = "openapi", schema(inline))]
     pub labels: Labels,
     /// Enrolments left; absent: any number. With none left it is only good for one whose answer was lost.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -40,6 +43,7 @@ pub const AWAITS_APPROVAL: &str = "awaits_approval";
 
 /// `GET /pending-robots` (administer): robots that wait to be approved.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct PendingRobotList {
     /// Who has waited for longest first.
     pub robots: Vec<PendingRobot>,
@@ -47,6 +51,7 @@ pub struct PendingRobotList {
 
 /// A robot that waits to be approved. Name, MAC and labels are what it says of itself, but for the token's labels.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct PendingRobot {
     /// Its identity.
     pub id: RobotId,
@@ -55,6 +60,7 @@ pub struct PendingRobot {
     /// Its MAC.
     pub mac: MacAddress,
     /// Its labels.
+    #[cfg_attr(feature = "openapi", schema(inline))]
     pub labels: Labels,
     /// Since when it waits.
     pub since_ms: u64,

@@ -7,13 +7,16 @@ use crate::log::{LogLevel, LogLine};
 
 /// The query of `GET /robots/{robot}/logs` (read).
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::IntoParams))]
 #[serde(deny_unknown_fields)]
 pub struct LogsQuery {
     /// Lines of this task only.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "openapi", param(inline))]
     pub task: Option<TaskName>,
     /// Only these and more serious ones; absent: all.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "openapi", param(inline))]
     pub level: Option<LogLevel>,
     /// Not older than so many seconds, by the robot's clock.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -28,6 +31,7 @@ pub struct LogsQuery {
 
 /// Answer of `GET /robots/{robot}/logs`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct LogsView {
     /// Whose lines these are.
     pub from: LogsFrom,
@@ -45,6 +49,7 @@ pub struct LogsView {
 
 /// Where log lines were read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum LogsFrom {
     /// The robot, which keeps them all for a while.
@@ -56,6 +61,7 @@ pub enum LogsFrom {
 /// What `GET /robots/{robot}/logs?follow=true` streams: each is the `data` of a server-sent event whose `event` is the
 /// tag's value.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub enum LogEvent {
     /// The robot publishes its lines from now on. Comes again after a gap: what was said in it is to be had by asking.

@@ -9,6 +9,7 @@ use crate::topic::TopicPrefix;
 
 /// Where a robot's MQTT session goes: part of the answer to an enrolment, and `GET /robots/{robot}/mqtt` (that robot).
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct MqttEndpoint {
     /// Host; absent means the host of the server's URL.
     #[serde(default)]
@@ -28,6 +29,7 @@ pub struct MqttEndpoint {
 /// What is otherwise with a broker that is not the server's own. Its PUBACK says that the broker took a message, and
 /// nothing of the server: reports go over HTTP, whose answer means stored.
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct ExternalBroker {
     /// The robot's password there, in the place of its token, which such a broker is never shown.
     pub password: String,
@@ -44,6 +46,7 @@ impl fmt::Debug for ExternalBroker {
 
 /// `GET /broker` (administer): what an external broker must know, as mosquitto reads it.
 #[derive(Clone, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct BrokerFiles {
     /// The access control list.
     pub acl: String,

@@ -9,6 +9,7 @@ use crate::{TokenId, UserName};
 
 /// `GET /users` (administer).
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct UserList {
     /// Sorted by name.
     pub users: Vec<UserView>,
@@ -16,6 +17,7 @@ pub struct UserList {
 
 /// A person as an administrator sees them.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct UserView {
     /// What they sign in with.
     pub name: UserName,
@@ -35,6 +37,7 @@ pub struct UserView {
 
 /// `POST /users` (administer).
 #[derive(Clone, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct AddUser {
     /// What they sign in with.
     pub name: UserName,
@@ -50,6 +53,7 @@ pub struct AddUser {
 
 /// `PATCH /users/{user}` (administer): absent fields stay.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct EditUser {
     /// What they may do from now on.
     #[serde(default)]
@@ -61,6 +65,7 @@ pub struct EditUser {
 
 /// `PUT /users/{user}/password` (administer). Ends what was signed in with the old one.
 #[derive(Clone, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct SetPassword {
     /// The new one.
     pub password: String,
@@ -68,6 +73,7 @@ pub struct SetPassword {
 
 /// `PUT /password` (any user): one's own. Ends what was signed in with the old one.
 #[derive(Clone, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct ChangePassword {
     /// The one there is.
     pub old: String,
@@ -77,6 +83,7 @@ pub struct ChangePassword {
 
 /// `POST /login` (anyone): exchanges name and password for an access token.
 #[derive(Clone, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct LogIn {
     /// Who.
     pub user: UserName,
@@ -89,6 +96,7 @@ pub struct LogIn {
 
 /// `POST /session` (anyone): exchanges an operator token, or a name and a password, for a cookie.
 #[derive(Clone, Default, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct SignIn {
     /// The operator token.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -103,6 +111,7 @@ pub struct SignIn {
 
 /// Answer to a sign-in, and `GET /session` (anyone).
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct SessionView {
     /// When the caller's session ends; absent: not signed in.
     pub expires_at_ms: Option<u64>,
@@ -113,6 +122,7 @@ pub struct SessionView {
 
 /// A provider by which people may sign in.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct ProviderView {
     /// What it is called.
     pub title: String,
@@ -122,6 +132,7 @@ pub struct ProviderView {
 
 /// `GET /me` (any person): who the caller is and what they may.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Me {
     /// The user's name, `operator.token` for the first token.
     pub name: UserName,
@@ -137,6 +148,7 @@ pub struct Me {
 
 /// Where a person's token came from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum TokenOrigin {
     /// From the server's data directory.
@@ -151,6 +163,7 @@ pub enum TokenOrigin {
 
 /// `GET /tokens` (any person): one's own; with `?all=true` (administer) everybody's.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct TokenList {
     /// The newest first.
     pub tokens: Vec<TokenView>,
@@ -158,6 +171,7 @@ pub struct TokenList {
 
 /// A person's access token, without its secret.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct TokenView {
     /// By which it is revoked.
     pub id: TokenId,
@@ -184,6 +198,7 @@ pub struct TokenView {
 
 /// `POST /tokens` (any user who signed in with a password): a token of one's own that may do as much or less.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct CreateToken {
     /// Whose it is; absent: one's own. Another's takes an administrator.
     #[serde(default)]
@@ -204,6 +219,7 @@ pub struct CreateToken {
 
 /// A new access token. The secret is shown this once.
 #[derive(Clone, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct AccessToken {
     /// The public part of it.
     pub id: TokenId,
@@ -217,6 +233,7 @@ pub struct AccessToken {
 
 /// The query of `GET /audit` (administer). Without `after` the newest come first.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::IntoParams))]
 #[serde(deny_unknown_fields)]
 pub struct AuditQuery {
     /// Only entries with a higher number, the lowest first.
@@ -241,6 +258,7 @@ pub struct AuditQuery {
 
 /// Answer of `GET /audit`.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct AuditPage {
     /// What was found.
     pub records: Vec<AuditRecord>,

@@ -34,7 +34,7 @@ use task_proto::ros::{Endpoint, LifecycleState, NodeDetail, NodeSummary, Paramet
 use task_proto::topic::TopicPrefix;
 use task_proto::{Digest, Generation, RobotId};
 
-fn parsed<T: std::str::FromStr<Err: Debug>>(text: &str) -> T {
+pub fn parsed<T: std::str::FromStr<Err: Debug>>(text: &str) -> T {
     text.parse().expect(text)
 }
 
@@ -42,7 +42,7 @@ fn blob(text: &str) -> BlobRef {
     BlobRef { digest: Digest::of(text.as_bytes()), size: text.len() as u64 }
 }
 
-fn package() -> PackageRef {
+pub fn package() -> PackageRef {
     PackageRef {
         name: parsed("talker"),
         version: parsed("1.2.0"),
@@ -52,7 +52,7 @@ fn package() -> PackageRef {
     }
 }
 
-fn robot() -> RobotId {
+pub fn robot() -> RobotId {
     parsed("r00000000000000a1")
 }
 
@@ -75,6 +75,7 @@ fn desired_state() -> DesiredState {
             lists: vec![blob("list")],
             signatures: vec![SignatureRef { manifest: package().manifest.digest, envelope: blob("signature") }],
         },
+        settings: crate::fleet::settings(),
     }
 }
 
@@ -103,6 +104,7 @@ fn report() -> Report {
             isolation: Isolation::Cgroup,
             battery_percent: Some(80),
             publishers: Some(3),
+            settings: Some(crate::fleet::effective_settings()),
         },
         conditions: vec![Condition { code: "held".to_owned(), text: "held at the robot".to_owned() }],
         link: Some(LinkFacts { throughput_bytes_per_s: Some(2_400_000), rtt_ms: Some(31), reconnects: 1, losses: 2 }),
@@ -142,6 +144,7 @@ fn report() -> Report {
                 active: Some(ActiveVersion {
                     deployment: parsed("d00000000000000b0"),
                     version: parsed("1.1.0"),
+                    manifest: Some(Digest::of(b"manifest")),
                     pid: 4711,
                 }),
             },
@@ -149,7 +152,7 @@ fn report() -> Report {
     }
 }
 
-fn manifest() -> TaskManifest {
+pub fn manifest() -> TaskManifest {
     TaskManifest {
         name: parsed("talker"),
         version: parsed("1.2.0"),
@@ -219,7 +222,7 @@ fn update_golden(name: &str, written: &str) {
     }
 }
 
-fn golden(name: &str) -> String {
+pub fn golden(name: &str) -> String {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden").join(name);
     std::fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }
@@ -267,6 +270,7 @@ fn questions_and_answers() {
         Ask::Lifecycle { node: parsed("/talker"), transition: Transition::Activate },
         Ask::Logs { task: Some(parsed("talker")), level: LogLevel::Warn, since_ms: Some(600_000), max_lines: 100 },
         Ask::Follow { level: LogLevel::Info, lease_ms: 30_000 },
+        Ask::Vitals,
     ];
     let requests = asks.map(|ask| Request { id: parsed("q00000000000000d4"), ttl_ms: 10_000, ask });
     check("requests.json", &requests.to_vec());
@@ -299,6 +303,7 @@ fn questions_and_answers() {
         Answer::Lifecycle { state: LifecycleState::Active },
         Answer::Logs(log_batch()),
         Answer::Following,
+        Answer::Vitals(crate::fleet::vitals()),
     ];
     let refusal = Refusal { code: "no_such_node".to_owned(), text: "no node /talker on the graph".to_owned() };
     let outcomes = answers.map(Outcome::Answer).into_iter().chain([Outcome::Refusal(refusal)]);

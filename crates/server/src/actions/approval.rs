@@ -68,7 +68,8 @@ pub(super) async fn give_up_pending(write: &mut Write, now_ms: u64) -> Result<Ve
 }
 
 async fn turn_away(write: &mut Write, known: &KnownRobot, deed: Deed, now_ms: u64) -> Result<(), StoreError> {
-    write.revoke_tokens(&known.id, now_ms).await?;
-    write.remove_robot(&known.id, now_ms).await?;
+    let robots = std::slice::from_ref(&known.id);
+    write.revoke_tokens(robots, now_ms).await?;
+    write.remove_robots(robots, now_ms).await?;
     write.audit(&deed.with("name", &known.name).with("mac", known.mac), now_ms).await
 }

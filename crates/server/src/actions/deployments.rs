@@ -3,6 +3,8 @@
 use std::collections::BTreeSet;
 
 use task_proto::api::{CreateDeployment, DeliveryChoice, MAX_PRIORITY, MIN_PRIORITY, PackageView};
+use task_proto::desired::PackageRef;
+use task_proto::manifest::TaskKind;
 use task_proto::report::Phase;
 use task_proto::{DeploymentId, RobotId, UserName};
 
@@ -49,17 +51,14 @@ impl Actions {
         self.check_fits(order, package)?;
         let robots = write.matching_robots(&order.selector).await?;
         if robots.is_empty() {
-            return Err(ActionError::NoRobotsMatch(order.selector.to_string()));
+            return Err(ActionError::NoRobotsMatch(quoted(&order.selector)));
         }
         check_scope(by, &robots, || quoted(&order.selector))?;
         let robots: Vec<RobotId> = robots.into_iter().map(|robot| robot.id).collect();
-        let (id, task) = (DeploymentId::random(), &package.package.name);
-        let expires_at_ms = now_ms + lifetime_ms;
-        let kind = package.manifest.run.kind;
-        let new = NewDeployment { id: &id, package: &package.package, kind, order, expires_at_ms };
-        write.insert_deployment(&new, now_ms).await?;
-        let mut touched = write.assign(&id, task, &robots, expires_at_ms, now_ms).await?;
-        touched.insert(id.clone());
+        let (kind, expires_at_ms) = (package.manifest.run.kind, now_ms + lifetime_ms);
+        let placed = Placed { package: &package.package, kind, order, robots: &robots, expires_at_ms };
+        let (id, touched) = placed.place(&mut write, now_ms).await?;
+        let task = &package.package.name;
         let mut consequences = Consequences { deployments: touched.clone(), ..Consequences::default() };
         advance(&mut write, &self.chooser, touched, now_ms, &mut consequences).await?;
         let deed = Deed::by(by, Act::DeploymentCreate, &id)
@@ -75,7 +74,7 @@ impl Actions {
     }
 
     /// What is ordered to ride inside an announcement must fit into one.
-    fn check_fits(&self, order: &CreateDeployment, package: &PackageView) -> Result<(), ActionError> {
+    pub(super) fn check_fits(&self, order: &CreateDeployment, package: &PackageView) -> Result<(), ActionError> {
         let (size, most) = (travelling_bytes(&package.package), self.chooser.inline_bytes());
         if order.delivery != DeliveryChoice::Inline || size <= most {
             return Ok(());
@@ -159,6 +158,33 @@ impl Actions {
     }
 }
 
+/// A package that is ordered on robots.
+pub(super) struct Placed<'a> {
+    pub(super) package: &'a PackageRef,
+    pub(super) kind: TaskKind,
+    /// How.
+    pub(super) order: &'a CreateDeployment,
+    pub(super) robots: &'a [RobotId],
+    pub(super) expires_at_ms: u64,
+}
+
+impl Placed<'_> {
+    /// Stores the deployment with its assignments. Gives it, and all deployments that may go on now, itself among them.
+    pub(super) async fn place(
+        &self,
+        write: &mut Write,
+        now_ms: u64,
+    ) -> Result<(DeploymentId, BTreeSet<DeploymentId>), ActionError> {
+        let &Self { package, kind, order, robots, expires_at_ms } = self;
+        let id = DeploymentId::random();
+        let new = NewDeployment { id: &id, package, kind, order, expires_at_ms };
+        write.insert_deployment(&new, now_ms).await?;
+        let mut touched = write.assign(&id, &package.name, robots, expires_at_ms, now_ms).await?;
+        touched.insert(id.clone());
+        Ok((id, touched))
+    }
+}
+
 /// An order to create a deployment, as its idempotency key remembers it.
 fn creation(order: &CreateDeployment) -> String {
     format!("Create {}", serde_json::to_string(order).expect("an order always has a JSON form"))
@@ -192,6 +218,7 @@ async fn take_back(
         robots: taken.iter().map(|row| row.robot.clone()).collect(),
         rings: taken_back.into_iter().collect(),
         deployments: touched.clone(),
+        ..Consequences::default()
     };
     advance(write, chooser, touched, now_ms, &mut consequences).await?;
     Ok(consequences)

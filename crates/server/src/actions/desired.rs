@@ -84,7 +84,7 @@ impl Actions {
     }
 
     fn sign(&self, found: DesiredTasks) -> Result<Desired, ActionError> {
-        let DesiredTasks { robot, generation, observed_generation, tasks, along, evidence } = found;
+        let DesiredTasks { robot, generation, observed_generation, tasks, along, evidence, settings } = found;
         if observed_generation > generation {
             return Err(ActionError::Diverged(robot));
         }
@@ -101,6 +101,7 @@ impl Actions {
             expires_at_ms: now_ms + lifetime_ms,
             tasks,
             evidence: evidence.clone(),
+            settings,
         };
         let payload = serde_json::to_vec(&state).expect("a desired state always has a JSON form");
         let envelope = Envelope::seal(DESIRED_STATE_TYPE, &payload, &self.key);

@@ -1,7 +1,9 @@
 //! What people and robots may order. Each order is one write to the store; after its commit the change is announced and
 //! the robots concerned are rung. No HTTP and no MQTT here, and no SQL.
 
+mod again;
 mod approval;
+mod bulk;
 mod deployments;
 mod desired;
 mod fallen_behind;
@@ -18,7 +20,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use task_proto::envelope::SigningKey;
 use task_proto::selector::Selector;
-use task_proto::{CaPin, DeploymentId, Digest, MacAddress, RobotId, RobotName, TokenId, UserName};
+use task_proto::{CaPin, DeploymentId, Digest, MacAddress, RobotId, RobotName, TaskName, TokenId, UserName, Version};
 
 use crate::changes::Changes;
 use crate::chooser::Chooser;
@@ -29,6 +31,7 @@ use crate::sign_ins::SignIns;
 use crate::store::{KnownRobot, PastOrder, Store, StoreError, Write};
 
 pub use crate::store::TaskOrder;
+pub use again::Rollback;
 pub use desired::Desired;
 pub use robots::Enrolled;
 
@@ -159,7 +162,7 @@ fn quoted(selector: &Selector) -> String {
 #[derive(Debug, thiserror::Error)]
 pub enum ActionError {
     /// The selector means nobody, or nobody who has the task.
-    #[error("no robots match {0:?}")]
+    #[error("no robots match {0}")]
     NoRobotsMatch(String),
     /// The key came with another order before.
     #[error("the idempotency key {0:?} was used for another order")]
@@ -281,6 +284,17 @@ pub enum ActionError {
     /// There is no such deployment.
     #[error("there is no deployment {0}")]
     DeploymentNotFound(DeploymentId),
+    /// It has ended well everywhere, or something else was ordered since.
+    #[error(
+        "there is no such robot for which deployment {0} has ended badly and of which nothing else was ordered since"
+    )]
+    NothingToRetry(DeploymentId),
+    /// Nobody had another package of the task before.
+    #[error("none of these robots had another package of {0} before that has run there and is still on the server")]
+    NothingToRollBack(TaskName),
+    /// It was deleted.
+    #[error("{0} {1} is no longer on the server: push it again")]
+    PackageNotFound(TaskName, Version),
     /// The deployment was cancelled before.
     #[error("deployment {0} was cancelled")]
     DeploymentCancelled(DeploymentId),
@@ -320,6 +334,9 @@ impl ActionError {
             | Self::TokenNotFound(_)
             | Self::EnrolmentNotFound(_) => "not_found",
             Self::DeploymentCancelled(_) => "deployment_cancelled",
+            Self::NothingToRetry(_) => "nothing_to_retry",
+            Self::NothingToRollBack(_) => "nothing_to_roll_back",
+            Self::PackageNotFound(..) => "package_not_found",
             Self::Diverged(_) => "diverged",
             Self::Store(_) | Self::PasswordFailed => "internal",
         }

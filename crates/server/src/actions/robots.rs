@@ -8,13 +8,15 @@ use task_proto::api::{
 use task_proto::id::Labels;
 use task_proto::request::Ask;
 use task_proto::selector::Selector;
+use task_proto::settings::RobotSettings;
 use task_proto::token::{Token, TokenKind};
 use task_proto::{MacAddress, RobotId, RobotName, TokenId};
 
 use super::approval::check_room;
+use super::bulk::removal;
 use super::{ActionError, Actions, MAX_LIFETIME_MS, check_scope, quoted};
 use crate::advance::advance;
-use crate::changes::{Change, Consequences};
+use crate::changes::Change;
 use crate::person::Person;
 use crate::store::{Act, Deed, EnrolmentTerms, KnownRobot, StoreError, Write};
 
@@ -156,7 +158,7 @@ impl Actions {
         Ok(write.commit().await?)
     }
 
-    /// Changes a robot's name or labels. Before and after it has to be one of the person's.
+    /// Changes a robot's name, labels or settings. Before and after it has to be one of the person's.
     pub async fn edit_robot(&self, by: &Person, robot: &RobotId, edit: &EditRobot) -> Result<(), ActionError> {
         let mut write = self.store.begin().await?;
         let mut known = known_robot(&mut write, robot.as_str()).await?;
@@ -172,11 +174,20 @@ impl Actions {
         }
         check_scope(by, std::slice::from_ref(&known), || format!("{} with the new name and labels", known.name))?;
         write.update_robot(&known).await?;
+        let now_ms = self.clock.now_ms();
+        let is_set = match &edit.settings {
+            Some(settings) => set(&mut write, &known.id, settings.clone().unwrap_or_default(), now_ms).await?,
+            None => false,
+        };
         let renamed = edit.name.as_ref().map(|_| &known.name);
         let labels = edit.labels.as_ref().map(shown_labels);
-        let deed = deed.with_some("new_name", renamed).with_some("labels", labels);
-        write.audit(&deed, self.clock.now_ms()).await?;
+        let settings = edit.settings.as_ref().map(|settings| shown_settings(settings.as_ref()));
+        let deed = deed.with_some("new_name", renamed).with_some("labels", labels).with_some("settings", settings);
+        write.audit(&deed, now_ms).await?;
         write.commit().await?;
+        if is_set {
+            self.changes.ring([known.id.clone()]);
+        }
         self.changes.announce(Change::Robot(known.id));
         self.changes.announce(Change::Scopes);
         self.changes.announce_rights();
@@ -189,17 +200,14 @@ impl Actions {
         let mut write = self.store.begin().await?;
         let known = known_robot(&mut write, robot.as_str()).await?;
         check_scope(by, std::slice::from_ref(&known), || known.name.to_string())?;
-        let touched = write.end_all_of_robot(robot, now_ms).await?;
-        write.revoke_tokens(robot, now_ms).await?;
-        write.remove_robot(robot, now_ms).await?;
-        let deed = Deed::by(by, Act::RobotRemove, robot).with("name", &known.name).with("mac", known.mac);
-        write.audit(&deed, now_ms).await?;
-        let mut consequences = Consequences { deployments: touched.clone(), ..Consequences::default() };
+        let known = [known];
+        let mut consequences = self.take_away(&mut write, &known, now_ms).await?;
+        let [robot] = &known;
+        write.audit(&removal(by, robot), now_ms).await?;
+        let touched = consequences.deployments.clone();
         advance(&mut write, &self.chooser, touched, now_ms, &mut consequences).await?;
         write.commit().await?;
-        self.envelopes.forget(robot);
-        self.changes.announce(Change::RobotRemoved(Box::new(known)));
-        self.changes.publish(consequences);
+        self.announce_removed(&known, consequences);
         Ok(())
     }
 
@@ -222,7 +230,7 @@ impl Actions {
 
     /// Writes down that the robot is about to be asked to change something, which it then may or may not do.
     pub async fn note_ask(&self, by: &Person, robot: &RobotId, ask: &Ask) -> Result<(), ActionError> {
-        let mut write = self.store.begin_reports().await?;
+        let mut write = self.store.begin_keeping_rights().await?;
         let ask = serde_json::to_string(ask).expect("a question always has a JSON form");
         write.audit(&Deed::by(by, Act::RobotAsk, robot).with("ask", ask), self.clock.now_ms()).await?;
         Ok(write.commit().await?)
@@ -233,7 +241,7 @@ impl Actions {
     pub async fn matching_robots(&self, by: &Person, selector: &Selector) -> Result<Vec<MatchedRobot>, ActionError> {
         let robots = self.store.matching_robots(selector).await?;
         if robots.is_empty() {
-            return Err(ActionError::NoRobotsMatch(selector.to_string()));
+            return Err(ActionError::NoRobotsMatch(quoted(selector)));
         }
         check_scope(by, &robots, || quoted(selector))?;
         Ok(robots.into_iter().map(matched).collect())
@@ -246,7 +254,7 @@ pub(super) fn matched(robot: KnownRobot) -> MatchedRobot {
 }
 
 /// Labels as the audit shows them.
-fn shown_labels(labels: &Labels) -> String {
+pub(super) fn shown_labels(labels: &Labels) -> String {
     let pairs: Vec<String> = labels.iter().map(|(key, value)| format!("{key}={value}")).collect();
     pairs.join(",")
 }
@@ -310,7 +318,7 @@ async fn check_name(write: &mut Write, name: &RobotName) -> Result<(), ActionErr
     }
 }
 
-fn check_labels(labels: &Labels) -> Result<(), ActionError> {
+pub(super) fn check_labels(labels: &Labels) -> Result<(), ActionError> {
     if labels.len() <= MAX_LABELS {
         return Ok(());
     }
@@ -325,4 +333,17 @@ pub(super) async fn known_robot(write: &mut Write, id_or_name: &str) -> Result<K
         Err(_) => None,
     };
     robot.ok_or_else(|| ActionError::RobotNotFound(id_or_name.chars().take(80).collect()))
+}
+
+/// Sets a robot's settings; whether they are others than before.
+async fn set(write: &mut Write, robot: &RobotId, settings: RobotSettings, now_ms: u64) -> Result<bool, ActionError> {
+    settings.check().map_err(|error| ActionError::Invalid { key: "settings", reason: error.to_string() })?;
+    write.adopt_diverged(std::slice::from_ref(robot), now_ms).await?;
+    Ok(write.update_settings(robot, &settings).await?)
+}
+
+fn shown_settings(settings: Option<&RobotSettings>) -> String {
+    settings.map_or("none".to_owned(), |settings| {
+        serde_json::to_string(settings).expect("a wire type always has a JSON form")
+    })
 }

@@ -150,7 +150,7 @@ impl Actions {
     async fn blocked(&self, whose: &str, address: IpAddr, blocked: Blocked, now_ms: u64) -> Result<(), ActionError> {
         let Blocked { until_ms, is_news } = blocked;
         if is_news {
-            let mut write = self.store.begin_reports().await?;
+            let mut write = self.store.begin_keeping_rights().await?;
             // Nobody knows who it is, so nobody is named as the one who did it.
             let deed = Deed::new("server".to_owned(), None, Some(address), Act::SignInBlocked, whose);
             write.audit(&deed.with("until_ms", until_ms), now_ms).await?;

@@ -1,4 +1,4 @@
-//! Orders on tasks that robots have: start, stop, remove.
+//! Orders on tasks that robots have: start, restart, stop, remove.
 
 use std::collections::{BTreeSet, HashSet};
 
@@ -11,10 +11,10 @@ use super::{ActionError, Actions, IdempotencyKey, TaskOrder, check_scope, quoted
 use crate::advance::advance;
 use crate::changes::Consequences;
 use crate::person::Person;
-use crate::store::{Act, Deed, KnownRobot};
+use crate::store::{Act, Deed, KnownRobot, Write};
 
 impl Actions {
-    /// Orders `task` started, stopped or removed on the robots that match and have it. The same key gives the same
+    /// Orders `task` started, restarted, stopped or removed on the robots that match and have it. The same key gives the same
     /// answer, and orders nothing twice. `online` is left false.
     pub async fn order_task(
         &self,
@@ -30,11 +30,7 @@ impl Actions {
         if let Some(answer) = self.answered_before(&mut write, by, key, &request).await? {
             return Ok(answer);
         }
-        let mut robots = write.matching_robots(selector).await?;
-        let ids: Vec<RobotId> = robots.iter().map(|robot| robot.id.clone()).collect();
-        write.adopt_diverged(&ids, now_ms).await?;
-        keep_those_with_task(&mut robots, write.robots_with_task(task).await?, selector)?;
-        check_scope(by, &robots, || quoted(selector))?;
+        let robots = meant(&mut write, by, task, selector, now_ms).await?;
         let ids: Vec<RobotId> = robots.iter().map(|robot| robot.id.clone()).collect();
         let expires_at_ms = now_ms + self.settings.assignment_lifetime_ms;
         let changed = write.order_on_task(order, task, &ids, expires_at_ms, now_ms).await?;
@@ -75,9 +71,26 @@ impl Actions {
 fn act(order: TaskOrder) -> Act {
     match order {
         TaskOrder::Start => Act::TaskStart,
+        TaskOrder::Restart => Act::TaskRestart,
         TaskOrder::Stop => Act::TaskStop,
         TaskOrder::Remove => Act::TaskRemove,
     }
+}
+
+/// The robots that match and have the task, each of which must be this person's; an error if nobody.
+pub(super) async fn meant(
+    write: &mut Write,
+    by: &Person,
+    task: &TaskName,
+    selector: &Selector,
+    now_ms: u64,
+) -> Result<Vec<KnownRobot>, ActionError> {
+    let mut robots = write.matching_robots(selector).await?;
+    let ids: Vec<RobotId> = robots.iter().map(|robot| robot.id.clone()).collect();
+    write.adopt_diverged(&ids, now_ms).await?;
+    keep_those_with_task(&mut robots, write.robots_with_task(task).await?, selector)?;
+    check_scope(by, &robots, || quoted(selector))?;
+    Ok(robots)
 }
 
 fn keep_those_with_task(
@@ -87,5 +100,5 @@ fn keep_those_with_task(
 ) -> Result<(), ActionError> {
     let with_task: HashSet<RobotId> = with_task.into_iter().collect();
     robots.retain(|robot| with_task.contains(&robot.id));
-    if robots.is_empty() { Err(ActionError::NoRobotsMatch(selector.to_string())) } else { Ok(()) }
+    if robots.is_empty() { Err(ActionError::NoRobotsMatch(quoted(selector))) } else { Ok(()) }
 }

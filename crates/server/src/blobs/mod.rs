@@ -252,6 +252,20 @@ impl Blobs {
         .await
     }
 
+    /// Bytes of all blobs.
+    pub async fn used_bytes(&self) -> Result<u64, BlobError> {
+        let directory = self.shared.directory.clone();
+        on_disk(move || {
+            let sum = || {
+                // One that is deleted meanwhile takes no room.
+                let sizes = fs::read_dir(&directory)?.flatten().filter_map(|entry| entry.metadata().ok());
+                Ok(sizes.map(|metadata| metadata.len()).sum())
+            };
+            sum().map_err(BlobError::disk("list", &directory))
+        })
+        .await
+    }
+
     /// Whether the blob is here and was last touched before `before_ms`.
     pub async fn is_untouched_since(&self, digest: Digest, before_ms: u64) -> Result<bool, BlobError> {
         let path = self.path(digest);
@@ -349,6 +363,11 @@ impl Blob {
         BlobBody::new(self.clone(), range)
     }
 
+    /// All of it for a thread that may wait for the disk.
+    pub fn reader(&self) -> impl io::Read + Send + use<> {
+        BlobReader { file: self.file.clone(), offset: 0 }
+    }
+
     /// All of it in memory. For small blobs: the caller has checked [`Blob::size`].
     pub async fn read(&self) -> Result<Bytes, BlobError> {
         let blob = self.clone();
@@ -379,6 +398,20 @@ impl Blob {
             self.file.read_exact_at(&mut scrap[..length], start)?;
         }
         Ok(())
+    }
+}
+
+/// A blob's file with a place of its own in it: many read the same file.
+struct BlobReader {
+    file: Arc<File>,
+    offset: u64,
+}
+
+impl io::Read for BlobReader {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let count = self.file.read_at(buffer, self.offset)?;
+        self.offset += count as u64;
+        Ok(count)
     }
 }
 

@@ -17,7 +17,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use futures_util::future::BoxFuture;
-use task_proto::api::{MqttTraffic, Traffic};
+use task_proto::api::{MqttTraffic, Subscription, Traffic};
 use task_proto::topic::{RobotTopic, TopicPrefix};
 use task_proto::{Digest, RobotId, UserName};
 use tokio::io::{AsyncRead, AsyncWrite};
@@ -375,6 +375,14 @@ impl Broker {
         match &self.kind {
             Kind::Embedded(front) => front.traffic_of(robot),
             Kind::External(_) => None,
+        }
+    }
+
+    /// What the robot's session listens to, if it has one and it is ours; sorted by filter.
+    pub fn subscriptions_of(&self, robot: &RobotId) -> Vec<Subscription> {
+        match &self.kind {
+            Kind::Embedded(front) => front.subscriptions_of(robot),
+            Kind::External(_) => Vec::new(),
         }
     }
 

@@ -10,6 +10,7 @@ use task_proto::api::{AuditPage, AuditQuery};
 use task_proto::audit::{AuditEntry, AuditRecord, Link};
 
 use super::output::{json_line, say, stream_text, time};
+use super::table::Columns;
 use super::{CommandError, Connection, Outcome, Session};
 
 /// The longest line of an export.
@@ -72,12 +73,13 @@ pub(super) async fn run(connection: &Connection, order: AuditOrder) -> Result<Ou
     let AuditOrder { who, target, act, limit, .. } = order;
     let query = AuditQuery { after: None, before: None, limit: Some(limit), who, target, act };
     let page: AuditPage = session.client.get_by("/audit", &query).await?;
-    let header = ["number", "time", "who", "from", "act", "target", "detail"];
     session
         .output
-        .result(&page, &header, |page| page.records.iter().rev().filter_map(AuditRecord::read).map(row).collect())?;
+        .result(&page, &COLUMNS, |page| page.records.iter().rev().filter_map(AuditRecord::read).map(row).collect())?;
     Ok(Outcome::Succeeded)
 }
+
+const COLUMNS: Columns = Columns::of(&["number", "time", "who", "from", "act", "target", "detail"]);
 
 fn row(entry: AuditEntry) -> Vec<String> {
     let detail: Vec<String> = entry.detail.iter().map(|(key, value)| format!("{key}={value}")).collect();

@@ -102,6 +102,14 @@ impl ClientError {
             Self::Refused { .. } | Self::Unreachable { .. } | Self::NotTheServer { .. } => Outcome::Failed,
         }
     }
+
+    /// What it means where `robot` was named: that there is no such robot is said alike by all commands.
+    pub(super) fn about(self, robot: &RobotName) -> CommandError {
+        match self {
+            Self::Refused { status: StatusCode::NOT_FOUND, .. } => super::robot::unknown(robot),
+            error => error.into(),
+        }
+    }
 }
 
 /// A server and the token to ask it with.
@@ -109,6 +117,7 @@ pub(crate) struct Client {
     http: reqwest::Client,
     base: String,
     token: Option<Token>,
+    trust: Trust,
 }
 
 impl Client {
@@ -146,12 +155,30 @@ impl Client {
             .user_agent(concat!("taskd/", env!("CARGO_PKG_VERSION")))
             .build()
             .map_err(|source| ClientError::Unreachable { url: base.clone(), source })?;
-        Ok(Self { http, base, token: None })
+        Ok(Self { http, base, token: None, trust })
     }
 
     /// The server's URL.
     pub(crate) fn base(&self) -> &str {
         &self.base
+    }
+
+    /// Host and port of the server's URL.
+    pub(crate) fn place(&self) -> (String, u16) {
+        let url = reqwest::Url::parse(&self.base).ok();
+        let host = url.as_ref().and_then(|url| url.host_str()).unwrap_or_default().to_owned();
+        (host, url.and_then(|url| url.port_or_known_default()).unwrap_or_default())
+    }
+
+    /// A path of the server as a request has it, where its URL has one of its own.
+    pub(crate) fn path(&self, path: &str) -> String {
+        let own = reqwest::Url::parse(&self.base).map(|url| url.path().trim_end_matches('/').to_owned());
+        format!("{}{path}", own.unwrap_or_default())
+    }
+
+    /// Whom it takes for the server.
+    pub(crate) fn trust(&self) -> Trust {
+        self.trust
     }
 
     /// Reads from the API.
@@ -237,8 +264,8 @@ impl Client {
     }
 
     /// Asks a robot something. Tried once only: the robot may have done what was asked though no answer came.
-    pub(crate) async fn ask(&self, robot: &RobotName, ask: &Ask) -> Result<Answer, ClientError> {
-        self.once(&format!("/robots/{robot}/ask"), ask).await
+    pub(crate) async fn ask(&self, robot: &RobotName, ask: &Ask) -> Result<Answer, CommandError> {
+        self.once(&format!("/robots/{robot}/ask"), ask).await.map_err(|error: ClientError| error.about(robot))
     }
 
     /// A request with the token, to a path below the server's URL or to a whole URL of the same server.
@@ -366,7 +393,7 @@ fn local_server(data: Option<&Path>) -> Option<(String, Option<CaPin>)> {
     Some((addresses.url(), addresses.ca_pin))
 }
 
-fn data_directory(connection: &Connection) -> Option<PathBuf> {
+pub(super) fn data_directory(connection: &Connection) -> Option<PathBuf> {
     let named = connection.data.as_ref().map(PathBuf::from);
     named.or_else(|| crate::config::default_data_directory(|name| std::env::var_os(name)))
 }

@@ -8,7 +8,8 @@ use task_proto::api::{CreateEnrollmentToken, EnrollmentToken, EnrollmentTokenLis
 use task_proto::id::{LabelKey, LabelValue};
 
 use super::output::{say, time};
-use super::{CommandError, Outcome, Session};
+use super::table::Columns;
+use super::{CommandError, Outcome, Session, complete};
 use crate::config::lifetime;
 
 /// What to do with enrolment tokens.
@@ -17,7 +18,7 @@ pub enum Action {
     /// Make one and print it; it is shown this once
     Create {
         /// Only this robot (id or name) may register again with it
-        #[arg(long, value_name = "ROBOT")]
+        #[arg(long, value_name = "ROBOT", add = complete::robots())]
         robot: Option<String>,
         /// How many enrolments it is good for [default: any number]
         #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
@@ -37,6 +38,7 @@ pub enum Action {
     /// End one now; robots that came by it stay
     Revoke {
         /// Its id
+        #[arg(add = complete::enrollment_tokens())]
         id: TokenId,
     },
 }
@@ -48,13 +50,12 @@ pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, Co
             let request = CreateEnrollmentToken { robot, uses, ttl_s, labels: labels.into_iter().collect(), approval };
             let key = super::client::random_key();
             let token: EnrollmentToken = session.client.order("/enrollment-tokens", &request, &key).await?;
-            session.output.described(&token, |token| token.token.clone())?;
+            session.output.described(&token, |token| token.id.clone(), |token| token.token.clone())?;
             say(&format!("{}, valid until {}; it is not shown again", token.id, time(token.expires_at_ms)));
         }
         Action::List => {
             let list: EnrollmentTokenList = session.client.get("/enrollment-tokens", &[]).await?;
-            let header = ["id", "robot", "labels", "uses left", "approval", "made", "ends"];
-            session.output.result(&list, &header, |list| list.tokens.iter().map(row).collect())?;
+            session.output.result(&list, &COLUMNS, |list| list.tokens.iter().map(row).collect())?;
         }
         Action::Revoke { id } => {
             session.client.delete(&format!("/enrollment-tokens/{id}")).await?;
@@ -63,6 +64,8 @@ pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, Co
     }
     Ok(Outcome::Succeeded)
 }
+
+const COLUMNS: Columns = Columns::of(&["id", "robot", "labels", "uses left", "approval", "made", "ends"]);
 
 fn row(token: &EnrollmentTokenView) -> Vec<String> {
     let labels: Vec<_> = token.labels.iter().map(|(key, value)| format!("{key}={value}")).collect();

@@ -106,14 +106,14 @@ pub(super) async fn run(connection: &Connection, action: Action) -> Result<Outco
             let newest = newest(&Client::connect(connection)?).await?;
             let newest =
                 newest.ok_or_else(|| CommandError::Usage("the server has no list of publishers".to_owned()))?;
-            output.described(&newest, describe)?;
+            output.described(&newest, version, describe)?;
         }
         Action::Draft(draft) => {
             let newest = newest(&Client::connect(connection)?).await?;
             let list = drafted(&draft, newest, Clock::system().now_ms())?;
             let payload = serde_json::to_vec(&list).expect("a list always has a JSON form");
             write(&draft.file, &Envelope::unsigned(LIST_TYPE, &payload))?;
-            output.described(&list, describe)?;
+            output.described(&list, version, describe)?;
         }
         Action::Sign { file, key } => {
             let mut envelope = read(&file)?;
@@ -121,7 +121,7 @@ pub(super) async fn run(connection: &Connection, action: Action) -> Result<Outco
             let key = key_file::read(&key)?;
             envelope.sign_also(LIST_TYPE, &key).map_err(|error| unusable(&file, &error))?;
             write(&file, &envelope)?;
-            output.described(&list, describe)?;
+            output.described(&list, version, describe)?;
             say(&format!("signed by {}", key.public_key().id()));
         }
         Action::Publish { file } => {
@@ -131,7 +131,7 @@ pub(super) async fn run(connection: &Connection, action: Action) -> Result<Outco
             let repository = LIST_REPOSITORY.parse().expect("a repository's name");
             let under = (None, Some(list.version.to_string()));
             upload::upload_signed(&client, &repository, LIST_ARTIFACT, &envelope, under).await?;
-            output.described(&list, describe)?;
+            output.described(&list, version, describe)?;
             let signers: Vec<&str> = envelope.claimed_signers().collect();
             say(&format!(
                 "published, signed by {}: robots follow it if those are enough of the keepers they go by",
@@ -142,8 +142,13 @@ pub(super) async fn run(connection: &Connection, action: Action) -> Result<Outco
     Ok(Outcome::Succeeded)
 }
 
+fn version(list: &PublisherList) -> String {
+    list.version.to_string()
+}
+
 fn print_key(output: &Output, key: PublicKey) -> Result<(), CommandError> {
-    output.described(&KeyView { id: key.id(), key }, |view| format!("key  {}\nid   {}\n", view.key, view.id))
+    let text = |view: &KeyView| format!("key  {}\nid   {}\n", view.key, view.id);
+    output.described(&KeyView { id: key.id(), key }, |view| view.id.to_string(), text)
 }
 
 /// The newest list on the server, as it says; robots find out themselves whether it may count.

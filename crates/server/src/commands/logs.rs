@@ -1,7 +1,6 @@
 //! `taskd logs`: what a robot's tasks said, and with `-f` what they say. It joins the two without a gap: the stream is
 //! opened first, the past is asked for when the robot has said that it publishes, and again whenever the stream broke.
 
-use std::io::IsTerminal as _;
 use std::time::Duration;
 
 use task_proto::api::{LogEvent, LogsFrom, LogsQuery, LogsView};
@@ -14,7 +13,7 @@ use super::client::ClientError;
 use super::output::{Format, printable, say, stream_text};
 use super::shown::Shown;
 use super::sse::Events;
-use super::{CommandError, Outcome, Session, wait};
+use super::{CommandError, Outcome, Session, complete, wait};
 use crate::config::lifetime;
 
 /// A stream that says nothing for so long is broken: the server says something every 15 s.
@@ -26,8 +25,10 @@ const OVERLAP: Duration = Duration::from_secs(120);
 #[derive(Debug, clap::Args)]
 pub struct LogsOrder {
     /// The robot's name or id
+    #[arg(add = complete::robots())]
     robot: RobotName,
     /// Only this task
+    #[arg(add = complete::tasks())]
     task: Option<TaskName>,
     /// Go on with what comes, until Ctrl-C
     #[arg(short, long)]
@@ -44,17 +45,25 @@ pub struct LogsOrder {
 }
 
 pub(super) async fn run(session: &Session, order: LogsOrder) -> Result<Outcome, CommandError> {
+    if session.output.format() == Format::Name {
+        return Err(CommandError::Usage("-o name: lines of a log have no names; give table, wide or json".to_owned()));
+    }
     if order.follow {
         return follow(session, &order).await;
     }
-    let view = past(session, &order, order.since).await?;
+    let view = past(session, &order, order.since).await.map_err(|error| error.about(&order.robot))?;
     explain(&view);
-    if session.output.format() == Format::Json {
-        session.output.described(&view, |_| String::new())?;
-    } else {
-        Screen::new(session).print(&view.lines)?;
+    match session.output.format() {
+        Format::Json => session.output.json(&view)?,
+        _ => drop(Screen::new(session).print(&view.lines)?),
     }
     Ok(Outcome::Succeeded)
+}
+
+/// Goes on with what a task says, as `taskd logs -f`.
+pub(super) async fn follow_task(session: &Session, robot: RobotName, task: TaskName) -> Result<Outcome, CommandError> {
+    let level = LogLevel::Info;
+    follow(session, &LogsOrder { robot, task: Some(task), follow: true, level, since: None, lines: None }).await
 }
 
 async fn past(session: &Session, order: &LogsOrder, since: Option<Duration>) -> Result<LogsView, ClientError> {
@@ -113,7 +122,7 @@ async fn follow(session: &Session, order: &LogsOrder) -> Result<Outcome, Command
         let left = match opened {
             Ok(response) => listen(session, order, Events::of(response), &mut screen).await?,
             // What never worked is not waited for.
-            Err(error) if screen.heard_at.is_none() || !wait::may_pass(&error) => return Err(error.into()),
+            Err(error) if screen.heard_at.is_none() || !wait::may_pass(&error) => return Err(error.about(&order.robot)),
             Err(error) => Left::Broken(error.to_string()),
         };
         match left {
@@ -191,7 +200,7 @@ struct Screen {
 
 impl Screen {
     fn new(session: &Session) -> Self {
-        let colours = std::io::stdout().is_terminal() && std::env::var_os("NO_COLOR").is_none();
+        let colours = session.output.has_colours();
         let shown = Shown::default();
         Self { format: session.output.format(), colours, task_width: 0, node_width: 0, shown, heard_at: None }
     }
@@ -219,7 +228,7 @@ impl Screen {
         let mut text = String::new();
         for line in lines {
             match self.format {
-                Format::Table => text.push_str(&self.row(line)),
+                Format::Table | Format::Wide | Format::Name => text.push_str(&self.row(line)),
                 Format::Json => text.push_str(&super::output::json_line(line)?),
             }
             text.push('\n');

@@ -16,106 +16,89 @@ use output::{Format, Output};
 mod audit;
 mod broker;
 mod client;
+mod complete;
 mod confirm;
+mod course;
 mod deploy;
+mod doctor;
+mod doctor_here;
+mod documents;
+mod download;
 mod enroll_token;
+mod export;
 mod key;
 mod login;
 mod logs;
 mod output;
 mod outputs;
+mod package;
 mod password;
 mod progress;
 mod push;
 mod robot;
+mod robot_settings;
+mod robot_view;
 mod ros;
+mod run;
 mod server;
 mod shown;
 mod sse;
+mod status;
+mod table;
 mod task;
 mod token;
+mod top;
 mod upload;
 mod user;
+mod version;
 mod view;
 mod wait;
 
-/// The operator's commands; `main` adds `serve` to them.
+pub use complete::complete;
+
+/// The operator's commands, those of every day first; `serve` is added to them.
 #[derive(Debug, Subcommand)]
 pub enum Command {
-    /// Look at robots, let them in, revoke or remove one
+    /// Pack a directory, upload it and, with --to, deploy it
+    Push(push::Push),
+    /// Run a launch file of a package on one robot, as ros2 launch does here
+    Run(run::RunOrder),
+    /// Start a task on robots that have it
+    Start(task::TaskOrder),
+    /// Stop a task; it stays installed
+    Stop(task::TaskOrder),
+    /// Stop a task where it runs, and start it
+    Restart(task::TaskOrder),
+    /// Go back to the version of a task that ran before the one there is now
+    Rollback(task::TaskOrder),
+    /// Stop a task and remove it from robots
+    Remove(task::RemoveOrder),
+    /// Show what a robot's tasks and their nodes said, or follow it
+    Logs(logs::LogsOrder),
+    /// Look at robots, let them in, label, rename, revoke or remove them
     Robot {
         /// What to do.
         #[command(subcommand)]
         action: robot::Action,
     },
-    /// Sign in with a name and a password
-    Login(login::LoginOrder),
-    /// Sign out where taskd login signed in
-    Logout,
-    /// Show whom the token stands for, and what it allows
-    Whoami,
-    /// Say who may use the server, and what for
-    User {
+    /// Look into packages, delete or export them
+    Package {
         /// What to do.
         #[command(subcommand)]
-        action: user::Action,
+        action: package::Action,
     },
-    /// Make, list or revoke access tokens
-    Token {
-        /// What to do.
-        #[command(subcommand)]
-        action: token::Action,
-    },
-    /// Show who did what, export or verify it
-    Audit(audit::AuditOrder),
-    /// Look at the server
-    Server {
-        /// What to do.
-        #[command(subcommand)]
-        action: server::Action,
-    },
-    /// Print what an external broker's own files must say
-    Broker {
-        /// Which file.
-        #[command(subcommand)]
-        action: broker::Action,
-    },
-    /// Make, list or revoke the tokens that robots enrol with
-    EnrollToken {
-        /// What to do.
-        #[command(subcommand)]
-        action: enroll_token::Action,
-    },
-    /// Make publishers' keys, and the list of those that robots trust
-    Key {
-        /// What to do.
-        #[command(subcommand)]
-        action: key::Action,
-    },
-    /// Pack a directory, upload it and, with --to, deploy it
-    Push(push::Push),
-    /// Pack a directory and print its digests; talks to no server
-    Pack(push::Pack),
-    /// Look at deployments, cancel or resume one
+    /// Look at deployments, follow, cancel, resume or retry one
     Deploy {
         /// What to do.
         #[command(subcommand)]
         action: deploy::Action,
     },
-    /// Start a task on robots that have it
-    Start(task::TaskOrder),
-    /// Stop a task; it stays installed
-    Stop(task::TaskOrder),
-    /// Stop a task and remove it from robots
-    Remove(task::RemoveOrder),
     /// Look at the files that tasks brought back, or fetch them
     Output {
         /// What to do.
         #[command(subcommand)]
         action: outputs::Action,
     },
-    /// Show what a robot's tasks and their nodes said, or follow it
-    Logs(logs::LogsOrder),
     /// Look at the nodes on a robot's ROS graph
     Node {
         /// What to do.
@@ -136,6 +119,62 @@ pub enum Command {
     },
     /// Ask a lifecycle node for a transition
     Lifecycle(ros::LifecycleOrder),
+    /// Show how the server and the ways to the robots do
+    Status,
+    /// Look at the server, its sessions and its rules
+    Server {
+        /// What to do.
+        #[command(subcommand)]
+        action: server::Action,
+    },
+    /// Sign in with a name and a password
+    Login(login::LoginOrder),
+    /// Sign out where taskd login signed in
+    Logout,
+    /// Show whom the token stands for, and what it allows
+    Whoami,
+    /// Say who may use the server, and what for
+    User {
+        /// What to do.
+        #[command(subcommand)]
+        action: user::Action,
+    },
+    /// Make, list or revoke access tokens
+    Token {
+        /// What to do.
+        #[command(subcommand)]
+        action: token::Action,
+    },
+    /// Make, list or revoke the tokens that robots enrol with
+    EnrollToken {
+        /// What to do.
+        #[command(subcommand)]
+        action: enroll_token::Action,
+    },
+    /// Show who did what, export or verify it
+    Audit(audit::AuditOrder),
+    /// Make publishers' keys, and the list of those that robots trust
+    Key {
+        /// What to do.
+        #[command(subcommand)]
+        action: key::Action,
+    },
+    /// Print what an external broker's own files must say
+    Broker {
+        /// Which file.
+        #[command(subcommand)]
+        action: broker::Action,
+    },
+    /// Pack a directory and print its digests; talks to no server
+    Pack(push::Pack),
+    /// Look for what commonly goes wrong, and say how to mend it
+    Doctor,
+    /// Show the version of this program, and of the server if it can be asked
+    Version,
+    /// Print the script by which a shell completes commands, and names live from the server
+    Completions(documents::CompletionsOrder),
+    /// Write man pages
+    Man(documents::ManOrder),
 }
 
 /// Where the server is and who asks. Each option may stand before the command or after it.
@@ -232,8 +271,8 @@ impl CommandError {
 }
 
 /// Runs one command to its end. Results are on stdout, everything else has been said on stderr.
-pub async fn run(connection: &Connection, command: Command) -> ExitCode {
-    let outcome = match dispatch(connection, command).await {
+pub async fn run(connection: &Connection, command: Command, command_line: fn() -> clap::Command) -> ExitCode {
+    let outcome = match dispatch(connection, command, command_line).await {
         Ok(outcome) => outcome,
         Err(error) => {
             output::complain(&error);
@@ -243,31 +282,45 @@ pub async fn run(connection: &Connection, command: Command) -> ExitCode {
     outcome.into()
 }
 
-async fn dispatch(connection: &Connection, command: Command) -> Result<Outcome, CommandError> {
+async fn dispatch(
+    connection: &Connection,
+    command: Command,
+    command_line: fn() -> clap::Command,
+) -> Result<Outcome, CommandError> {
+    let open = || connection.open();
     match command {
-        Command::Pack(pack) => push::pack(&Output::new(connection.output), pack).await,
+        Command::Push(push) => push::run(&open()?, push).await,
+        Command::Run(order) => run::run(&open()?, order).await,
+        Command::Start(order) => task::run(&open()?, task::Verb::Start, order).await,
+        Command::Stop(order) => task::run(&open()?, task::Verb::Stop, order).await,
+        Command::Restart(order) => task::run(&open()?, task::Verb::Restart, order).await,
+        Command::Rollback(order) => task::roll_back(&open()?, order).await,
+        Command::Remove(order) => task::remove(&open()?, order).await,
+        Command::Logs(order) => logs::run(&open()?, order).await,
+        Command::Robot { action } => robot::run(&open()?, action).await,
+        Command::Package { action } => package::run(&open()?, action).await,
+        Command::Deploy { action } => deploy::run(&open()?, action).await,
+        Command::Output { action } => outputs::run(&open()?, action).await,
+        Command::Node { action } => ros::node(&open()?, action).await,
+        Command::Topic { action } => ros::topic(&open()?, action).await,
+        Command::Param { action } => ros::param(&open()?, action).await,
+        Command::Lifecycle(order) => ros::lifecycle(&open()?, order).await,
+        Command::Status => status::status(&open()?).await,
+        Command::Server { action } => server::run(&open()?, action).await,
         Command::Login(order) => login::log_in(connection, order).await,
         Command::Logout => login::log_out(connection).await,
-        Command::Whoami => user::who_am_i(&connection.open()?).await,
-        Command::User { action } => user::run(&connection.open()?, action).await,
-        Command::Token { action } => token::run(&connection.open()?, action).await,
+        Command::Whoami => user::who_am_i(&open()?).await,
+        Command::User { action } => user::run(&open()?, action).await,
+        Command::Token { action } => token::run(&open()?, action).await,
+        Command::EnrollToken { action } => enroll_token::run(&open()?, action).await,
         Command::Audit(order) => audit::run(connection, order).await,
-        Command::Robot { action } => robot::run(&connection.open()?, action).await,
-        Command::Server { action } => server::run(&connection.open()?, action).await,
-        Command::Broker { action } => broker::run(&connection.open()?, action).await,
-        Command::EnrollToken { action } => enroll_token::run(&connection.open()?, action).await,
         Command::Key { action } => key::run(connection, action).await,
-        Command::Push(push) => push::run(&connection.open()?, push).await,
-        Command::Deploy { action } => deploy::run(&connection.open()?, action).await,
-        Command::Start(order) => task::run(&connection.open()?, task::Verb::Start, order).await,
-        Command::Stop(order) => task::run(&connection.open()?, task::Verb::Stop, order).await,
-        Command::Remove(order) => task::remove(&connection.open()?, order).await,
-        Command::Output { action } => outputs::run(&connection.open()?, action).await,
-        Command::Logs(order) => logs::run(&connection.open()?, order).await,
-        Command::Node { action } => ros::node(&connection.open()?, action).await,
-        Command::Topic { action } => ros::topic(&connection.open()?, action).await,
-        Command::Param { action } => ros::param(&connection.open()?, action).await,
-        Command::Lifecycle(order) => ros::lifecycle(&connection.open()?, order).await,
+        Command::Broker { action } => broker::run(&open()?, action).await,
+        Command::Pack(pack) => push::pack(&Output::new(connection.output), pack).await,
+        Command::Doctor => doctor::run(connection).await,
+        Command::Version => version::run(connection).await,
+        Command::Completions(order) => documents::completions(&order),
+        Command::Man(order) => documents::man(&order, command_line()),
     }
 }
 

@@ -3,28 +3,37 @@
 
 use std::io::{self, IsTerminal as _, Write as _};
 
-use comfy_table::{ContentArrangement, Table};
 use serde::Serialize;
 
 use super::CommandError;
+use super::table::{Columns, Look, table};
 
 /// How results are printed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub enum Format {
-    /// For people.
+    /// For people, as wide as the terminal
     Table,
-    /// For programs: one JSON document.
+    /// The same with more columns, and nothing cut
+    Wide,
+    /// For programs: one JSON document
     Json,
+    /// Names alone, one a line
+    Name,
 }
 
 /// The command's way to its reader.
 pub(crate) struct Output {
     format: Format,
+    look: Look,
 }
 
 impl Output {
     pub(crate) fn new(format: Format) -> Self {
-        Self { format }
+        let is_terminal = io::stdout().is_terminal();
+        let colours = is_terminal && std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
+        let wide = format == Format::Wide;
+        let width = (is_terminal && !wide).then(terminal_width).flatten();
+        Self { format, look: Look { wide, width, colours } }
     }
 
     /// How results are printed.
@@ -32,32 +41,81 @@ impl Output {
         self.format
     }
 
-    /// Prints `value`: as JSON, or as the table that `rows` makes of it.
+    /// Whether colours may repeat what words say.
+    pub(crate) fn has_colours(&self) -> bool {
+        self.look.colours
+    }
+
+    /// A table that looks as it should here.
+    pub(crate) fn table(&self, columns: &Columns, rows: &[Vec<String>]) -> String {
+        table(columns, rows, self.look)
+    }
+
+    /// Prints `value` as JSON, whatever the format.
+    pub(crate) fn json<T: Serialize>(&self, value: &T) -> Result<(), CommandError> {
+        print(&json(value)?).map(drop)
+    }
+
+    /// Prints a text whose parts hold nothing that a terminal would obey.
+    pub(crate) fn text(&self, text: &str) -> Result<(), CommandError> {
+        print(text).map(drop)
+    }
+
+    /// Prints names, one a line.
+    pub(crate) fn lines(&self, lines: impl Iterator<Item = impl AsRef<str>>) -> Result<(), CommandError> {
+        print(&lines.map(|line| printable(line.as_ref())).collect::<Vec<_>>().join("\n")).map(drop)
+    }
+
+    /// Prints the list `value`: as JSON, or as the rows that `rows` makes of it.
     pub(crate) fn result<T: Serialize>(
         &self,
         value: &T,
-        header: &[&str],
+        columns: &Columns,
         rows: impl FnOnce(&T) -> Vec<Vec<String>>,
     ) -> Result<(), CommandError> {
+        self.listed(value, columns, rows).map(drop)
+    }
+
+    /// The same, for one of many times; false when nobody reads any more.
+    pub(crate) fn listed<T: Serialize>(
+        &self,
+        value: &T,
+        columns: &Columns,
+        rows: impl FnOnce(&T) -> Vec<Vec<String>>,
+    ) -> Result<bool, CommandError> {
         let text = match self.format {
             Format::Json => json(value)?,
-            Format::Table => table(header, rows(value)),
+            Format::Table | Format::Wide => self.table(columns, &rows(value)),
+            Format::Name => columns.names(&rows(value)).join("\n"),
         };
         print(&text)
     }
 
-    /// Prints `value`: as JSON, or as the text that `describe` makes of it.
+    /// Prints the one thing `value`: as JSON, as the name it goes by, or as the text that `describe` makes of it, whose
+    /// parts hold nothing that a terminal would obey.
     pub(crate) fn described<T: Serialize>(
         &self,
         value: &T,
+        name: impl FnOnce(&T) -> String,
         describe: impl FnOnce(&T) -> String,
     ) -> Result<(), CommandError> {
         let text = match self.format {
             Format::Json => json(value)?,
-            Format::Table => shown(&describe(value)),
+            Format::Table | Format::Wide => describe(value),
+            Format::Name => name(value).lines().map(printable).collect::<Vec<_>>().join("\n"),
         };
-        print(&text)
+        print(&text).map(drop)
     }
+}
+
+fn terminal_width() -> Option<usize> {
+    let (terminal_size::Width(width), _) = terminal_size::terminal_size_of(io::stdout())?;
+    (width > 0).then_some(usize::from(width))
+}
+
+/// Facts a line each, their names in a column.
+pub(crate) fn facts<'a>(facts: impl IntoIterator<Item = (&'a str, String)>) -> String {
+    facts.into_iter().map(|(key, value)| format!("{key:<12}{}\n", printable(&value))).collect()
 }
 
 fn json<T: Serialize>(value: &T) -> Result<String, CommandError> {
@@ -86,8 +144,11 @@ fn is_c1(c: char) -> bool {
     matches!(c, '\u{7f}'..='\u{9f}')
 }
 
-fn print(text: &str) -> Result<(), CommandError> {
-    stream_text(&format!("{}\n", text.trim_end())).map(drop)
+fn print(text: &str) -> Result<bool, CommandError> {
+    match text.trim_end() {
+        "" => Ok(true),
+        text => stream_text(&format!("{text}\n")),
+    }
 }
 
 /// Prints a part of what goes on; false when nobody reads it any more.
@@ -98,19 +159,6 @@ pub(crate) fn stream_text(text: &str) -> Result<bool, CommandError> {
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(false),
         Err(error) => Err(CommandError::Io { what: "can't write to stdout".to_owned(), source: error }),
     }
-}
-
-/// A table without lines, its columns two spaces apart.
-pub(crate) fn table(header: &[&str], rows: Vec<Vec<String>>) -> String {
-    let mut table = Table::new();
-    table.load_style(comfy_table::presets::NOTHING).set_content_arrangement(ContentArrangement::Disabled);
-    table.set_header(header.iter().map(|title| title.to_uppercase()));
-    for row in rows {
-        table.add_row(row.into_iter().map(|cell| printable(&cell)));
-    }
-    // Each cell has a space on both sides, which is wanted between columns only.
-    let line = |line: String| line.trim_end().strip_prefix(' ').unwrap_or_default().to_owned();
-    table.lines().map(line).collect::<Vec<_>>().join("\n")
 }
 
 /// `text` on one line and without control characters, nor those that turn a line's direction: a robot or a package may
@@ -181,11 +229,5 @@ mod tests {
         let line = json_line(&text).unwrap();
         assert_eq!(line, r#""\u001b]0;x\u0007\u009b2J\u007f é""#);
         assert_eq!(serde_json::from_str::<String>(&line).unwrap(), text, "programs read what was meant");
-    }
-
-    #[test]
-    fn a_table_has_a_header_and_no_lines() {
-        let text = table(&["id", "name"], vec![vec!["r1".to_owned(), "a\u{1b}[31mb\nc".to_owned()]]);
-        assert_eq!(text, "ID  NAME\nr1  a [31mb c");
     }
 }

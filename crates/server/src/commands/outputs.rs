@@ -1,25 +1,17 @@
 //! `taskd output`: what tasks brought back from robots, listed and fetched.
 
-use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use clap::Subcommand;
-use reqwest::Method;
-use sha2::{Digest as _, Sha256};
 use task_proto::api::{OutputList, OutputView};
 use task_proto::output::OutputFile;
-use task_proto::{Digest, RobotName, Tag, TaskName};
-use tokio::io::AsyncWriteExt as _;
-use tokio::time::timeout;
+use task_proto::{RobotName, Tag, TaskName};
 
+use super::complete;
+use super::download::{download, put};
 use super::output::{bytes, say, time};
+use super::table::Columns;
 use super::{CommandError, Outcome, Session};
-
-/// The longest the server may say nothing in the middle of a file.
-const SILENCE: Duration = Duration::from_secs(60);
-/// The longest one file may take.
-const LONGEST: Duration = Duration::from_secs(24 * 60 * 60);
 
 /// What to do with outputs.
 #[derive(Debug, Subcommand)]
@@ -27,16 +19,19 @@ pub enum Action {
     /// List what came back, the newest first
     List {
         /// Only from this robot, by name or id
+        #[arg(add = complete::robots())]
         robot: Option<RobotName>,
         /// Only of this task
-        #[arg(long)]
+        #[arg(long, add = complete::tasks())]
         task: Option<TaskName>,
     },
     /// Fetch the files of a run, the newest unless --run says which
     Get {
         /// The robot's name or id
+        #[arg(add = complete::robots())]
         robot: RobotName,
         /// The task
+        #[arg(add = complete::tasks())]
         task: TaskName,
         /// Which run, as the list shows it
         #[arg(long, value_name = "RUN")]
@@ -51,8 +46,7 @@ pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, Co
     match action {
         Action::List { robot, task } => {
             let list = list(session, robot.as_ref(), task.as_ref()).await?;
-            let header = ["robot", "task", "version", "run", "came", "file", "size"];
-            session.output.result(&list, &header, |list| list.outputs.iter().flat_map(rows).collect())?;
+            session.output.result(&list, &COLUMNS, |list| list.outputs.iter().flat_map(rows).collect())?;
         }
         Action::Get { robot, task, run, into } => {
             let list = list(session, Some(&robot), Some(&task)).await?;
@@ -80,11 +74,20 @@ async fn list(
     robot: Option<&RobotName>,
     task: Option<&TaskName>,
 ) -> Result<OutputList, CommandError> {
-    let robot = robot.map(|robot| ("robot", robot.to_string()));
-    let task = task.map(|task| ("task", task.to_string()));
-    let query: Vec<_> = [robot, task].into_iter().flatten().collect();
-    Ok(session.client.get("/outputs", &query).await?)
+    let of_robot = robot.map(|robot| ("robot", robot.to_string()));
+    let of_task = task.map(|task| ("task", task.to_string()));
+    let query: Vec<_> = [of_robot, of_task].into_iter().flatten().collect();
+    session.client.get("/outputs", &query).await.map_err(|error| match robot {
+        Some(robot) => error.about(robot),
+        None => error.into(),
+    })
 }
+
+const COLUMNS: Columns = Columns {
+    name: "file",
+    narrow: &["robot", "task", "version", "run", "came", "file", "size"],
+    wide: &["robot id", "digest"],
+};
 
 fn rows(view: &OutputView) -> Vec<Vec<String>> {
     let run = view.output.tag().map_or_else(|| "-".to_owned(), |tag| tag.to_string());
@@ -97,6 +100,8 @@ fn rows(view: &OutputView) -> Vec<Vec<String>> {
             time(view.pushed_at_ms),
             file.path.to_string(),
             bytes(file.blob.size),
+            view.output.robot_id.to_string(),
+            file.blob.digest.to_string(),
         ]
     };
     view.output.files.iter().map(row).collect()
@@ -106,32 +111,13 @@ fn rows(view: &OutputView) -> Vec<Vec<String>> {
 async fn fetch(session: &Session, view: &OutputView, file: &OutputFile, into: &Path) -> Result<(), CommandError> {
     // An output's path has no `..` and is not absolute, so this stays below `into`.
     let path = into.join(file.path.as_str());
-    let failed = |source| CommandError::Io { what: format!("can't write {}", path.display()), source };
     let parent = path.parent().unwrap_or(into);
-    tokio::fs::create_dir_all(parent).await.map_err(failed)?;
-    // As any new file of this person, once it is whole.
-    let readable = std::fs::Permissions::from_mode(0o666);
-    let beside = tempfile::Builder::new().permissions(readable).tempfile_in(parent).map_err(failed)?;
-    let mut writer = tokio::fs::File::from_std(beside.reopen().map_err(failed)?);
+    tokio::fs::create_dir_all(parent)
+        .await
+        .map_err(|source| CommandError::Io { what: format!("can't make {}", parent.display()), source })?;
     let (robot, task) = (&view.output.robot_id, &view.output.task);
     let url = format!("/v2/outputs/{robot}/{task}/blobs/{}", file.blob.digest);
-    // A large file may take long, as long as it goes on.
-    let mut response = session.client.send(|| session.client.request(Method::GET, &url).timeout(LONGEST)).await?;
-    let mut hash = Sha256::new();
-    loop {
-        let chunk = timeout(SILENCE, response.chunk()).await;
-        let chunk = chunk.map_err(|_| failed(std::io::Error::other("the server has stopped sending")))?;
-        let Some(chunk) = chunk.map_err(|source| session.client.unreachable(source))? else { break };
-        hash.update(&chunk);
-        writer.write_all(&chunk).await.map_err(failed)?;
-    }
-    writer.flush().await.map_err(failed)?;
-    let got = Digest::from_bytes(hash.finalize().into());
-    if got != file.blob.digest {
-        let text = format!("{}: the bytes hash to {got}, not to {}", file.path, file.blob.digest);
-        return Err(failed(std::io::Error::other(text)));
-    }
-    beside.persist(&path).map_err(|error| failed(error.error))?;
+    put(download(session, &url, file.blob.digest, parent).await?, &path)?;
     say(&path.display().to_string());
     Ok(())
 }

@@ -6,7 +6,9 @@ use indicatif::{MultiProgress, ProgressBar, ProgressFinish, ProgressStyle};
 use task_proto::RobotId;
 use task_proto::api::{AssignmentView, DeploymentView};
 use task_proto::report::Phase;
+use tokio::time::Instant;
 
+use super::course::Course;
 use super::output::{printable, say, stderr_is_terminal};
 
 /// Up to this many robots each gets its own bar.
@@ -31,6 +33,9 @@ pub(super) struct DeploymentProgress {
     moving: bool,
     robots: HashMap<RobotId, ProgressBar>,
     summary: Option<ProgressBar>,
+    bytes: Option<ProgressBar>,
+    course: Course,
+    since: Instant,
     said: HashMap<RobotId, Phase>,
     said_summary: String,
 }
@@ -42,6 +47,9 @@ impl DeploymentProgress {
             moving: stderr_is_terminal(),
             robots: HashMap::new(),
             summary: None,
+            bytes: None,
+            course: Course::default(),
+            since: Instant::now(),
             said: HashMap::new(),
             said_summary: String::new(),
         }
@@ -50,6 +58,7 @@ impl DeploymentProgress {
     /// Shows where the deployment stands now.
     pub(super) fn show(&mut self, view: &DeploymentView) {
         let assignments = view.assignments.as_deref().unwrap_or_default();
+        self.show_bytes(view);
         if assignments.len() > MAX_BARS {
             self.show_summary(view, assignments);
         } else {
@@ -57,6 +66,19 @@ impl DeploymentProgress {
                 self.show_robot(assignment, assignment.phase.is_settled(view.kind));
             }
         }
+    }
+
+    /// How much has travelled, how fast, and for how long it will; only where somebody looks.
+    fn show_bytes(&mut self, view: &DeploymentView) {
+        let estimate = self.course.look(view, self.since.elapsed());
+        if !self.moving || estimate.total == 0 {
+            return;
+        }
+        let bars = &self.bars;
+        let bar = self.bytes.get_or_insert_with(|| styled(bars));
+        bar.set_length(estimate.total);
+        bar.set_position(estimate.done);
+        bar.set_message(estimate.text());
     }
 
     fn show_robot(&mut self, assignment: &AssignmentView, is_settled: bool) {
@@ -101,7 +123,7 @@ impl DeploymentProgress {
 
     /// Takes the bars away, so that the result stands alone.
     pub(super) fn finish(self) {
-        for bar in self.robots.into_values().chain(self.summary) {
+        for bar in self.robots.into_values().chain(self.summary).chain(self.bytes) {
             bar.finish_and_clear();
         }
     }

@@ -5,19 +5,18 @@ use std::time::Duration;
 
 use clap::{Args, ValueEnum};
 use task_proto::RepositoryName;
-use task_proto::api::{
-    CreateDeployment, DeliveryChoice, DeploymentView, MAX_PRIORITY, MIN_PRIORITY, MatchedRobot, MatchedRobots,
-};
+use task_proto::api::{CreateDeployment, DeliveryChoice, DeploymentView, MAX_PRIORITY, MIN_PRIORITY};
+use task_proto::desired::PackageRef;
 use task_proto::envelope::SigningKey;
 use task_proto::publisher::{PackageStatement, SIGNATURE_ARTIFACT};
 use task_proto::selector::Selector;
 
 use super::confirm::confirm;
 use super::output::{Output, bytes, robots, say};
-use super::{CommandError, Outcome, Session, client, robot, upload, view, wait};
+use super::{CommandError, Outcome, Session, client, complete, robot, upload, view, wait};
 use crate::config::lifetime;
 use crate::key_file;
-use crate::package::{self, Packed};
+use crate::package::{self, Launch, Packed};
 
 /// What to push, where to and how.
 #[derive(Debug, Args)]
@@ -25,8 +24,8 @@ use crate::package::{self, Packed};
 pub struct Push {
     /// The package's directory, with task.toml, package.xml or both
     dir: PathBuf,
-    /// Deploy it to these robots: *, names, label=value; without it the package is only uploaded
-    #[arg(long, value_name = "SELECTOR")]
+    /// Deploy it to these robots: *, names, label=value, !term for all but; without it the package is only uploaded
+    #[arg(long, value_name = "SELECTOR", add = complete::selectors())]
     to: Option<Selector>,
     /// Wait until it runs (a job: has succeeded) everywhere
     #[arg(long, requires = "to")]
@@ -105,10 +104,11 @@ pub(super) async fn run(session: &Session, push: Push) -> Result<Outcome, Comman
     // Before anything is done: a key that can't be used must not leave a package without its signature on the server.
     let keys = push.keys.iter().map(|path| key_file::read(path)).collect::<Result<Vec<_>, _>>()?;
     let matched = match &push.to {
-        Some(selector) => Some(matched(session, selector).await?),
+        // None at all is a mistake in the command, noticed before anything travels.
+        Some(selector) => Some(robot::matched(session, selector).await?),
         None => None,
     };
-    let packed = packed(push.dir.clone()).await?;
+    let packed = packed(push.dir.clone(), None).await?;
     if push.dry_run {
         view::print_matched(session, &matched.unwrap_or_default())?;
         return Ok(Outcome::Succeeded);
@@ -116,10 +116,10 @@ pub(super) async fn run(session: &Session, push: Push) -> Result<Outcome, Comman
     if let (Some(selector), Some(matched)) = (&push.to, &matched) {
         confirm(&format!("push {} to {selector}", packed.package.name), matched.robots.len(), push.yes)?;
     }
-    upload::upload(&session.client, &packed).await?;
-    sign(session, &packed, &keys).await?;
+    upload::upload(&session.client, &upload::Upload::of(&packed, true)).await?;
+    sign(session, &packed.package, &keys).await?;
     let Some(selector) = push.to else {
-        session.output.described(&packed.package, |_| describe(&packed))?;
+        session.output.described(&packed.package, reference, |_| describe(&packed))?;
         return Ok(Outcome::Succeeded);
     };
     let order = CreateDeployment {
@@ -141,15 +141,14 @@ pub(super) async fn run(session: &Session, push: Push) -> Result<Outcome, Comman
         say(&format!("it supersedes {superseded}"));
     }
     if !push.wait {
-        session.output.described(&ordered, view::describe)?;
+        view::print(session, &ordered)?;
         return Ok(Outcome::Succeeded);
     }
     wait::until_settled(session, &ordered.id, push.timeout).await
 }
 
 /// Puts what publishers say of the package beside it.
-async fn sign(session: &Session, packed: &Packed, keys: &[SigningKey]) -> Result<(), CommandError> {
-    let package = &packed.package;
+pub(super) async fn sign(session: &Session, package: &PackageRef, keys: &[SigningKey]) -> Result<(), CommandError> {
     let repository = RepositoryName::of_package(&package.name);
     for key in keys {
         let envelope = PackageStatement { package: package.clone() }.seal(key);
@@ -160,19 +159,11 @@ async fn sign(session: &Session, packed: &Packed, keys: &[SigningKey]) -> Result
     Ok(())
 }
 
-/// The robots meant; none at all is a mistake in the command, noticed before anything travels.
-async fn matched(session: &Session, selector: &Selector) -> Result<MatchedRobots, CommandError> {
-    let robots = robot::matching(session, selector).await?.robots;
-    if robots.is_empty() {
-        return Err(CommandError::Usage(format!("--to {selector}: no robot matches")));
-    }
-    let matched =
-        |robot: task_proto::api::RobotView| MatchedRobot { id: robot.id, name: robot.name, online: robot.online };
-    Ok(MatchedRobots { robots: robots.into_iter().map(matched).collect() })
-}
-
-async fn packed(dir: PathBuf) -> Result<Packed, CommandError> {
-    let packing = tokio::task::spawn_blocking(move || package::pack(&dir));
+pub(super) async fn packed(dir: PathBuf, launch: Option<Launch>) -> Result<Packed, CommandError> {
+    let packing = tokio::task::spawn_blocking(move || match &launch {
+        Some(launch) => package::pack_to_launch(&dir, launch),
+        None => package::pack(&dir),
+    });
     let packed = packing.await.map_err(|error| CommandError::Io {
         what: "the packer ended unexpectedly".to_owned(),
         source: error.into(),
@@ -181,13 +172,18 @@ async fn packed(dir: PathBuf) -> Result<Packed, CommandError> {
 }
 
 pub(super) async fn pack(output: &Output, pack: Pack) -> Result<Outcome, CommandError> {
-    let packed = packed(pack.dir).await?;
+    let packed = packed(pack.dir, None).await?;
     if let Some(path) = &pack.out {
         std::fs::copy(packed.content.path(), path)
             .map_err(|source| CommandError::Io { what: format!("can't write {}", path.display()), source })?;
     }
-    output.described(&packed.package, |_| describe(&packed))?;
+    output.described(&packed.package, reference, |_| describe(&packed))?;
     Ok(Outcome::Succeeded)
+}
+
+/// What the package goes by in other commands.
+fn reference(package: &PackageRef) -> String {
+    format!("{}:{}", package.name, package.version)
 }
 
 fn describe(packed: &Packed) -> String {

@@ -8,7 +8,8 @@ use task_proto::request::{Answer, Ask};
 use task_proto::ros::{Endpoint, NodeDetail, NodeSummary, Parameter, TopicSummary, Transition};
 
 use super::output::{printable, say};
-use super::{CommandError, Outcome, Session};
+use super::table::Columns;
+use super::{CommandError, Outcome, Session, complete};
 
 /// What to do with nodes.
 #[derive(Debug, Subcommand)]
@@ -16,13 +17,16 @@ pub enum NodeAction {
     /// List the nodes on a robot's graph
     List {
         /// The robot's name or id
+        #[arg(add = complete::robots())]
         robot: RobotName,
     },
     /// Show a node with its topics and services
     Info {
         /// The robot's name or id
+        #[arg(add = complete::robots())]
         robot: RobotName,
         /// The node's full name, like /mapper
+        #[arg(add = complete::nodes())]
         node: GraphName,
     },
 }
@@ -33,6 +37,7 @@ pub enum TopicAction {
     /// List the topics on a robot's graph
     List {
         /// The robot's name or id
+        #[arg(add = complete::robots())]
         robot: RobotName,
     },
 }
@@ -43,15 +48,19 @@ pub enum ParamAction {
     /// List a node's parameters
     List {
         /// The robot's name or id
+        #[arg(add = complete::robots())]
         robot: RobotName,
         /// The node's full name, like /mapper
+        #[arg(add = complete::nodes())]
         node: GraphName,
     },
     /// Show one parameter of a node
     Get {
         /// The robot's name or id
+        #[arg(add = complete::robots())]
         robot: RobotName,
         /// The node's full name, like /mapper
+        #[arg(add = complete::nodes())]
         node: GraphName,
         /// The parameter's name
         name: String,
@@ -59,8 +68,10 @@ pub enum ParamAction {
     /// Set a parameter of a running node, until its next start
     Set {
         /// The robot's name or id
+        #[arg(add = complete::robots())]
         robot: RobotName,
         /// The node's full name, like /mapper
+        #[arg(add = complete::nodes())]
         node: GraphName,
         /// The parameter's name
         name: String,
@@ -74,12 +85,36 @@ pub enum ParamAction {
 #[derive(Debug, clap::Args)]
 pub struct LifecycleOrder {
     /// The robot's name or id
+    #[arg(add = complete::robots())]
     robot: RobotName,
     /// The node's full name, like /mapper
+    #[arg(add = complete::nodes())]
     node: GraphName,
-    /// configure, activate, deactivate, cleanup or shutdown
-    #[arg(value_parser = transition)]
-    transition: Transition,
+    /// What it is to do
+    #[arg(value_enum)]
+    transition: TransitionName,
+}
+
+/// A transition by its name, which shells complete.
+#[derive(Debug, Clone, Copy, clap::ValueEnum)]
+enum TransitionName {
+    Configure,
+    Activate,
+    Deactivate,
+    Cleanup,
+    Shutdown,
+}
+
+impl From<TransitionName> for Transition {
+    fn from(name: TransitionName) -> Self {
+        match name {
+            TransitionName::Configure => Self::Configure,
+            TransitionName::Activate => Self::Activate,
+            TransitionName::Deactivate => Self::Deactivate,
+            TransitionName::Cleanup => Self::Cleanup,
+            TransitionName::Shutdown => Self::Shutdown,
+        }
+    }
 }
 
 pub(super) async fn node(session: &Session, action: NodeAction) -> Result<Outcome, CommandError> {
@@ -87,18 +122,22 @@ pub(super) async fn node(session: &Session, action: NodeAction) -> Result<Outcom
         NodeAction::List { robot } => {
             let answer = session.client.ask(&robot, &Ask::Nodes).await?;
             say_age(&answer);
-            session.output.result(&answer, &["node", "task", "state"], |answer| match answer {
+            session.output.result(&answer, &Columns::of(&["node", "task", "state"]), |answer| match answer {
                 Answer::Nodes { nodes, .. } => nodes.iter().map(node_row).collect(),
                 _ => Vec::new(),
             })?;
         }
         NodeAction::Info { robot, node } => {
-            let answer = session.client.ask(&robot, &Ask::Node { name: node }).await?;
+            let answer = session.client.ask(&robot, &Ask::Node { name: node.clone() }).await?;
             say_age(&answer);
-            session.output.described(&answer, |answer| match answer {
-                Answer::Node { nodes, .. } => nodes.iter().map(describe).collect::<Vec<_>>().join("\n"),
-                _ => String::new(),
-            })?;
+            session.output.described(
+                &answer,
+                |_| node.to_string(),
+                |answer| match answer {
+                    Answer::Node { nodes, .. } => nodes.iter().map(describe).collect::<Vec<_>>().join("\n"),
+                    _ => String::new(),
+                },
+            )?;
         }
     }
     Ok(Outcome::Succeeded)
@@ -108,9 +147,11 @@ pub(super) async fn topic(session: &Session, action: TopicAction) -> Result<Outc
     let TopicAction::List { robot } = action;
     let answer = session.client.ask(&robot, &Ask::Topics).await?;
     say_age(&answer);
-    session.output.result(&answer, &["topic", "type", "publishers", "subscriptions"], |answer| match answer {
-        Answer::Topics { topics, .. } => topics.iter().map(topic_row).collect(),
-        _ => Vec::new(),
+    session.output.result(&answer, &Columns::of(&["topic", "type", "publishers", "subscriptions"]), |answer| {
+        match answer {
+            Answer::Topics { topics, .. } => topics.iter().map(topic_row).collect(),
+            _ => Vec::new(),
+        }
     })?;
     Ok(Outcome::Succeeded)
 }
@@ -126,7 +167,7 @@ pub(super) async fn param(session: &Session, action: ParamAction) -> Result<Outc
     };
     let answer = session.client.ask(&robot, &ask).await?;
     let row = |parameter: &Parameter| vec![parameter.name.clone(), parameter.value.to_string()];
-    session.output.result(&answer, &["parameter", "value"], |answer| match answer {
+    session.output.result(&answer, &Columns::of(&["parameter", "value"]), |answer| match answer {
         Answer::Parameters { parameters } => parameters.iter().map(row).collect(),
         Answer::ParameterSet { parameter } => vec![row(parameter)],
         _ => Vec::new(),
@@ -136,11 +177,16 @@ pub(super) async fn param(session: &Session, action: ParamAction) -> Result<Outc
 
 pub(super) async fn lifecycle(session: &Session, order: LifecycleOrder) -> Result<Outcome, CommandError> {
     let LifecycleOrder { robot, node, transition } = order;
-    let answer = session.client.ask(&robot, &Ask::Lifecycle { node: node.clone(), transition }).await?;
-    session.output.described(&answer, |answer| match answer {
-        Answer::Lifecycle { state } => format!("{node} is {}", state.as_str()),
-        _ => String::new(),
-    })?;
+    let answer =
+        session.client.ask(&robot, &Ask::Lifecycle { node: node.clone(), transition: transition.into() }).await?;
+    session.output.described(
+        &answer,
+        |_| node.to_string(),
+        |answer| match answer {
+            Answer::Lifecycle { state } => format!("{node} is {}", state.as_str()),
+            _ => String::new(),
+        },
+    )?;
     Ok(Outcome::Succeeded)
 }
 
@@ -149,11 +195,6 @@ fn say_age(answer: &Answer) {
         // Tenths are enough, and a count of milliseconds fits a float exactly.
         say(&format!("the graph as it was {:.1} s ago", *age_ms as f64 / 1000.0));
     }
-}
-
-fn transition(text: &str) -> Result<Transition, String> {
-    let found = Transition::ALL.into_iter().find(|transition| transition.as_str() == text);
-    found.ok_or_else(|| format!("expected {}", Transition::ALL.map(Transition::as_str).join(", ")))
 }
 
 /// A value as it is typed: JSON where it is JSON, otherwise a text.

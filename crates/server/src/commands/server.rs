@@ -3,29 +3,35 @@
 use clap::Subcommand;
 use task_proto::api::{ServerInfo, Traffic};
 
-use super::output::{bytes, time};
-use super::{CommandError, Outcome, Session};
+use super::output::{bytes, facts, time};
+use super::{CommandError, Outcome, Session, status};
 
 /// What to do with the server.
 #[derive(Debug, Subcommand)]
 pub enum Action {
     /// Show its version, its MQTT address and the traffic since it started
     Info,
+    /// Show who is connected over MQTT, and what each listens to
+    Sessions,
+    /// Show by what rules packages travel, and the limits that hold
+    Rules,
 }
 
 pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, CommandError> {
     match action {
         Action::Info => {
             let info: ServerInfo = session.client.get("/server", &[]).await?;
-            session.output.described(&info, describe)?;
+            session.output.described(&info, |info| info.version.clone(), describe)?;
+            Ok(Outcome::Succeeded)
         }
+        Action::Sessions => status::sessions(session).await,
+        Action::Rules => status::rules(session).await,
     }
-    Ok(Outcome::Succeeded)
 }
 
 fn describe(info: &ServerInfo) -> String {
     let (traffic, http, conduct) = (&info.traffic, &info.http, &info.conduct);
-    let facts = [
+    facts([
         ("version", info.version.clone()),
         ("time", time(info.now_ms)),
         ("mqtt", info.mqtt.clone()),
@@ -42,8 +48,7 @@ fn describe(info: &ServerInfo) -> String {
         ("http", format!("{} connections, {} requests", http.connections, http.requests)),
         ("http in", bytes(http.bytes_in)),
         ("http out", bytes(http.bytes_out)),
-    ];
-    facts.iter().map(|(key, value)| format!("{key:<12}{value}\n")).collect()
+    ])
 }
 
 /// What came in, in words.

@@ -1,27 +1,29 @@
-//! `taskd start|stop|remove`: orders on tasks that robots already have.
+//! `taskd start|stop|restart|rollback|remove`: orders on tasks that robots already have.
 
 use std::time::Duration;
 
 use clap::Args;
 use task_proto::TaskName;
-use task_proto::api::{MatchedRobots, OrderTask, RobotView};
+use task_proto::api::{DeploymentView, MatchedRobot, MatchedRobots, OrderTask, RobotView, RolledBack};
 use task_proto::selector::Selector;
 use tokio::time::{Instant, sleep, timeout_at};
 
-use super::client::ClientError;
+use super::client::{ClientError, random_key};
 use super::confirm::confirm;
 use super::output::{robots, say};
+use super::table::Columns;
 use super::view::print_matched;
-use super::{CommandError, Outcome, Session, robot, wait};
+use super::{CommandError, Outcome, Session, complete, robot, wait};
 use crate::config::lifetime;
 
 /// Which task on which robots.
 #[derive(Debug, Args)]
 pub struct TaskOrder {
     /// The task's name
+    #[arg(add = complete::tasks())]
     task: TaskName,
-    /// Which robots: *, names, label=value; those without the task are left out
-    #[arg(long, value_name = "SELECTOR")]
+    /// Which robots: *, names, label=value, !term for all but; those without the task are left out
+    #[arg(long, value_name = "SELECTOR", add = complete::selectors())]
     on: Selector,
     /// Only list the robots that are meant
     #[arg(long)]
@@ -52,6 +54,7 @@ pub struct RemoveOrder {
 pub(super) enum Verb {
     Start,
     Stop,
+    Restart,
     Remove,
 }
 
@@ -60,6 +63,7 @@ impl Verb {
         match self {
             Self::Start => "start",
             Self::Stop => "stop",
+            Self::Restart => "restart",
             Self::Remove => "remove",
         }
     }
@@ -78,6 +82,67 @@ pub(super) async fn remove(session: &Session, order: RemoveOrder) -> Result<Outc
         return Ok(Outcome::Succeeded);
     }
     until_gone(session, &task, &on, &ordered, timeout).await
+}
+
+/// Brings each robot back to the package it had before the one it has now.
+pub(super) async fn roll_back(session: &Session, order: TaskOrder) -> Result<Outcome, CommandError> {
+    let TaskOrder { task, on, dry_run, yes, idempotency_key } = order;
+    let path = format!("/tasks/{task}/rollback");
+    let may_be_repeated = idempotency_key.is_some() && !dry_run;
+    let ask = OrderTask { selector: on.clone(), dry_run: true };
+    let meant: RolledBack = match session.client.order(&path, &ask, &random_key()).await {
+        Err(ClientError::Refused { code, .. })
+            if ["no_robots_match", "nothing_to_roll_back"].contains(&code.as_str()) =>
+        {
+            RolledBack::default()
+        }
+        answer => answer?,
+    };
+    if meant.robots.is_empty() && !may_be_repeated {
+        say_without(&meant.without);
+        return Err(CommandError::Usage(format!("no robot that {on} selects has an earlier version of {task}")));
+    }
+    if dry_run {
+        print_matched(session, &MatchedRobots { robots: meant.robots })?;
+        say_without(&meant.without);
+        return Ok(Outcome::Succeeded);
+    }
+    confirm(&format!("rollback {task} on {on}"), meant.robots.len(), yes)?;
+    let order = OrderTask { selector: on, dry_run: false };
+    let key = idempotency_key.unwrap_or_else(random_key);
+    let back: RolledBack = session.client.order(&path, &order, &key).await?;
+    session.output.result(&back, &ROLLED_BACK, |back| back.deployments.iter().map(rolled_back_row).collect())?;
+    say_without(&back.without);
+    say(&format!("ordered: rollback {task} on {}", robots(back.robots.len() as u64)));
+    Ok(Outcome::Succeeded)
+}
+
+const ROLLED_BACK: Columns =
+    Columns { name: "deployment", narrow: &["deployment", "package", "version", "robots"], wide: &["manifest"] };
+
+fn rolled_back_row(deployment: &DeploymentView) -> Vec<String> {
+    let package = &deployment.package;
+    vec![
+        deployment.id.to_string(),
+        package.name.to_string(),
+        package.version.to_string(),
+        deployment.counts.iter().map(|count| count.count).sum::<u64>().to_string(),
+        package.manifest.digest.to_string(),
+    ]
+}
+
+fn say_without(without: &[MatchedRobot]) {
+    const MAX_NAMES: usize = 10;
+    if without.is_empty() {
+        return;
+    }
+    let mut names: Vec<&str> = without.iter().take(MAX_NAMES).map(|robot| robot.name.as_str()).collect();
+    let more = without.len().saturating_sub(MAX_NAMES);
+    let and_more = format!("and {more} more");
+    if more > 0 {
+        names.push(&and_more);
+    }
+    say(&format!("no earlier version ran on {}", names.join(", ")));
 }
 
 /// Waits until none of `ordered` has the task any more. Whoever was removed meanwhile has not.
@@ -131,10 +196,10 @@ async fn give(session: &Session, verb: Verb, order: TaskOrder) -> Result<Matched
     let path = format!("/tasks/{task}/{}", verb.as_str());
     // With a key this may be an order that was carried out before, whose tasks are gone by now: the server knows.
     let may_be_repeated = idempotency_key.is_some() && !dry_run;
-    let key = idempotency_key.unwrap_or_else(super::client::random_key);
+    let key = idempotency_key.unwrap_or_else(random_key);
     let ask = OrderTask { selector: on.clone(), dry_run: true };
     // A dry run is no order, so it gets a key of its own.
-    let matched: MatchedRobots = match session.client.order(&path, &ask, &super::client::random_key()).await {
+    let matched: MatchedRobots = match session.client.order(&path, &ask, &random_key()).await {
         Err(ClientError::Refused { code, .. }) if code == "no_robots_match" => MatchedRobots::default(),
         answer => answer?,
     };

@@ -9,7 +9,8 @@ use task_proto::selector::Selector;
 use task_proto::{TokenId, UserName};
 
 use super::output::{say, time};
-use super::{CommandError, Outcome, Session};
+use super::table::Columns;
+use super::{CommandError, Outcome, Session, complete};
 use crate::config::lifetime;
 
 /// What to do with access tokens.
@@ -21,13 +22,13 @@ pub enum Action {
         #[arg(long, value_name = "TEXT", default_value = "")]
         title: String,
         /// Whose it is, which takes an administrator [default: one's own]
-        #[arg(long, value_name = "NAME")]
+        #[arg(long, value_name = "NAME", add = complete::users())]
         user: Option<UserName>,
         /// Only these of its user's roles
         #[arg(long, value_name = "ROLES")]
         role: Option<Roles>,
         /// Only robots that this selector means, like site=lab
-        #[arg(long, value_name = "SELECTOR")]
+        #[arg(long, value_name = "SELECTOR", add = complete::selectors())]
         robots: Option<Selector>,
         /// How long it lives, like 12h or 30d [default: 90d]
         #[arg(long, value_name = "TIME", value_parser = lifetime)]
@@ -42,6 +43,7 @@ pub enum Action {
     /// End one now
     Revoke {
         /// Its id
+        #[arg(add = complete::tokens())]
         id: TokenId,
     },
 }
@@ -52,7 +54,7 @@ pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, Co
             let ttl_s = ttl.map(|ttl| ttl.as_secs());
             let order = CreateToken { user, title, roles: role, scope: robots, ttl_s };
             let token: AccessToken = session.client.once("/tokens", &order).await?;
-            session.output.described(&token, |token| token.token.clone())?;
+            session.output.described(&token, |token| token.id.to_string(), |token| token.token.clone())?;
             say(&format!(
                 "{} of {}, valid until {}; it is not shown again",
                 token.id,
@@ -62,8 +64,7 @@ pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, Co
         }
         Action::List { all } => {
             let list: TokenList = session.client.get("/tokens", &[("all", all.to_string())]).await?;
-            let header = ["id", "user", "origin", "title", "roles", "robots", "made", "ends"];
-            session.output.result(&list, &header, |list| list.tokens.iter().map(row).collect())?;
+            session.output.result(&list, &COLUMNS, |list| list.tokens.iter().map(row).collect())?;
         }
         Action::Revoke { id } => {
             session.client.delete(&format!("/tokens/{id}")).await?;
@@ -72,6 +73,8 @@ pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, Co
     }
     Ok(Outcome::Succeeded)
 }
+
+const COLUMNS: Columns = Columns::of(&["id", "user", "origin", "title", "roles", "robots", "made", "ends"]);
 
 fn row(token: &TokenView) -> Vec<String> {
     let origin = match token.origin {

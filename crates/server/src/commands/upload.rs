@@ -6,7 +6,7 @@ use std::path::Path;
 use futures_util::TryStreamExt as _;
 use reqwest::header::{CONTENT_LENGTH, CONTENT_TYPE, LOCATION};
 use reqwest::{Body, Method, Response, StatusCode};
-use task_proto::desired::BlobRef;
+use task_proto::desired::{BlobRef, PackageRef};
 use task_proto::envelope::Envelope;
 use task_proto::oci::{EMPTY, ImageManifest, MANIFEST_TYPE};
 use task_proto::{Digest, RepositoryName};
@@ -31,21 +31,38 @@ enum Source<'a> {
     File(&'a Path),
 }
 
+/// What is uploaded of a package.
+pub(super) struct Upload<'a> {
+    pub(super) package: &'a PackageRef,
+    pub(super) config: &'a [u8],
+    pub(super) manifest: &'a [u8],
+    /// Absent: the server has it.
+    pub(super) content: Option<&'a Path>,
+    /// Whether its version means it from now on; else it goes by its digest alone.
+    pub(super) tagged: bool,
+}
+
+impl<'a> Upload<'a> {
+    /// A directory's package, under its version or by its digest alone.
+    pub(super) fn of(packed: &'a Packed, tagged: bool) -> Self {
+        let (config, manifest) = (&packed.config_bytes, &packed.manifest_bytes);
+        Self { package: &packed.package, config, manifest, content: Some(packed.content.path()), tagged }
+    }
+}
+
 /// Uploads what the server lacks, and says how much that was.
-pub(super) async fn upload(client: &Client, packed: &Packed) -> Result<(), CommandError> {
-    let name = packed.package.name.as_str();
+pub(super) async fn upload(client: &Client, upload: &Upload<'_>) -> Result<(), CommandError> {
+    let package = upload.package;
+    let name = package.name.as_str();
     let mut sent = 0;
-    for (blob, source) in [
-        (packed.package.config, Source::Bytes(&packed.config_bytes)),
-        (packed.package.content, Source::File(packed.content.path())),
-    ] {
+    let content = upload.content.map(|path| (package.content, Source::File(path)));
+    for (blob, source) in [Some((package.config, Source::Bytes(upload.config))), content].into_iter().flatten() {
         if !exists(client, &format!("/v2/{name}/blobs/{}", blob.digest)).await? {
             upload_blob(client, name, blob, &source).await?;
             sent += 1;
         }
     }
-    put_manifest(client, packed).await?;
-    let package = &packed.package;
+    put_manifest(client, upload).await?;
     match sent {
         0 => say(&format!("{} {}: nothing to upload, the server has it already", package.name, package.version)),
         _ => say(&format!(
@@ -171,22 +188,23 @@ async fn body(source: &Source<'_>, size: u64) -> Result<Body, CommandError> {
     }
 }
 
-/// Puts the manifest under the version as its tag, unless the tag is there and means it.
-async fn put_manifest(client: &Client, packed: &Packed) -> Result<(), CommandError> {
-    let path = format!("/v2/{}/manifests/{}", packed.package.name, packed.package.version);
+/// Puts the manifest, under the version as its tag unless it is to go by its digest, if it is not there already.
+async fn put_manifest(client: &Client, upload: &Upload<'_>) -> Result<(), CommandError> {
+    let Upload { package, manifest, tagged, .. } = upload;
+    let reference = if *tagged { package.version.to_string() } else { package.manifest.digest.to_string() };
+    let path = format!("/v2/{}/manifests/{reference}", package.name);
     match client.send(|| client.request(Method::HEAD, &path)).await {
         Ok(response) => {
             let known = response.headers().get("docker-content-digest").and_then(|value| value.to_str().ok());
-            if known == Some(&packed.package.manifest.digest.to_string()) {
+            if known == Some(&package.manifest.digest.to_string()) {
                 return Ok(());
             }
-            say(&format!("version {} is on the server with other content; its tag moves", packed.package.version));
+            say(&format!("version {} is on the server with other content; its tag moves", package.version));
         }
         Err(error) if status_of(&error) == Some(StatusCode::NOT_FOUND) => {}
         Err(error) => return Err(error.into()),
     }
-    let put =
-        || client.request(Method::PUT, &path).header(CONTENT_TYPE, MANIFEST_TYPE).body(packed.manifest_bytes.clone());
+    let put = || client.request(Method::PUT, &path).header(CONTENT_TYPE, MANIFEST_TYPE).body(manifest.to_vec());
     client.send(put).await?;
     Ok(())
 }

@@ -7,9 +7,10 @@ use task_proto::person::Roles;
 use task_proto::selector::Selector;
 
 use super::confirm::always;
-use super::output::{say, time};
+use super::output::{facts, say, time};
 use super::password::{self, Secret};
-use super::{CommandError, Outcome, Session};
+use super::table::Columns;
+use super::{CommandError, Outcome, Session, complete};
 
 /// What to do with users.
 #[derive(Debug, Subcommand)]
@@ -22,7 +23,7 @@ pub enum Action {
         #[arg(long, value_name = "ROLES")]
         role: Roles,
         /// Only robots that this selector means, like site=lab
-        #[arg(long, value_name = "SELECTOR")]
+        #[arg(long, value_name = "SELECTOR", add = complete::selectors())]
         robots: Option<Selector>,
         /// Without a password: only with tokens that an administrator makes for them
         #[arg(long, conflicts_with = "password_stdin")]
@@ -35,17 +36,19 @@ pub enum Action {
     /// Change what a user may do
     Edit {
         /// Who
+        #[arg(add = complete::users())]
         name: UserName,
         /// The roles they have from now on
         #[arg(long, value_name = "ROLES")]
         role: Option<Roles>,
         /// The robots they are limited to from now on; '*' for no limit
-        #[arg(long, value_name = "SELECTOR")]
+        #[arg(long, value_name = "SELECTOR", add = complete::selectors())]
         robots: Option<Selector>,
     },
     /// Remove a user; their tokens end now
     Remove {
         /// Who
+        #[arg(add = complete::users())]
         name: UserName,
         /// Don't ask
         #[arg(short, long)]
@@ -54,6 +57,7 @@ pub enum Action {
     /// Set a password: one's own, or with a name anybody's
     Passwd {
         /// Whose; absent: one's own, which takes the old one
+        #[arg(add = complete::users())]
         name: Option<UserName>,
         #[command(flatten)]
         from: PasswordFrom,
@@ -114,20 +118,22 @@ pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, Co
 /// `taskd whoami`: whom the token stands for, and what it allows.
 pub(super) async fn who_am_i(session: &Session) -> Result<Outcome, CommandError> {
     let me: Me = session.client.get("/me", &[]).await?;
-    session.output.described(&me, |me| {
+    let name = |me: &Me| me.name.to_string();
+    session.output.described(&me, name, |me| {
         let permissions: Vec<&str> = me.permissions.iter().map(|permission| permission.as_str()).collect();
         let scope: Vec<String> = me.scope.iter().map(Selector::to_string).collect();
-        let facts = [
+        facts([
             ("name", me.name.to_string()),
             ("roles", me.roles.to_string()),
             ("may", permissions.join(", ")),
             ("robots", if scope.is_empty() { "*".to_owned() } else { scope.join(" and ") }),
             ("token", me.token.to_string()),
-        ];
-        facts.iter().map(|(key, value)| format!("{key:<12}{value}\n")).collect()
+        ])
     })?;
     Ok(Outcome::Succeeded)
 }
+
+const COLUMNS: Columns = Columns::of(&["name", "roles", "robots", "password", "added"]);
 
 fn show(session: &Session, list: &UserList) -> Result<(), CommandError> {
     let row = |user: &UserView| {
@@ -144,6 +150,5 @@ fn show(session: &Session, list: &UserList) -> Result<(), CommandError> {
             time(user.created_at_ms),
         ]
     };
-    let header = ["name", "roles", "robots", "password", "added"];
-    session.output.result(list, &header, |list| list.users.iter().map(row).collect())
+    session.output.result(list, &COLUMNS, |list| list.users.iter().map(row).collect())
 }

@@ -6,7 +6,8 @@ use task_proto::api::{AssignmentView, DeliveryDecision, DeploymentState, Deploym
 use task_proto::desired::Delivery;
 use task_proto::report::Phase;
 
-use super::output::{printable, robots, table, time};
+use super::output::{self, robots, time};
+use super::table::Columns;
 use super::{CommandError, Session};
 use crate::delivery::{FELL_BEHIND, ORDERED};
 
@@ -29,18 +30,40 @@ pub(super) fn phases(view: &DeploymentView) -> String {
     phases.join(" ")
 }
 
-/// A deployment for people: its facts, then a line per robot.
-pub(super) fn describe(view: &DeploymentView) -> String {
-    describe_fully(view, false)
+/// Prints a deployment: its facts, then a line per robot.
+pub(super) fn print(session: &Session, view: &DeploymentView) -> Result<(), CommandError> {
+    print_with(session, view, &COLUMNS)
 }
 
-/// The same; with `deliveries` it also says of each robot how its bytes travel.
-pub(super) fn describe_fully(view: &DeploymentView, deliveries: bool) -> String {
+/// The same; it also says of each robot how its bytes travel.
+pub(super) fn print_deliveries(session: &Session, view: &DeploymentView) -> Result<(), CommandError> {
+    print_with(session, view, &COLUMNS_WITH_DELIVERIES)
+}
+
+fn print_with(session: &Session, view: &DeploymentView, columns: &Columns) -> Result<(), CommandError> {
+    let name = |view: &DeploymentView| view.id.to_string();
+    session.output.described(view, name, |view| {
+        let mut text = describe(view);
+        if let Some(assignments) = &view.assignments {
+            let rows: Vec<_> = assignments.iter().map(assignment_row).collect();
+            text.push('\n');
+            text.push_str(&session.output.table(columns, &rows));
+        }
+        text
+    })
+}
+
+const COLUMNS: Columns =
+    Columns { name: "robot", narrow: &["robot", "state", "phase", "progress", "detail"], wide: &["delivery"] };
+const COLUMNS_WITH_DELIVERIES: Columns =
+    Columns { name: "robot", narrow: &["robot", "state", "phase", "progress", "detail", "delivery"], wide: &[] };
+
+fn describe(view: &DeploymentView) -> String {
     let supersedes: Vec<_> = view.supersedes.iter().map(ToString::to_string).collect();
     let mut facts = vec![
         ("deployment", view.id.to_string()),
         ("package", format!("{} {} {}", view.package.name, view.package.version, view.package.manifest.digest)),
-        ("selector", view.selector.to_string()),
+        ("selector", view.selector.as_ref().map_or_else(String::new, ToString::to_string)),
         ("delivery", view.delivery.to_string()),
         ("state", state(view.state).to_owned()),
         ("phases", phases(view)),
@@ -59,15 +82,7 @@ pub(super) fn describe_fully(view: &DeploymentView, deliveries: bool) -> String 
     let assignments = view.assignments.as_deref().unwrap_or_default();
     facts.extend(mechanisms(assignments).into_iter().map(|line| ("travels", line)));
     facts.extend(deferred(assignments).into_iter().map(|line| ("deferred", line)));
-    let mut text: String = facts.iter().map(|(key, value)| format!("{key:<12}{}\n", printable(value))).collect();
-    if let Some(assignments) = &view.assignments {
-        text.push('\n');
-        let header = ["robot", "state", "phase", "progress", "detail", "delivery"];
-        let columns = if deliveries { header.len() } else { header.len() - 1 };
-        let row = |assignment| assignment_row(assignment).into_iter().take(columns).collect();
-        text.push_str(&table(&header[..columns], assignments.iter().map(row).collect()));
-    }
-    text
+    output::facts(facts)
 }
 
 /// How the bytes travel to how many robots and why, the most common way first.
@@ -139,7 +154,8 @@ fn assignment_row(assignment: &AssignmentView) -> Vec<String> {
 
 /// Lists the robots an order means.
 pub(super) fn print_matched(session: &Session, matched: &MatchedRobots) -> Result<(), CommandError> {
-    session.output.result(matched, &["id", "name", "state"], |matched| {
+    let columns = Columns { name: "name", narrow: &["id", "name", "state"], wide: &[] };
+    session.output.result(matched, &columns, |matched| {
         let row = |robot: &MatchedRobot| {
             vec![
                 robot.id.to_string(),
@@ -170,6 +186,7 @@ mod tests {
             attempts: 1,
             superseded_by: None,
             updated_at_ms: 0,
+            timeline: None,
         }
     }
 

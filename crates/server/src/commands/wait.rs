@@ -1,6 +1,7 @@
 //! `--wait`: follows a deployment until every robot has settled or the time is over, and judges how it went. It asks the
 //! server again and again, so a server that restarts meanwhile costs time and nothing else.
 
+use std::collections::BTreeMap;
 use std::time::Duration;
 
 use task_proto::DeploymentId;
@@ -49,7 +50,7 @@ pub(super) async fn until_settled(
         say("timed out: the server did not say how the deployment stands");
         return Ok(Outcome::TimedOut);
     };
-    session.output.described(&view, view::describe)?;
+    view::print(session, &view)?;
     let verdict = judge(&view);
     say(&verdict.text);
     Ok(verdict.outcome)
@@ -93,7 +94,7 @@ fn judge(view: &DeploymentView) -> Verdict {
         open.into_iter().partition(|a| view.state == DeploymentState::Paused && !a.released);
     let (open, offline): (Vec<_>, Vec<_>) = open.into_iter().partition(|a| a.online);
     let mut lines = vec![format!("{} of {} succeeded", succeeded.len(), assignments.len())];
-    lines.extend(failed.iter().map(|a| format!("{}: {}", a.name, reason(a))));
+    lines.extend(by_reason(&failed));
     lines.extend(open.iter().map(|a| format!("{}: not done in time, still {}", a.name, reason(a))));
     if !offline.is_empty() {
         lines.push(format!("offline, and following when back: {}", names(&offline)));
@@ -106,6 +107,9 @@ fn judge(view: &DeploymentView) -> Verdict {
             view.id
         ));
     }
+    if !failed.is_empty() && view.state != DeploymentState::Paused {
+        lines.push(format!("once more where it failed: taskd deploy retry {}", view.id));
+    }
     let outcome = match (succeeded.len(), failed.len() + waiting.len(), open.len() + offline.len()) {
         (_, _, 1..) if view.state != DeploymentState::Cancelled => Outcome::TimedOut,
         (1.., 0, 0) => Outcome::Succeeded,
@@ -114,6 +118,17 @@ fn judge(view: &DeploymentView) -> Verdict {
     };
     let text = lines.iter().map(|line| printable(line)).collect::<Vec<_>>().join("\n");
     Verdict { outcome, text }
+}
+
+/// Robots that did not make it, those with one reason together, the most common first.
+fn by_reason(assignments: &[&AssignmentView]) -> Vec<String> {
+    let mut reasons: BTreeMap<String, Vec<&AssignmentView>> = BTreeMap::new();
+    for assignment in assignments {
+        reasons.entry(reason(assignment)).or_default().push(assignment);
+    }
+    let mut reasons: Vec<_> = reasons.into_iter().collect();
+    reasons.sort_by_key(|(_, robots)| std::cmp::Reverse(robots.len()));
+    reasons.into_iter().map(|(reason, robots)| format!("{}: {reason}", names(&robots))).collect()
 }
 
 fn reason(assignment: &AssignmentView) -> String {
@@ -134,13 +149,13 @@ fn names(assignments: &[&AssignmentView]) -> String {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use task_proto::report::{Failure, FailureCode, Phase};
     use task_proto::{Digest, RobotId};
 
     use super::*;
 
-    fn assignment(name: &str, phase: Phase, online: bool) -> AssignmentView {
+    pub(in super::super) fn assignment(name: &str, phase: Phase, online: bool) -> AssignmentView {
         AssignmentView {
             robot: RobotId::random(),
             name: name.parse().unwrap(),
@@ -153,10 +168,11 @@ mod tests {
             attempts: 1,
             superseded_by: None,
             updated_at_ms: 0,
+            timeline: None,
         }
     }
 
-    fn deployment(state: DeploymentState, assignments: Vec<AssignmentView>) -> DeploymentView {
+    pub(in super::super) fn deployment(state: DeploymentState, assignments: Vec<AssignmentView>) -> DeploymentView {
         let blob = serde_json::json!({ "digest": Digest::of(b""), "size": 0 });
         let package = serde_json::json!({
             "name": "talker", "version": "1", "manifest": blob, "config": blob, "content": blob,
@@ -165,7 +181,7 @@ mod tests {
             id: DeploymentId::random(),
             package: serde_json::from_value(package).unwrap(),
             kind: task_proto::manifest::TaskKind::Service,
-            selector: "*".parse().unwrap(),
+            selector: "*".parse().ok(),
             delivery: task_proto::api::DeliveryChoice::PushPull,
             priority: 0,
             state,
@@ -208,9 +224,20 @@ mod tests {
         assert!(!is_over(&view));
         assert_eq!(
             judge(&view).text,
-            "1 of 4 succeeded\nbad: failed (build_failed: colcon said no)\nslow: not done in time, still building\n\
-             offline, and following when back: away"
+            format!(
+                "1 of 4 succeeded\nbad: failed (build_failed: colcon said no)\nslow: not done in time, still building\n\
+                 offline, and following when back: away\nonce more where it failed: taskd deploy retry {}",
+                view.id
+            )
         );
+    }
+
+    #[test]
+    fn robots_that_failed_alike_stand_together() {
+        let bad = |name| assignment(name, Phase::Failed, true);
+        let (a, b, c) = (bad("a"), bad("b"), assignment("c", Phase::Unmet, true));
+        let lines = by_reason(&[&c, &a, &b]);
+        assert_eq!(lines, ["a, b: failed (build_failed: colcon said no)", "c: unmet"]);
     }
 
     #[test]

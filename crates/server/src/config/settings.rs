@@ -266,6 +266,12 @@ pub(super) const SETTINGS: &[Setting] = &[
         set: |config, text| count(text, 1 << 50).map(|n| config.max_blob_bytes = n),
     },
     Setting {
+        name: "max-upload-bytes",
+        value_name: "SIZE",
+        help: "Most that is unpacked of a package that the page brings as a directory [default: 4 GB]",
+        set: |config, text| size_within(text, 1, 1 << 50).map(|bytes| config.max_upload_bytes = bytes),
+    },
+    Setting {
         name: "delivery-part-bytes",
         value_name: "SIZE",
         help: "Size of a part in direct-push; a smaller package is one message [default: 64 KB]",

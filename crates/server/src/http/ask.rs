@@ -14,13 +14,18 @@ use super::auth::not_permitted;
 use super::error::ApiError;
 use super::extract::{JsonBody, PathParam};
 use super::robots::find;
+use crate::changes::Change;
 use crate::person::Person;
 use crate::requests::RequestError;
 
 /// How long a robot may take. A lifecycle transition on a slow robot is what takes longest.
 const PATIENCE: Duration = Duration::from_secs(20);
 
-/// `POST /robots/{robot}/ask`: asks the robot and gives its answer.
+/// Asks the robot, and gives its answer. What changes something takes the permission `operate`.
+#[utoipa::path(post, path = "/api/v1/robots/{robot}/ask", tag = "robots",
+    responses((status = 409, description = "`robot_offline`, or what the robot says of why it gives no answer: `no_ros`, `no_such_node`, …."),
+        (status = 503, description = "Too many questions to it are under way."),
+        (status = 504, description = "`robot_silent`: it did not answer in time.")))]
 pub(super) async fn ask(
     State(app): State<App>,
     by: Person,
@@ -37,14 +42,20 @@ pub(super) async fn ask(
         }
         app.actions.note_ask(&by, &id, &ask).await?;
     }
-    Ok(Json(app.requests.ask(&app.broker, &id, ask, PATIENCE).await?))
+    let mut answer = app.requests.ask(&app.broker, &id, ask, PATIENCE).await?;
+    if let Answer::Vitals(vitals) = &mut answer {
+        // Its clock may lie, and so may its figures.
+        *vitals = app.vitals.take(&id, *vitals, app.clock.now_ms());
+        app.changes.announce(Change::Robot(id));
+    }
+    Ok(Json(answer))
 }
 
 impl From<RequestError> for ApiError {
     fn from(error: RequestError) -> Self {
         let message = error.to_string();
         match error {
-            RequestError::NotConnected(_) => Self::conflict("robot_offline", message),
+            RequestError::NotConnected => Self::conflict("robot_offline", message),
             RequestError::Busy => Self::unavailable(message),
             RequestError::TimedOut { .. } => Self::new(StatusCode::GATEWAY_TIMEOUT, "robot_silent", message),
             RequestError::Refused(refusal) => Self::conflict(code(&refusal), message),

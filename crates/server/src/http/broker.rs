@@ -9,7 +9,8 @@ use super::App;
 use super::error::ApiError;
 use super::extract::PathParam;
 
-/// `GET /robots/{robot}/mqtt` (that robot): where its MQTT session goes now.
+/// Says where the robot's MQTT session goes now.
+#[utoipa::path(get, path = "/api/v1/robots/{robot}/mqtt", tag = "agent")]
 pub(super) async fn endpoint(
     State(app): State<App>,
     PathParam(robot): PathParam<RobotId>,
@@ -24,7 +25,10 @@ pub(super) async fn endpoint_of(app: &App, robot: &RobotId) -> Result<MqttEndpoi
     Ok(app.mqtt.endpoint_of(&credential))
 }
 
-/// `GET /broker`: the files that an external broker needs.
+/// Gives the files that an external broker needs.
+#[utoipa::path(get, path = "/api/v1/broker", tag = "server",
+    responses((status = 409, description = "`no_external_broker`: the server uses its own."),
+        (status = 503, description = "The files could not be made now.")))]
 pub(super) async fn files(State(app): State<App>) -> Result<Json<BrokerFiles>, ApiError> {
     if !app.mqtt.is_external() {
         let message = "the server uses its own broker; `broker` in its settings names another";

@@ -4,35 +4,85 @@ use axum::Json;
 use axum::extract::State;
 use axum::response::{IntoResponse, Response};
 use http::{HeaderMap, StatusCode};
+use serde::Deserialize;
 use task_proto::DeploymentId;
-use task_proto::api::{CreateDeployment, DeploymentList, DeploymentView, IDEMPOTENCY_KEY, MatchedRobots};
+use task_proto::api::{
+    CreateDeployment, DeploymentList, DeploymentView, IDEMPOTENCY_KEY, MatchedRobots, RetryDeployment,
+};
 
 use super::App;
 use super::error::ApiError;
-use super::extract::{JsonBody, PathParam, idempotency_key};
+use utoipa::IntoParams;
+
+use super::extract::{JsonBody, PathParam, QueryParams, idempotency_key, page_limit};
+use super::openapi::OrderKey;
 use super::views::{complete_deployment, complete_matched, narrowed};
 use crate::person::Person;
 
-/// `GET /deployments`: the newest first; of each only what concerns the person's robots.
-pub(super) async fn list(State(app): State<App>, by: Person) -> Result<Json<DeploymentList>, ApiError> {
-    let deployments = if by.scope.is_everything() {
-        app.store.deployments().await?
-    } else {
-        app.store.deployments_of(&app.store.robots_in(&by.scope).await?).await?
-    };
-    Ok(Json(DeploymentList { deployments }))
+/// The query of `GET /deployments`.
+#[derive(Deserialize, IntoParams)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ListQuery {
+    /// At most so many; absent: 200.
+    #[param(minimum = 1, maximum = 1000)]
+    limit: Option<u32>,
+    /// Only those that came before this one.
+    #[param(inline)]
+    before: Option<DeploymentId>,
 }
 
-/// `GET /deployments/{deployment}`: one, with its assignments.
+/// How many are listed where nobody says how many.
+const LISTED: u32 = 200;
+
+/// Lists the newest deployments, a page of them; of each only what concerns the person's robots.
+#[utoipa::path(get, path = "/api/v1/deployments", tag = "deployments",
+    responses((status = 404, description = "There is no deployment `before`.")))]
+pub(super) async fn list(
+    State(app): State<App>,
+    by: Person,
+    QueryParams(query): QueryParams<ListQuery>,
+) -> Result<Json<DeploymentList>, ApiError> {
+    let limit = page_limit(query.limit)?.unwrap_or(LISTED);
+    let robots = match by.scope.is_everything() {
+        true => None,
+        false => Some(app.store.robots_in(&by.scope).await?),
+    };
+    let before = query.before.as_ref();
+    let page = app.store.deployments(robots.as_deref(), before, limit).await?.ok_or_else(|| {
+        let before = before.map(DeploymentId::as_str).unwrap_or_default();
+        ApiError::not_found(format!("before: there is no deployment {before}"))
+    })?;
+    Ok(Json(DeploymentList { deployments: page.deployments, next: page.next }))
+}
+
+/// The query of `GET /deployments/{deployment}`.
+#[derive(Deserialize, IntoParams)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ShowQuery {
+    /// Whether each assignment says when it came into its phases.
+    #[serde(default)]
+    #[param(required = false)]
+    timeline: bool,
+}
+
+/// Shows one deployment, with its assignments.
+#[utoipa::path(get, path = "/api/v1/deployments/{deployment}", tag = "deployments")]
 pub(super) async fn show(
     State(app): State<App>,
     by: Person,
     PathParam(id): PathParam<DeploymentId>,
+    QueryParams(query): QueryParams<ShowQuery>,
 ) -> Result<Json<DeploymentView>, ApiError> {
-    view(&app, &by, &id).await.map(Json)
+    seen(&app, &by, &id, query.timeline).await.map(Json)
 }
 
-/// `POST /deployments`: orders a package on robots, or only says which robots that would be.
+/// Orders a package on robots, or only says which robots that would be.
+#[utoipa::path(post, path = "/api/v1/deployments", tag = "deployments", params(OrderKey),
+    responses((status = 200, description = "A dry run: the robots it would be.", body = MatchedRobots),
+        (status = 201, description = "The deployment.", body = DeploymentView),
+        (status = 404, description = "`package_not_found`: nobody has pushed that."),
+        (status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order."),
+        (status = 422, description = "`too_large_for_inline`: so much does not fit into the announcement.")))]
 pub(super) async fn create(
     State(app): State<App>,
     by: Person,
@@ -55,7 +105,8 @@ pub(super) async fn create(
     Ok((StatusCode::CREATED, Json(view(&app, &by, &id).await?)).into_response())
 }
 
-/// `POST /deployments/{deployment}/cancel`: interrupts it.
+/// Takes a deployment back.
+#[utoipa::path(post, path = "/api/v1/deployments/{deployment}/cancel", tag = "deployments")]
 pub(super) async fn cancel(
     State(app): State<App>,
     by: Person,
@@ -65,7 +116,9 @@ pub(super) async fn cancel(
     view(&app, &by, &id).await.map(Json)
 }
 
-/// `POST /deployments/{deployment}/resume`: lets a paused one go on.
+/// Lets a paused deployment go on.
+#[utoipa::path(post, path = "/api/v1/deployments/{deployment}/resume", tag = "deployments",
+    responses((status = 409, description = "`deployment_cancelled`: it was taken back.")))]
 pub(super) async fn resume(
     State(app): State<App>,
     by: Person,
@@ -75,8 +128,36 @@ pub(super) async fn resume(
     view(&app, &by, &id).await.map(Json)
 }
 
-async fn view(app: &App, by: &Person, id: &DeploymentId) -> Result<DeploymentView, ApiError> {
-    let found = app.store.deployment(id).await?;
+/// Orders once more what has ended badly, or only says on which robots that would be.
+#[utoipa::path(post, path = "/api/v1/deployments/{deployment}/retry", tag = "deployments", params(OrderKey),
+    responses((status = 200, description = "A dry run: the robots it would be.", body = MatchedRobots),
+        (status = 201, description = "The new deployment.", body = DeploymentView),
+        (status = 404, description = "There is no such deployment, or `package_not_found`: its package was deleted."),
+        (status = 409, description = "`nothing_to_retry`, or `idempotency_key_reused` for another order.")))]
+pub(super) async fn retry(
+    State(app): State<App>,
+    by: Person,
+    PathParam(id): PathParam<DeploymentId>,
+    headers: HeaderMap,
+    JsonBody(order): JsonBody<RetryDeployment>,
+) -> Result<Response, ApiError> {
+    if order.dry_run {
+        let mut robots = app.actions.robots_to_retry(&by, &id, &order).await?;
+        complete_matched(&mut robots, &app.presence, app.clock.now_ms());
+        return Ok(Json(MatchedRobots { robots }).into_response());
+    }
+    let key = idempotency_key(headers.get(IDEMPOTENCY_KEY))?;
+    let id = app.actions.retry_deployment(&by, &key, &id, &order).await?;
+    Ok((StatusCode::CREATED, Json(view(&app, &by, &id).await?)).into_response())
+}
+
+/// A deployment as far as it concerns the person, without timelines.
+pub(super) async fn view(app: &App, by: &Person, id: &DeploymentId) -> Result<DeploymentView, ApiError> {
+    seen(app, by, id, false).await
+}
+
+async fn seen(app: &App, by: &Person, id: &DeploymentId, with_timelines: bool) -> Result<DeploymentView, ApiError> {
+    let found = app.store.deployment(id, with_timelines).await?;
     let mut view = found.ok_or_else(|| ApiError::not_found(format!("there is no deployment {id}")))?;
     if !by.scope.is_everything() {
         let robots = app.store.robots_in(&by.scope).await?.into_iter().collect();

@@ -1,5 +1,6 @@
 //! Reads to its end what a handler left of a request's body. Otherwise the connection would have to be closed under a
 //! client that was refused early: it would see a reset instead of the refusal, or its next request would get no answer.
+//! Many clients read no answer before all of their body is sent, so how long it is does not matter, but how long it takes.
 
 use std::pin::Pin;
 use std::task::{Context, Poll, ready};
@@ -9,21 +10,27 @@ use axum::body::Body;
 use axum::extract::Request;
 use bytes::Bytes;
 use futures_util::StreamExt as _;
+use http::header;
 use http_body::{Frame, SizeHint};
 
-/// Of a longer rest the connection is closed: reading it would cost more than a new connection.
-const MAX_REST_BYTES: usize = 1024 * 1024;
 /// How long the rest may take to arrive.
-const PATIENCE: Duration = Duration::from_secs(5);
+const PATIENCE: Duration = Duration::from_secs(30);
+/// How long its sender may be silent.
+const SILENCE: Duration = Duration::from_secs(5);
+/// After how long the refusal has gone out: asked for more before it, a client that has announced its body sends all of it.
+const HEAD_START: Duration = Duration::from_millis(100);
 
 /// Wraps the body of a request; for `axum::middleware::map_request`, outermost.
 pub async fn drain_unread(request: Request) -> Request {
-    request.map(|body| Body::new(DrainedBody { body: Some(body) }))
+    let announced = request.headers().contains_key(header::EXPECT);
+    request.map(|body| Body::new(DrainedBody { body: Some(body), announced }))
 }
 
 struct DrainedBody {
     /// Taken when it has ended.
     body: Option<Body>,
+    /// The client sends none of it before it is asked for some, or has waited for that in vain.
+    announced: bool,
 }
 
 impl http_body::Body for DrainedBody {
@@ -34,6 +41,7 @@ impl http_body::Body for DrainedBody {
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
     ) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
+        self.announced = false;
         let Some(body) = self.body.as_mut() else { return Poll::Ready(None) };
         let frame = ready!(Pin::new(body).poll_frame(context));
         if !matches!(frame, Some(Ok(_))) {
@@ -54,19 +62,15 @@ impl http_body::Body for DrainedBody {
 impl Drop for DrainedBody {
     fn drop(&mut self) {
         let rest = self.body.take().filter(|body| !http_body::Body::is_end_stream(body));
+        let head_start = if self.announced { HEAD_START } else { Duration::ZERO };
         if let (Some(rest), Ok(runtime)) = (rest, tokio::runtime::Handle::try_current()) {
-            runtime.spawn(tokio::time::timeout(PATIENCE, drain(rest)));
+            runtime.spawn(tokio::time::timeout(PATIENCE, drain(rest, head_start)));
         }
     }
 }
 
-async fn drain(rest: Body) {
+async fn drain(rest: Body, head_start: Duration) {
+    tokio::time::sleep(head_start).await;
     let mut rest = rest.into_data_stream();
-    let mut length = 0;
-    while let Some(Ok(chunk)) = rest.next().await {
-        length += chunk.len();
-        if length > MAX_REST_BYTES {
-            return;
-        }
-    }
+    while let Ok(Some(Ok(_))) = tokio::time::timeout(SILENCE, rest.next()).await {}
 }

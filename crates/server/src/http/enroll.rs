@@ -4,9 +4,10 @@ use std::net::SocketAddr;
 
 use axum::Json;
 use axum::extract::{ConnectInfo, State};
-use http::StatusCode;
+use axum::response::NoContent;
 use task_proto::api::{
-    CreateEnrollmentToken, EnrollRequest, EnrollResponse, EnrollmentToken, EnrollmentTokenList, PendingRobotList,
+    CreateEnrollmentToken, EnrollRequest, EnrollResponse, EnrollmentToken, EnrollmentTokenList, FeedKind,
+    PendingRobotList,
 };
 use task_proto::{RobotName, TokenId};
 
@@ -15,73 +16,88 @@ use super::auth::Caller;
 use super::broker::endpoint_of;
 use super::error::ApiError;
 use super::extract::{JsonBody, PathParam, TolerantJson};
+use super::openapi::Created;
 use super::robots::find;
+use crate::happening::Happening;
 use crate::person::Person;
 
-/// `POST /enroll`: registers the robot that holds the token.
+/// Registers the robot that holds the token.
+#[utoipa::path(post, path = "/api/v1/enroll", tag = "enrolment",
+    responses((status = 409, description = "`mac_known`, `name_taken` or `enrolled_anew`."),
+        (status = 429, description = "Too many robots wait to be approved, or too many tokens from this address were wrong.")))]
 pub(super) async fn enroll(
     State(app): State<App>,
     ConnectInfo(peer): ConnectInfo<SocketAddr>,
     caller: Caller,
     TolerantJson(request): TolerantJson<EnrollRequest>,
-) -> Result<(StatusCode, Json<EnrollResponse>), ApiError> {
+) -> Result<Created<EnrollResponse>, ApiError> {
     let Caller::Enrolment(token) = caller else {
         return Err(ApiError::forbidden("an enrolment token is needed"));
     };
     let enrolled = app.actions.enroll(&token, &request, Some(peer.ip().to_canonical())).await?;
     let mqtt = endpoint_of(&app, &enrolled.robot_id).await?;
+    let text = format!("registered from {}", peer.ip().to_canonical());
+    app.changes.happened(Happening::Robot(enrolled.robot_id.clone(), FeedKind::RobotEnrolled, text));
     let (token, awaits_approval) = (enrolled.token.reveal(), enrolled.awaits_approval);
     let answer = EnrollResponse { robot_id: enrolled.robot_id, name: enrolled.name, token, mqtt, awaits_approval };
-    Ok((StatusCode::CREATED, Json(answer)))
+    Ok(Created(answer))
 }
 
-/// `POST /enrollment-tokens`: makes a token.
+/// Makes an enrolment token.
+#[utoipa::path(post, path = "/api/v1/enrollment-tokens", tag = "enrolment")]
 pub(super) async fn create_token(
     State(app): State<App>,
     by: Person,
     JsonBody(order): JsonBody<CreateEnrollmentToken>,
-) -> Result<(StatusCode, Json<EnrollmentToken>), ApiError> {
-    Ok((StatusCode::CREATED, Json(app.actions.create_enrollment_token(&by, &order).await?)))
+) -> Result<Created<EnrollmentToken>, ApiError> {
+    Ok(Created(app.actions.create_enrollment_token(&by, &order).await?))
 }
 
-/// `GET /enrollment-tokens`: those that are good for something.
+/// Lists the enrolment tokens that are good for something.
+#[utoipa::path(get, path = "/api/v1/enrollment-tokens", tag = "enrolment")]
 pub(super) async fn tokens(State(app): State<App>) -> Result<Json<EnrollmentTokenList>, ApiError> {
     Ok(Json(app.actions.enrollment_tokens().await?))
 }
 
-/// `DELETE /enrollment-tokens/{enrollment}`: revokes one.
+/// Revokes an enrolment token.
+#[utoipa::path(delete, path = "/api/v1/enrollment-tokens/{enrollment}", tag = "enrolment")]
 pub(super) async fn revoke_token(
     State(app): State<App>,
     by: Person,
     PathParam(token): PathParam<TokenId>,
-) -> Result<StatusCode, ApiError> {
+) -> Result<NoContent, ApiError> {
     app.actions.revoke_enrollment_token(&by, &token).await?;
-    Ok(StatusCode::NO_CONTENT)
+    Ok(NoContent)
 }
 
-/// `GET /pending-robots`: those that wait to be approved.
+/// Lists the robots that wait to be approved.
+#[utoipa::path(get, path = "/api/v1/pending-robots", tag = "enrolment")]
 pub(super) async fn pending(State(app): State<App>) -> Result<Json<PendingRobotList>, ApiError> {
     Ok(Json(app.actions.pending_robots().await?))
 }
 
-/// `POST /robots/{robot}/approve`: lets one in.
+/// Lets a robot in that waits.
+#[utoipa::path(post, path = "/api/v1/robots/{robot}/approve", tag = "enrolment",
+    responses((status = 409, description = "`not_pending`: it does not wait.")))]
 pub(super) async fn approve(
     State(app): State<App>,
     by: Person,
     PathParam(robot): PathParam<RobotName>,
-) -> Result<StatusCode, ApiError> {
+) -> Result<NoContent, ApiError> {
     let id = find(&app, &by, &robot).await?;
     app.actions.approve_robot(&by, &id).await?;
-    Ok(StatusCode::NO_CONTENT)
+    Ok(NoContent)
 }
 
-/// `POST /robots/{robot}/reject`: turns one away that waits.
+/// Turns a robot away that waits.
+#[utoipa::path(post, path = "/api/v1/robots/{robot}/reject", tag = "enrolment",
+    responses((status = 409, description = "`not_pending`: it does not wait.")))]
 pub(super) async fn reject(
     State(app): State<App>,
     by: Person,
     PathParam(robot): PathParam<RobotName>,
-) -> Result<StatusCode, ApiError> {
+) -> Result<NoContent, ApiError> {
     let id = find(&app, &by, &robot).await?;
     app.actions.reject_robot(&by, &id).await?;
-    Ok(StatusCode::NO_CONTENT)
+    Ok(NoContent)
 }

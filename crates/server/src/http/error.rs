@@ -8,6 +8,7 @@ use serde_json::json;
 use task_proto::api;
 
 use crate::actions::ActionError;
+use crate::blobs::BlobError;
 use crate::person::Person;
 use crate::report_writer::ReportError;
 use crate::store::StoreError;
@@ -130,6 +131,12 @@ impl IntoResponse for ApiError {
     }
 }
 
+impl From<BlobError> for ApiError {
+    fn from(error: BlobError) -> Self {
+        Self::internal(&error)
+    }
+}
+
 impl From<StoreError> for ApiError {
     fn from(error: StoreError) -> Self {
         Self::internal(&error)
@@ -152,6 +159,7 @@ impl From<ActionError> for ApiError {
             }
             ActionError::RobotNotFound(_)
             | ActionError::DeploymentNotFound(_)
+            | ActionError::PackageNotFound(..)
             | ActionError::UserNotFound(_)
             | ActionError::TokenNotFound(_)
             | ActionError::EnrolmentNotFound(_) => StatusCode::NOT_FOUND,
@@ -163,6 +171,8 @@ impl From<ActionError> for ApiError {
             | ActionError::EnrolledAnew(_)
             | ActionError::NotPending(_)
             | ActionError::DeploymentCancelled(_)
+            | ActionError::NothingToRetry(_)
+            | ActionError::NothingToRollBack(_)
             | ActionError::UserExists(_)
             | ActionError::OfProvider(_)
             | ActionError::LastAdministrator(_)

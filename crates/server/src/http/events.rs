@@ -24,8 +24,10 @@ use super::views::{complete_robot, narrowed};
 use crate::changes::{Change, Changes};
 use crate::clock::Clock;
 use crate::conduct::Conduct;
+use crate::feed::{Feed, FeedAudience};
 use crate::person::{Person, Scope};
 use crate::presence::Presence;
+use crate::robot_vitals::RobotVitals;
 use crate::store::{KnownRobot, Store, StoreError, TokenHolder};
 
 /// For how long notices are gathered: a robot that reports ten times in it is sent once.
@@ -107,6 +109,10 @@ pub struct EventSource {
     pub presence: Arc<Presence>,
     /// How robots behave.
     pub conduct: Arc<Conduct>,
+    /// How their machines do.
+    pub vitals: RobotVitals,
+    /// What happened last.
+    pub feed: Feed,
     /// The time.
     pub clock: Clock,
 }
@@ -181,18 +187,30 @@ impl EventFeed {
                 Change::Scopes => self.send(&Event::Missed, Audience::Limited),
                 Change::Package(name) => self.send(&Event::Package { name }, Audience::Everybody),
                 Change::Deployment(id) => drop(deployments.insert(id)),
+                Change::Feed(number) => self.send_entry(source, number),
             }
         }
         self.send_deployments(source, deployments).await?;
         let now_ms = source.clock.now_ms();
         let robots: Vec<RobotId> = robots.into_iter().collect();
         for mut robot in source.store.robots_among(&robots).await? {
-            complete_robot(&mut robot, &source.presence, &source.conduct, now_ms);
+            complete_robot(&mut robot, &source.presence, &source.conduct, &source.vitals, now_ms);
             let RobotView { id, name, mac, labels, .. } = &robot;
             let known = KnownRobot { id: id.clone(), name: name.clone(), mac: *mac, labels: labels.clone() };
             self.send(&Event::Robot { robot: Box::new(robot) }, Audience::Robot(Arc::new(known)));
         }
         Ok(())
+    }
+
+    /// Sends an entry of the feed, if it is still there, to those it is for.
+    fn send_entry(&self, source: &EventSource, number: u64) {
+        let Some((entry, audience)) = source.feed.get(number) else { return };
+        let event = Event::Feed { entry };
+        match audience {
+            FeedAudience::Everybody => self.send(&event, Audience::Everybody),
+            FeedAudience::Robot(robot) => self.send(&event, Audience::Robot(robot)),
+            FeedAudience::Unlimited => self.send(&event, Audience::Scope(Scope::everything())),
+        }
     }
 
     /// Whoever has a limited scope gets their part of a deployment; it is read and written once for all with that scope.
@@ -211,16 +229,17 @@ impl EventFeed {
             scopes.push((scope, robots));
         }
         for id in deployments {
-            let whole = source.store.deployment_summary(&id).await?;
-            let Some(deployment) = whole.map(Box::new) else { continue };
+            let summary = source.store.deployment_summary(&id).await?;
+            let Some(deployment) = summary.map(Box::new) else { continue };
+            let selector = deployment.selector.clone();
             self.send(&Event::Deployment { deployment }, Audience::Scope(Scope::everything()));
             if scopes.is_empty() {
                 continue;
             }
-            let Some(whole) = source.store.deployment(&id).await? else { continue };
+            let Some(whole) = source.store.deployment(&id, false).await? else { continue };
             for (scope, robots) in &scopes {
                 if let Some(part) = narrowed(whole.clone(), robots) {
-                    let deployment = Box::new(DeploymentView { assignments: None, ..part });
+                    let deployment = Box::new(DeploymentView { assignments: None, selector: selector.clone(), ..part });
                     self.send(&Event::Deployment { deployment }, Audience::Scope(scope.clone()));
                 }
             }
@@ -249,11 +268,16 @@ fn name_of(event: &Event) -> &'static str {
         Event::RobotRemoved { .. } => "robot_removed",
         Event::Deployment { .. } => "deployment",
         Event::Package { .. } => "package",
+        Event::Feed { .. } => "feed",
         Event::Missed => "missed",
     }
 }
 
-/// `GET /events`: what changes from now on, until the server stops or the listener's session ends.
+/// Streams what changes from now on, until the server stops or the session ends.
+#[utoipa::path(get, path = "/api/v1/events", tag = "events",
+    responses((status = 200, description = "Server-sent events, each of which has an `Event` as its data.",
+            content((Event = "text/event-stream"))),
+        (status = 503, description = "Too many listen already.")))]
 pub(super) async fn stream(
     State(app): State<App>,
     by: Person,

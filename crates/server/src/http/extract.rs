@@ -1,7 +1,6 @@
 //! What handlers take out of a request: JSON bodies, path and query parameters, the idempotency key. Whatever does not
 //! parse is refused here in the API's error shape, naming the field.
 
-use std::collections::BTreeMap;
 use std::fmt::Display;
 use std::str::FromStr;
 
@@ -11,6 +10,7 @@ use http::request::Parts;
 use http::{HeaderValue, StatusCode, header};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+use serde_json::Value;
 
 use super::error::ApiError;
 use crate::actions::IdempotencyKey;
@@ -69,15 +69,28 @@ pub fn parse_json<T: DeserializeOwned>(body: &[u8]) -> Result<T, ApiError> {
 
 /// A field is known if the value, written out again, has it.
 fn refuse_unknown_fields<T: Serialize>(body: &[u8], value: &T) -> Result<(), ApiError> {
-    let given: BTreeMap<String, serde::de::IgnoredAny> = parse_json(body)?;
+    let given: serde_json::Map<String, Value> = parse_json(body)?;
     let known = serde_json::to_value(value).map_err(|error| ApiError::internal(&error))?;
-    match given.keys().find(|key| known.get(key.as_str()).is_none()) {
+    match unknown_field(&given, &known) {
         Some(unknown) => {
             let shown: String = unknown.chars().take(80).collect();
             Err(ApiError::invalid(format!("{shown}: there is no such field")))
         }
         None => Ok(()),
     }
+}
+
+/// The path of a field that is not known, in the body or in what is in it. Inside, null and {} are the same as nothing, which
+/// is not written out again.
+fn unknown_field(given: &serde_json::Map<String, Value>, known: &Value) -> Option<String> {
+    given.iter().find_map(|(key, value)| {
+        let Some(known) = known.get(key) else { return Some(key.clone()) };
+        let says_something =
+            |(_, value): &(&String, &Value)| !value.is_null() && value.as_object().is_none_or(|o| !o.is_empty());
+        let said = value.as_object()?.iter().filter(says_something);
+        let given = said.map(|(key, value)| (key.clone(), value.clone())).collect();
+        Some(format!("{key}.{}", unknown_field(&given, known)?))
+    })
 }
 
 /// The path's one parameter, parsed. What does not parse names nothing that exists.
@@ -94,6 +107,29 @@ impl<S: Send + Sync, T: FromStr<Err: Display>> FromRequestParts<S> for PathParam
     }
 }
 
+/// The path's two parameters, likewise.
+pub struct PathParams<A, B>(pub A, pub B);
+
+impl<S, A, B> FromRequestParts<S> for PathParams<A, B>
+where
+    S: Send + Sync,
+    A: FromStr<Err: Display>,
+    B: FromStr<Err: Display>,
+{
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, ApiError> {
+        let missing = || ApiError::not_found("there is nothing at this path");
+        let params = RawPathParams::from_request_parts(parts, state).await.map_err(|_| missing())?;
+        let mut texts = params.iter().map(|(_, text)| text);
+        let first = texts.next().ok_or_else(missing)?;
+        let first = first.parse().map_err(|error: A::Err| ApiError::not_found(error.to_string()))?;
+        let second = texts.next().ok_or_else(missing)?;
+        let second = second.parse().map_err(|error: B::Err| ApiError::not_found(error.to_string()))?;
+        Ok(Self(first, second))
+    }
+}
+
 /// The query's parameters. Only the names in the handler's struct are known; others are refused.
 pub struct QueryParams<T>(pub T);
 
@@ -104,6 +140,17 @@ impl<S: Send + Sync, T: DeserializeOwned> FromRequestParts<S> for QueryParams<T>
         axum::extract::Query::<T>::try_from_uri(&parts.uri)
             .map(|query| Self(query.0))
             .map_err(|rejection| ApiError::invalid(format!("the query: {}", rejection.body_text())))
+    }
+}
+
+/// The most entries a page may have.
+const MOST_ON_A_PAGE: u32 = 1_000;
+
+/// How many entries a page shall have.
+pub fn page_limit(limit: Option<u32>) -> Result<Option<u32>, ApiError> {
+    match limit {
+        None | Some(1..=MOST_ON_A_PAGE) => Ok(limit),
+        Some(other) => Err(ApiError::invalid(format!("limit: expected 1 to {MOST_ON_A_PAGE}, not {other}"))),
     }
 }
 

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use axum::Json;
 use axum::extract::State;
+use axum::response::{IntoResponse as _, Response};
 use http::StatusCode;
 use serde_json::{Value, json};
 use task_proto::api::ServerInfo;
@@ -15,13 +16,19 @@ use crate::broker::Health;
 /// How long one part may take to answer.
 const PATIENCE: Duration = Duration::from_secs(5);
 
-/// `GET /healthz`: the process answers.
+/// Says that the process answers.
+#[utoipa::path(get, path = "/healthz", tag = "server",
+    responses((status = 200, description = "It does.", body = Value, example = json!({ "status": "ok" }))))]
 pub(super) async fn healthz() -> Json<Value> {
     Json(json!({ "status": "ok" }))
 }
 
-/// `GET /readyz`: database, broker and disk answer; else 503, naming which does not.
-pub(super) async fn readyz(State(app): State<App>) -> (StatusCode, Json<Value>) {
+/// Says whether database, broker and disk answer, and names which do not.
+#[utoipa::path(get, path = "/readyz", tag = "server",
+    responses((status = 200, description = "All of them do.", body = Value,
+            example = json!({ "status": "ready", "database": "ok", "broker": "ok", "disk": "ok" })),
+        (status = 503, description = "Some do not, or the server stops.", body = Value)))]
+pub(super) async fn readyz(State(app): State<App>) -> Response {
     let (database, disk) = tokio::join!(
         tokio::time::timeout(PATIENCE, app.store.ping()),
         tokio::time::timeout(PATIENCE, is_writable(&app.data)),
@@ -46,7 +53,7 @@ pub(super) async fn readyz(State(app): State<App>) -> (StatusCode, Json<Value>) 
     for (part, problem) in parts {
         body[part] = problem.unwrap_or_else(|| "ok".to_owned()).into();
     }
-    (if is_ready { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE }, Json(body))
+    (if is_ready { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE }, Json(body)).into_response()
 }
 
 /// Writes one small file of a fixed name, so that a full or read-only disk is noticed before a robot's report is lost.
@@ -55,7 +62,8 @@ async fn is_writable(data: &Path) -> std::io::Result<()> {
     tokio::fs::write(&probe, b"ready\n").await
 }
 
-/// `GET /server`: what it is, where MQTT listens and what went over it.
+/// Says what the server is, where MQTT listens and what went over it.
+#[utoipa::path(get, path = "/api/v1/server", tag = "server")]
 pub(super) async fn server(State(app): State<App>) -> Json<ServerInfo> {
     Json(ServerInfo {
         version: env!("CARGO_PKG_VERSION").to_owned(),

@@ -36,7 +36,12 @@ const RETRY: Duration = Duration::from_secs(3);
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
 const DEFAULT_LINES: u64 = 500;
 
-/// `GET /robots/{robot}/logs`: the newest lines, or with `follow` those that come.
+/// Gives a robot's newest log lines, or with `follow` streams those that come.
+#[utoipa::path(get, path = "/api/v1/robots/{robot}/logs", tag = "robots",
+    responses((status = 200, description = "The lines; or server-sent events, each of which has a `LogEvent` as its data.",
+            content((LogsView = "application/json"), (LogEvent = "text/event-stream"))),
+        (status = 409, description = "`no_such_task`: the robot has no such task."),
+        (status = 503, description = "Too many listen already.")))]
 pub(super) async fn show(
     State(app): State<App>,
     by: Person,

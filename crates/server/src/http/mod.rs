@@ -5,6 +5,7 @@ mod ask;
 pub mod attempts;
 pub mod auth;
 mod broker;
+mod bulk;
 mod conduct;
 mod deployments;
 pub mod drain;
@@ -12,22 +13,28 @@ mod enroll;
 pub mod error;
 pub mod events;
 pub mod extract;
+mod feed;
 mod health;
+mod history;
 pub mod listener;
 mod logs;
 mod mqtt;
 pub mod oci;
 mod oidc;
+mod openapi;
 mod outputs;
 mod packages;
 mod people;
 mod proxy;
 mod robots;
 pub mod session;
+pub mod status;
 mod tasks;
 pub mod traffic;
+pub mod upload;
 mod views;
 pub mod visits;
+mod vitals;
 
 use std::net::IpAddr;
 use std::ops::Deref;
@@ -45,6 +52,7 @@ use http::{HeaderValue, Method, StatusCode, header};
 use task_proto::CaPin;
 use task_proto::envelope::PublicKey;
 use task_proto::person::Permission;
+use task_proto::selector::MAX_SELECTOR_BYTES;
 use tokio_util::sync::CancellationToken;
 
 use crate::actions::Actions;
@@ -53,17 +61,21 @@ use crate::broker::Broker;
 use crate::changes::Changes;
 use crate::clock::Clock;
 use crate::conduct::Conduct;
+use crate::feed::Feed;
 use crate::mqtt_access::MqttAccess;
 use crate::oidc::Provider;
 use crate::presence::Presence;
 use crate::report_writer::ReportWriter;
 use crate::requests::Requests;
 use crate::robot_logs::RobotLogs;
+use crate::robot_vitals::RobotVitals;
+use crate::server_facts::ServerFacts;
 use crate::store::Store;
 use crate::transfers::Transfers;
 use crate::web;
 use auth::{Access, Gate, guard};
 use error::ApiError;
+use openapi::{Describe as _, Draft};
 
 /// What handlers work with. Clones are the same: a request makes several on its way.
 #[derive(Clone)]
@@ -89,10 +101,14 @@ pub struct AppParts {
     pub requests: Requests,
     /// What robots said last, and who follows them.
     pub logs: RobotLogs,
+    /// How their machines do.
+    pub vitals: RobotVitals,
     /// The packages' bytes.
     pub blobs: Blobs,
     /// Whose turn it is to pull them.
     pub transfers: Transfers,
+    /// Where packages are packed that come as directories.
+    pub uploads: upload::UploadSpace,
     /// Who is signed in at the page.
     pub sessions: Arc<session::Sessions>,
     /// Robots' requests that are under way.
@@ -103,6 +119,12 @@ pub struct AppParts {
     pub provider: Option<Arc<Provider>>,
     /// Failed authentications.
     pub attempts: Arc<attempts::FailedAttempts>,
+    /// What happened last.
+    pub feed: Feed,
+    /// What holds for as long as the server runs.
+    pub facts: Arc<ServerFacts>,
+    /// What was found out about it last.
+    pub slow_figures: Arc<status::SlowFigures>,
     /// The event stream's source.
     pub events: events::EventFeed,
     /// The key that verifies desired states.
@@ -150,8 +172,8 @@ impl FromRef<App> for oci::Registry {
 
 /// The largest body of most requests.
 const SMALL_BODY_BYTES: usize = 64 * 1024;
-/// The largest selector is 64 KiB; an order has one.
-const ORDER_BODY_BYTES: usize = 128 * 1024;
+/// An order has one selector.
+const ORDER_BODY_BYTES: usize = MAX_SELECTOR_BYTES + SMALL_BODY_BYTES;
 /// The largest report.
 pub const REPORT_BODY_BYTES: usize = 1024 * 1024;
 /// How long a request may take, from its head to its answer.
@@ -168,32 +190,38 @@ pub struct Route {
     body_bytes: usize,
     deadline: Option<Duration>,
     handler: MethodRouter<App>,
+    describe: fn(&mut Draft),
 }
 
 impl Route {
     /// A route of the API, with a small body and the common deadline.
     #[expect(clippy::expect_used, reason = "the table is fixed, and a test builds it")]
-    pub fn new<H, T>(method: Method, path: &'static str, access: Access, handler: H) -> Self
+    fn new<H, T>(method: Method, path: &'static str, access: Access, handler: H, describe: fn(&mut Draft)) -> Self
     where
         H: Handler<T, App>,
         T: 'static,
     {
         let filter = MethodFilter::try_from(method.clone()).expect("a method that axum routes");
         let (body_bytes, deadline) = (SMALL_BODY_BYTES, Some(DEADLINE));
-        Self { method: Some(method), path, access, body_bytes, deadline, handler: on(filter, handler) }
+        Self { method: Some(method), path, access, body_bytes, deadline, handler: on(filter, handler), describe }
     }
 
     /// A route for every method, whose handler streams and bounds itself.
-    pub fn any<H, T>(path: &'static str, access: Access, handler: H) -> Self
+    fn any<H, T>(path: &'static str, access: Access, handler: H, describe: fn(&mut Draft)) -> Self
     where
         H: Handler<T, App>,
         T: 'static,
     {
-        Self { method: None, path, access, body_bytes: usize::MAX, deadline: None, handler: any(handler) }
+        Self { method: None, path, access, body_bytes: usize::MAX, deadline: None, handler: any(handler), describe }
     }
 
     fn body_bytes(self, body_bytes: usize) -> Self {
         Self { body_bytes, ..self }
+    }
+
+    /// With a deadline of its own.
+    fn within(self, deadline: Duration) -> Self {
+        Self { deadline: Some(deadline), ..self }
     }
 
     /// Without a deadline, for an answer that goes on.
@@ -202,73 +230,114 @@ impl Route {
     }
 }
 
+/// A route and its description, which is the handler's: its attribute's and its types'.
+macro_rules! route {
+    (any $path:literal, $access:expr, $module:ident::$handler:ident) => {
+        Route::any($path, $access, $module::$handler, route!(describe $module::$handler))
+    };
+    (describe $module:ident::$handler:ident) => { pastey::paste! {
+        |draft| {
+            draft.begin::<$module::[<__path_ $handler>]>(stringify!([<$module _ $handler>]));
+            $module::$handler.describe(draft);
+        }
+    } };
+    ($method:ident $path:literal, $access:expr, $module:ident::$handler:ident) => {
+        Route::new(Method::$method, $path, $access, $module::$handler, route!(describe $module::$handler))
+    };
+}
+
 /// Every route there is, with who may call it. Nothing is served that is not here.
 pub fn routes() -> Vec<Route> {
-    use Access::{Anyone, Enrolment, OwnRobot, Person, PersonOrRobot};
-    use Permission::{Administer, Maintain, Operate, Read};
-    let (get, post, put) = (Method::GET, Method::POST, Method::PUT);
-    let (patch, delete) = (Method::PATCH, Method::DELETE);
+    use Access::{Anyone, Enrolment, OwnRobot, Person};
+    use Permission::{Administer, Maintain, Read};
+    let mut routes = vec![
+        route!(GET "/healthz", Anyone, health::healthz),
+        route!(GET "/readyz", Anyone, health::readyz),
+        route!(GET "/api/v1/server", Person(Read), health::server),
+        route!(GET "/api/v1/server/status", Person(Read), status::status),
+        route!(GET "/api/v1/server/sessions", Person(Read), status::sessions),
+        route!(GET "/api/v1/server/rules", Person(Read), status::rules),
+        route!(GET "/api/v1/broker", Person(Administer), broker::files),
+        route!(GET "/api/v1/session", Anyone, session::show),
+        route!(POST "/api/v1/session", Anyone, session::sign_in),
+        route!(DELETE "/api/v1/session", Person(Read), session::sign_out),
+        route!(GET "/api/v1/oidc/sign-in", Anyone, oidc::begin),
+        route!(GET "/api/v1/oidc/callback", Anyone, oidc::finish),
+        route!(POST "/api/v1/login", Anyone, people::log_in),
+        route!(GET "/api/v1/me", Person(Read), people::me),
+        route!(PUT "/api/v1/password", Person(Read), people::change_password),
+        route!(GET "/api/v1/users", Person(Administer), people::users),
+        route!(POST "/api/v1/users", Person(Administer), people::add_user),
+        route!(PATCH "/api/v1/users/{user}", Person(Administer), people::edit_user),
+        route!(DELETE "/api/v1/users/{user}", Person(Administer), people::remove_user),
+        route!(PUT "/api/v1/users/{user}/password", Person(Administer), people::set_password),
+        route!(GET "/api/v1/tokens", Person(Read), people::tokens),
+        route!(POST "/api/v1/tokens", Person(Read), people::create_token),
+        route!(DELETE "/api/v1/tokens/{token}", Person(Read), people::revoke_token),
+        route!(GET "/api/v1/audit", Person(Administer), people::audit),
+        route!(POST "/api/v1/enroll", Enrolment, enroll::enroll),
+        route!(GET "/api/v1/enrollment-tokens", Person(Administer), enroll::tokens),
+        route!(POST "/api/v1/enrollment-tokens", Person(Administer), enroll::create_token),
+        route!(DELETE "/api/v1/enrollment-tokens/{enrollment}", Person(Administer), enroll::revoke_token),
+        route!(GET "/api/v1/robots", Person(Read), robots::list),
+        route!(GET "/api/v1/robots/{robot}", Person(Read), robots::show),
+        route!(PATCH "/api/v1/robots/{robot}", Person(Maintain), robots::edit),
+        route!(DELETE "/api/v1/robots/{robot}", Person(Maintain), robots::remove),
+        route!(POST "/api/v1/bulk/labels", Person(Maintain), bulk::labels).body_bytes(ORDER_BODY_BYTES),
+        route!(POST "/api/v1/bulk/remove", Person(Maintain), bulk::remove).body_bytes(ORDER_BODY_BYTES),
+        route!(GET "/api/v1/pending-robots", Person(Administer), enroll::pending),
+        route!(POST "/api/v1/robots/{robot}/approve", Person(Administer), enroll::approve),
+        route!(POST "/api/v1/robots/{robot}/reject", Person(Administer), enroll::reject),
+        route!(POST "/api/v1/robots/{robot}/revoke", Person(Maintain), robots::revoke),
+        route!(GET "/api/v1/robots/{robot}/desired", OwnRobot, robots::desired),
+        route!(GET "/api/v1/robots/{robot}/mqtt", OwnRobot, broker::endpoint),
+        route!(POST "/api/v1/robots/{robot}/token", OwnRobot, robots::next_token),
+        route!(POST "/api/v1/robots/{robot}/report", OwnRobot, robots::report).body_bytes(REPORT_BODY_BYTES),
+        route!(POST "/api/v1/robots/{robot}/telemetry", OwnRobot, vitals::telemetry),
+        route!(GET "/api/v1/robots/{robot}/tasks", Person(Read), history::tasks),
+        route!(GET "/api/v1/robots/{robot}/vitals", Person(Read), vitals::show),
+        route!(POST "/api/v1/robots/{robot}/ask", Person(Read), ask::ask),
+        route!(GET "/api/v1/robots/{robot}/logs", Person(Read), logs::show).streaming(),
+    ];
+    routes.extend(routes_of_work());
+    routes
+}
+
+/// What robots are to do, and what others than people and the page ask for.
+fn routes_of_work() -> Vec<Route> {
+    use Access::{Anyone, Person, PersonOrRobot};
+    use Permission::{Operate, Publish, Read};
     vec![
-        Route::new(get.clone(), "/healthz", Anyone, health::healthz),
-        Route::new(get.clone(), "/readyz", Anyone, health::readyz),
-        Route::new(get.clone(), "/api/v1/server", Person(Read), health::server),
-        Route::new(get.clone(), "/api/v1/broker", Person(Administer), broker::files),
-        Route::new(get.clone(), "/api/v1/session", Anyone, session::show),
-        Route::new(post.clone(), "/api/v1/session", Anyone, session::sign_in),
-        Route::new(delete.clone(), "/api/v1/session", Person(Read), session::sign_out),
-        Route::new(get.clone(), "/api/v1/oidc/sign-in", Anyone, oidc::begin),
-        Route::new(get.clone(), "/api/v1/oidc/callback", Anyone, oidc::finish),
-        Route::new(post.clone(), "/api/v1/login", Anyone, people::log_in),
-        Route::new(get.clone(), "/api/v1/me", Person(Read), people::me),
-        Route::new(put.clone(), "/api/v1/password", Person(Read), people::change_password),
-        Route::new(get.clone(), "/api/v1/users", Person(Administer), people::users),
-        Route::new(post.clone(), "/api/v1/users", Person(Administer), people::add_user),
-        Route::new(patch.clone(), "/api/v1/users/{user}", Person(Administer), people::edit_user),
-        Route::new(delete.clone(), "/api/v1/users/{user}", Person(Administer), people::remove_user),
-        Route::new(put, "/api/v1/users/{user}/password", Person(Administer), people::set_password),
-        Route::new(get.clone(), "/api/v1/tokens", Person(Read), people::tokens),
-        Route::new(post.clone(), "/api/v1/tokens", Person(Read), people::create_token),
-        Route::new(delete.clone(), "/api/v1/tokens/{token}", Person(Read), people::revoke_token),
-        Route::new(get.clone(), "/api/v1/audit", Person(Administer), people::audit),
-        Route::new(post.clone(), "/api/v1/enroll", Enrolment, enroll::enroll),
-        Route::new(get.clone(), "/api/v1/enrollment-tokens", Person(Administer), enroll::tokens),
-        Route::new(post.clone(), "/api/v1/enrollment-tokens", Person(Administer), enroll::create_token),
-        Route::new(delete.clone(), "/api/v1/enrollment-tokens/{enrollment}", Person(Administer), enroll::revoke_token),
-        Route::new(get.clone(), "/api/v1/robots", Person(Read), robots::list),
-        Route::new(get.clone(), "/api/v1/robots/{robot}", Person(Read), robots::show),
-        Route::new(patch, "/api/v1/robots/{robot}", Person(Maintain), robots::edit),
-        Route::new(delete, "/api/v1/robots/{robot}", Person(Maintain), robots::remove),
-        Route::new(get.clone(), "/api/v1/pending-robots", Person(Administer), enroll::pending),
-        Route::new(post.clone(), "/api/v1/robots/{robot}/approve", Person(Administer), enroll::approve),
-        Route::new(post.clone(), "/api/v1/robots/{robot}/reject", Person(Administer), enroll::reject),
-        Route::new(post.clone(), "/api/v1/robots/{robot}/revoke", Person(Maintain), robots::revoke),
-        Route::new(get.clone(), "/api/v1/robots/{robot}/desired", OwnRobot, robots::desired),
-        Route::new(get.clone(), "/api/v1/robots/{robot}/mqtt", OwnRobot, broker::endpoint),
-        Route::new(post.clone(), "/api/v1/robots/{robot}/token", OwnRobot, robots::next_token),
-        Route::new(post.clone(), "/api/v1/robots/{robot}/report", OwnRobot, robots::report)
-            .body_bytes(REPORT_BODY_BYTES),
-        Route::new(post.clone(), "/api/v1/robots/{robot}/ask", Person(Read), ask::ask),
-        Route::new(get.clone(), "/api/v1/robots/{robot}/logs", Person(Read), logs::show).streaming(),
-        Route::new(get.clone(), "/api/v1/packages", Person(Read), packages::list),
-        Route::new(get.clone(), "/api/v1/outputs", Person(Read), outputs::list),
-        Route::new(get.clone(), "/api/v1/deployments", Person(Read), deployments::list),
-        Route::new(post.clone(), "/api/v1/deployments", Person(Operate), deployments::create)
+        route!(GET "/api/v1/packages", Person(Read), packages::list),
+        route!(POST "/api/v1/packages", Person(Publish), upload::package).streaming(),
+        route!(GET "/api/v1/packages/{package}", Person(Read), packages::show),
+        route!(GET "/api/v1/packages/{package}/diff", Person(Read), packages::diff).within(packages::READING),
+        route!(GET "/api/v1/packages/{package}/{version}/files", Person(Read), packages::files)
+            .within(packages::READING),
+        route!(DELETE "/api/v1/packages/{package}/{version}", Person(Publish), packages::remove),
+        route!(GET "/api/v1/outputs", Person(Read), outputs::list),
+        route!(GET "/api/v1/deployments", Person(Read), deployments::list),
+        route!(POST "/api/v1/deployments", Person(Operate), deployments::create).body_bytes(ORDER_BODY_BYTES),
+        route!(GET "/api/v1/deployments/{deployment}", Person(Read), deployments::show),
+        route!(POST "/api/v1/deployments/{deployment}/cancel", Person(Operate), deployments::cancel),
+        route!(POST "/api/v1/deployments/{deployment}/resume", Person(Operate), deployments::resume),
+        route!(POST "/api/v1/deployments/{deployment}/retry", Person(Operate), deployments::retry)
             .body_bytes(ORDER_BODY_BYTES),
-        Route::new(get.clone(), "/api/v1/deployments/{deployment}", Person(Read), deployments::show),
-        Route::new(post.clone(), "/api/v1/deployments/{deployment}/cancel", Person(Operate), deployments::cancel),
-        Route::new(post.clone(), "/api/v1/deployments/{deployment}/resume", Person(Operate), deployments::resume),
-        Route::new(post.clone(), "/api/v1/tasks/{task}/start", Person(Operate), tasks::start)
-            .body_bytes(ORDER_BODY_BYTES),
-        Route::new(post.clone(), "/api/v1/tasks/{task}/stop", Person(Operate), tasks::stop)
-            .body_bytes(ORDER_BODY_BYTES),
-        Route::new(post, "/api/v1/tasks/{task}/remove", Person(Operate), tasks::remove).body_bytes(ORDER_BODY_BYTES),
-        Route::new(get.clone(), "/api/v1/events", Person(Read), events::stream).streaming(),
-        Route::new(get.clone(), "/mqtt", Anyone, mqtt::upgrade),
-        Route::new(get.clone(), "/", Anyone, web::index),
-        Route::new(get, "/ui/{*file}", Anyone, web::file),
-        Route::any("/v2", PersonOrRobot, oci::version),
-        Route::any("/v2/", PersonOrRobot, oci::version),
-        Route::any("/v2/{*path}", PersonOrRobot, oci::dispatch),
+        route!(POST "/api/v1/tasks/{task}/start", Person(Operate), tasks::start).body_bytes(ORDER_BODY_BYTES),
+        route!(POST "/api/v1/tasks/{task}/restart", Person(Operate), tasks::restart).body_bytes(ORDER_BODY_BYTES),
+        route!(POST "/api/v1/tasks/{task}/rollback", Person(Operate), tasks::rollback).body_bytes(ORDER_BODY_BYTES),
+        route!(POST "/api/v1/tasks/{task}/stop", Person(Operate), tasks::stop).body_bytes(ORDER_BODY_BYTES),
+        route!(POST "/api/v1/tasks/{task}/remove", Person(Operate), tasks::remove).body_bytes(ORDER_BODY_BYTES),
+        route!(GET "/api/v1/feed", Person(Read), feed::feed),
+        route!(GET "/api/v1/events", Person(Read), events::stream).streaming(),
+        route!(GET "/api/openapi.json", Anyone, openapi::show),
+        route!(GET "/api/docs", Anyone, web::docs),
+        route!(GET "/mqtt", Anyone, mqtt::upgrade),
+        route!(GET "/", Anyone, web::index),
+        route!(GET "/ui/{*file}", Anyone, web::file),
+        route!(any "/v2", PersonOrRobot, oci::version),
+        route!(any "/v2/", PersonOrRobot, oci::version),
+        route!(any "/v2/{*path}", PersonOrRobot, oci::dispatch),
     ]
 }
 

@@ -15,7 +15,11 @@ use super::App;
 use super::error::ApiError;
 use crate::tls::ClientProof;
 
-/// `GET /mqtt`: goes over to MQTT.
+/// Goes over to MQTT in a WebSocket. Who comes in is the broker's affair, as at its own port.
+#[utoipa::path(get, path = "/mqtt", tag = "agent",
+    responses((status = 101, description = "MQTT from here on."),
+        (status = 426, description = "It is no WebSocket handshake for MQTT."),
+        (status = 503, description = "MQTT is served elsewhere, or to as many as there may be.")))]
 pub(super) async fn upgrade(
     State(app): State<App>,
     ConnectInfo(peer): ConnectInfo<SocketAddr>,

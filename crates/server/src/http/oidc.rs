@@ -10,6 +10,7 @@ use http::{HeaderMap, StatusCode, header};
 use serde::Deserialize;
 use task_proto::UserName;
 use task_proto::api::ProviderView;
+use utoipa::IntoParams;
 
 use super::App;
 use super::error::ApiError;
@@ -32,7 +33,10 @@ pub(super) fn view(app: &App) -> Option<ProviderView> {
     Some(ProviderView { title: settings.title.clone(), url })
 }
 
-/// `GET /oidc/sign-in`: sends the browser to the provider.
+/// Sends the browser to the provider.
+#[utoipa::path(get, path = "/api/v1/oidc/sign-in", tag = "session",
+    responses((status = 303, description = "To the provider; or to the page, which says what is wrong."),
+        (status = 404, description = "No provider is configured.")))]
 pub(super) async fn begin(State(app): State<App>) -> Result<Response, ApiError> {
     let provider = configured(&app)?;
     let attempt = Attempt::random();
@@ -43,16 +47,22 @@ pub(super) async fn begin(State(app): State<App>) -> Result<Response, ApiError> 
 }
 
 /// What the provider says by way of the browser. It may say more.
-#[derive(Deserialize)]
+#[derive(Deserialize, IntoParams)]
 pub(super) struct Answered {
+    /// What the provider was sent.
     state: Option<String>,
+    /// To be exchanged for who it is.
     code: Option<String>,
+    /// Why there is no code.
     error: Option<String>,
     /// RFC 9207: who answers.
     iss: Option<String>,
 }
 
-/// `GET /oidc/callback`: the browser comes back.
+/// Takes the browser back from the provider.
+#[utoipa::path(get, path = "/api/v1/oidc/callback", tag = "session",
+    responses((status = 303, description = "To the page, signed in or told why not."),
+        (status = 404, description = "No provider is configured.")))]
 pub(super) async fn finish(
     State(app): State<App>,
     ConnectInfo(peer): ConnectInfo<SocketAddr>,

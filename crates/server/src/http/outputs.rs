@@ -5,6 +5,7 @@ use axum::extract::State;
 use serde::Deserialize;
 use task_proto::api::OutputList;
 use task_proto::{RobotName, TaskName};
+use utoipa::IntoParams;
 
 use super::App;
 use super::error::ApiError;
@@ -13,14 +14,20 @@ use super::robots::find;
 use crate::person::{Person, Scope};
 
 /// The query of `GET /outputs`.
-#[derive(Deserialize)]
+#[derive(Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ListQuery {
+    /// Only of this robot, by id or name.
+    #[param(inline)]
     robot: Option<RobotName>,
+    /// Only of this task.
+    #[param(inline)]
     task: Option<TaskName>,
 }
 
-/// `GET /outputs`: what came back, of one robot or of all.
+/// Lists what came back, of one robot or of all.
+#[utoipa::path(get, path = "/api/v1/outputs", tag = "outputs",
+    responses((status = 404, description = "There is no such robot.")))]
 pub(super) async fn list(
     State(app): State<App>,
     by: Person,

@@ -5,7 +5,7 @@ use std::net::SocketAddr;
 
 use axum::Json;
 use axum::extract::{ConnectInfo, State};
-use http::StatusCode;
+use axum::response::NoContent;
 use serde::Deserialize;
 use task_proto::api::{
     AccessToken, AddUser, AuditPage, AuditQuery, ChangePassword, CreateToken, EditUser, LogIn, Me, SetPassword,
@@ -13,36 +13,44 @@ use task_proto::api::{
 };
 use task_proto::person::Permission;
 use task_proto::{TokenId, UserName};
+use utoipa::IntoParams;
 
 use super::App;
 use super::auth::not_permitted;
 use super::error::ApiError;
 use super::extract::{JsonBody, PathParam, QueryParams};
+use super::openapi::Created;
 use crate::person::Person;
 
-/// `GET /me`: who is asking.
+/// Says who is asking, and what they may.
+#[utoipa::path(get, path = "/api/v1/me", tag = "people")]
 pub(super) async fn me(by: Person) -> Json<Me> {
     let permissions = Permission::ALL.into_iter().filter(|&permission| by.may(permission)).collect();
     let Person { name, roles, scope, token, .. } = by;
     Json(Me { name, roles, permissions, scope: scope.selectors().to_vec(), token })
 }
 
-/// `GET /users`: everybody.
+/// Lists the users.
+#[utoipa::path(get, path = "/api/v1/users", tag = "people")]
 pub(super) async fn users(State(app): State<App>) -> Result<Json<UserList>, ApiError> {
     let users = app.store.users().await?;
     Ok(Json(UserList { users: users.into_iter().map(crate::store::User::view).collect() }))
 }
 
-/// `POST /users`: adds one.
+/// Adds a user.
+#[utoipa::path(post, path = "/api/v1/users", tag = "people",
+    responses((status = 409, description = "`user_exists`: the name is taken.")))]
 pub(super) async fn add_user(
     State(app): State<App>,
     by: Person,
     JsonBody(order): JsonBody<AddUser>,
-) -> Result<(StatusCode, Json<UserView>), ApiError> {
-    Ok((StatusCode::CREATED, Json(app.actions.add_user(&by, &order).await?)))
+) -> Result<Created<UserView>, ApiError> {
+    Ok(Created(app.actions.add_user(&by, &order).await?))
 }
 
-/// `PATCH /users/{user}`: changes what one may.
+/// Changes what a user may do.
+#[utoipa::path(patch, path = "/api/v1/users/{user}", tag = "people",
+    responses((status = 409, description = "`last_administrator`, or `of_provider`: the provider says what they may.")))]
 pub(super) async fn edit_user(
     State(app): State<App>,
     by: Person,
@@ -54,61 +62,73 @@ pub(super) async fn edit_user(
     Ok(Json(view))
 }
 
-/// `DELETE /users/{user}`: removes one.
+/// Removes a user; their tokens and sessions end.
+#[utoipa::path(delete, path = "/api/v1/users/{user}", tag = "people",
+    responses((status = 409, description = "`last_administrator`: somebody has to be able to administer.")))]
 pub(super) async fn remove_user(
     State(app): State<App>,
     by: Person,
     PathParam(user): PathParam<UserName>,
-) -> Result<StatusCode, ApiError> {
+) -> Result<NoContent, ApiError> {
     app.actions.remove_user(&by, &user).await?;
     app.broker.disconnect_person(&user);
-    Ok(StatusCode::NO_CONTENT)
+    Ok(NoContent)
 }
 
-/// `PUT /users/{user}/password`: sets anybody's.
+/// Sets anybody's password. What was signed in with the old one has ended.
+#[utoipa::path(put, path = "/api/v1/users/{user}/password", tag = "people",
+    responses((status = 409, description = "`of_provider`: who signs in by the provider has no password here.")))]
 pub(super) async fn set_password(
     State(app): State<App>,
     by: Person,
     PathParam(user): PathParam<UserName>,
     JsonBody(order): JsonBody<SetPassword>,
-) -> Result<StatusCode, ApiError> {
+) -> Result<NoContent, ApiError> {
     app.actions.set_password(&by, &user, &order.password).await?;
     app.broker.disconnect_person(&user);
-    Ok(StatusCode::NO_CONTENT)
+    Ok(NoContent)
 }
 
-/// `PUT /password`: sets one's own.
+/// Sets one's own password. What was signed in with the old one has ended.
+#[utoipa::path(put, path = "/api/v1/password", tag = "people",
+    responses((status = 409, description = "`of_provider`: who signs in by the provider has no password here."),
+        (status = 429, description = "The old password was wrong too often.")))]
 pub(super) async fn change_password(
     State(app): State<App>,
     by: Person,
     JsonBody(order): JsonBody<ChangePassword>,
-) -> Result<StatusCode, ApiError> {
+) -> Result<NoContent, ApiError> {
     app.actions.change_password(&by, &order).await?;
     app.broker.disconnect_person(&by.name);
-    Ok(StatusCode::NO_CONTENT)
+    Ok(NoContent)
 }
 
-/// `POST /login`: exchanges name and password for a token.
+/// Exchanges name and password for a token.
+#[utoipa::path(post, path = "/api/v1/login", tag = "session",
+    responses((status = 401, description = "Name or password is not right."),
+        (status = 429, description = "Too many attempts failed, of this user or from this address.")))]
 pub(super) async fn log_in(
     State(app): State<App>,
     ConnectInfo(peer): ConnectInfo<SocketAddr>,
     JsonBody(order): JsonBody<LogIn>,
-) -> Result<(StatusCode, Json<AccessToken>), ApiError> {
+) -> Result<Created<AccessToken>, ApiError> {
     let signed_in = app.actions.sign_in(&order, TokenOrigin::Login, peer.ip().to_canonical()).await?;
     let id = signed_in.token.id().parse().map_err(|error| ApiError::internal(&error))?;
     let (token, expires_at_ms) = (signed_in.token.reveal(), signed_in.expires_at_ms);
-    Ok((StatusCode::CREATED, Json(AccessToken { id, token, user: signed_in.user, expires_at_ms })))
+    Ok(Created(AccessToken { id, token, user: signed_in.user, expires_at_ms }))
 }
 
 /// The query of `GET /tokens`.
-#[derive(Deserialize)]
+#[derive(Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
 pub(super) struct TokensQuery {
+    /// Everybody's, which takes the permission `administer`.
     #[serde(default)]
     all: bool,
 }
 
-/// `GET /tokens`: one's own, or everybody's.
+/// Lists one's own tokens, or everybody's.
+#[utoipa::path(get, path = "/api/v1/tokens", tag = "people")]
 pub(super) async fn tokens(
     State(app): State<App>,
     by: Person,
@@ -120,27 +140,31 @@ pub(super) async fn tokens(
     Ok(Json(app.actions.tokens(&by, query.all).await?))
 }
 
-/// `POST /tokens`: makes one.
+/// Makes a token that may do as much as one may oneself, or less.
+#[utoipa::path(post, path = "/api/v1/tokens", tag = "people",
+    responses((status = 404, description = "There is no such user.")))]
 pub(super) async fn create_token(
     State(app): State<App>,
     by: Person,
     JsonBody(order): JsonBody<CreateToken>,
-) -> Result<(StatusCode, Json<AccessToken>), ApiError> {
-    Ok((StatusCode::CREATED, Json(app.actions.create_token(&by, &order).await?)))
+) -> Result<Created<AccessToken>, ApiError> {
+    Ok(Created(app.actions.create_token(&by, &order).await?))
 }
 
-/// `DELETE /tokens/{token}`: revokes one.
+/// Revokes a token.
+#[utoipa::path(delete, path = "/api/v1/tokens/{token}", tag = "people")]
 pub(super) async fn revoke_token(
     State(app): State<App>,
     by: Person,
     PathParam(token): PathParam<TokenId>,
-) -> Result<StatusCode, ApiError> {
+) -> Result<NoContent, ApiError> {
     let user = app.actions.revoke_token(&by, &token).await?;
     app.broker.disconnect_person(&user);
-    Ok(StatusCode::NO_CONTENT)
+    Ok(NoContent)
 }
 
-/// `GET /audit`: what was done.
+/// Reads what was done, by whom and from where.
+#[utoipa::path(get, path = "/api/v1/audit", tag = "people")]
 pub(super) async fn audit(
     State(app): State<App>,
     QueryParams(query): QueryParams<AuditQuery>,

@@ -3,48 +3,72 @@
 use std::net::SocketAddr;
 
 use axum::extract::{ConnectInfo, State};
-use axum::response::{IntoResponse, Response};
+use axum::response::{IntoResponse, NoContent, Response};
 use axum::{Extension, Json};
 use http::{HeaderMap, StatusCode, header};
 use serde::Deserialize;
-use task_proto::api::{EditRobot, MqttConnection, ReportReply, RobotList, RobotToken, RobotView};
+use task_proto::api::{EditRobot, FeedKind, MqttConnection, ReportReply, RobotList, RobotToken, RobotView};
+use task_proto::envelope::Envelope;
 use task_proto::report::Report;
 use task_proto::selector::Selector;
 use task_proto::{Digest, RobotId, RobotName};
+use utoipa::IntoParams;
 
 use super::App;
 use super::auth::TokenNumber;
 use super::error::ApiError;
-use super::extract::{JsonBody, PathParam, QueryParams, TolerantJson};
+use super::extract::{JsonBody, PathParam, QueryParams, TolerantJson, page_limit};
+use super::openapi::Created;
 use super::views::complete_robot;
 use crate::changes::Change;
+use crate::happening::Happening;
 use crate::person::Person;
 use crate::uplink;
 
 /// The query of `GET /robots`.
-#[derive(Deserialize)]
+#[derive(Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ListQuery {
+    /// Only the robots that it means.
+    #[param(inline)]
     selector: Option<Selector>,
+    /// At most so many; absent: all.
+    #[param(minimum = 1, maximum = 1000)]
+    limit: Option<u32>,
+    /// Only those whose names come after this one; takes a `limit`.
+    #[param(inline)]
+    after: Option<RobotName>,
 }
 
-/// `GET /robots`: all robots of the person's, or those of them a selector means.
+/// Lists all robots of the person's, or those of them a selector means, or a page of either.
+#[utoipa::path(get, path = "/api/v1/robots", tag = "robots")]
 pub(super) async fn list(
     State(app): State<App>,
     by: Person,
     QueryParams(query): QueryParams<ListQuery>,
 ) -> Result<Json<RobotList>, ApiError> {
-    let mut robots = app.store.robots().await?;
-    robots.retain(|robot| by.scope.covers(&robot.id, &robot.name, &robot.labels));
-    if let Some(selector) = query.selector {
-        robots.retain(|robot| selector.matches(&robot.id, &robot.name, &robot.labels));
-    }
+    let (selector, after) = (query.selector.as_ref(), query.after.as_ref());
+    let mut list = match (page_limit(query.limit)?, after) {
+        (Some(limit), after) => {
+            let page = app.store.robots_page(&by.scope, selector, after, limit as usize).await?;
+            RobotList { robots: page.robots, next: page.next, total: Some(page.total) }
+        }
+        (None, None) => {
+            let mut robots = app.store.robots().await?;
+            robots.retain(|RobotView { id, name, labels, .. }| {
+                by.scope.covers(id, name, labels) && selector.is_none_or(|selector| selector.matches(id, name, labels))
+            });
+            RobotList { robots, next: None, total: None }
+        }
+        (None, Some(_)) => return Err(ApiError::invalid("after: a page needs a limit as well")),
+    };
     let now_ms = app.clock.now_ms();
-    robots.iter_mut().for_each(|robot| complete_robot(robot, &app.presence, &app.conduct, now_ms));
-    Ok(Json(RobotList { robots }))
+    list.robots.iter_mut().for_each(|robot| complete_robot(robot, &app.presence, &app.conduct, &app.vitals, now_ms));
+    Ok(Json(list))
 }
 
-/// `GET /robots/{robot}`: one robot, by id or name.
+/// Shows one robot.
+#[utoipa::path(get, path = "/api/v1/robots/{robot}", tag = "robots")]
 pub(super) async fn show(
     State(app): State<App>,
     by: Person,
@@ -58,7 +82,9 @@ pub(super) async fn show(
     Ok(Json(view))
 }
 
-/// `PATCH /robots/{robot}`: changes name or labels.
+/// Changes a robot's name, labels or settings.
+#[utoipa::path(patch, path = "/api/v1/robots/{robot}", tag = "robots",
+    responses((status = 409, description = "`name_taken`: another robot has the name.")))]
 pub(super) async fn edit(
     State(app): State<App>,
     by: Person,
@@ -70,33 +96,42 @@ pub(super) async fn edit(
     view(&app, &id).await.map(Json)
 }
 
-/// `DELETE /robots/{robot}`: removes it; whoever is connected with its token has to go.
+/// Removes a robot; whoever is connected with its token has to go.
+#[utoipa::path(delete, path = "/api/v1/robots/{robot}", tag = "robots")]
 pub(super) async fn remove(
     State(app): State<App>,
     by: Person,
     PathParam(robot): PathParam<RobotName>,
-) -> Result<StatusCode, ApiError> {
+) -> Result<NoContent, ApiError> {
     let id = find(&app, &by, &robot).await?;
     app.actions.remove_robot(&by, &id).await?;
-    put_out(&app, &id);
-    app.logs.forget(&id);
-    app.presence.forget(&id);
-    Ok(StatusCode::NO_CONTENT)
+    gone(&app, &id);
+    Ok(NoContent)
 }
 
-/// `POST /robots/{robot}/revoke`: ends its tokens, and whatever is under way by them.
+/// Ends a robot's tokens, and whatever is under way by them.
+#[utoipa::path(post, path = "/api/v1/robots/{robot}/revoke", tag = "robots")]
 pub(super) async fn revoke(
     State(app): State<App>,
     by: Person,
     PathParam(robot): PathParam<RobotName>,
-) -> Result<StatusCode, ApiError> {
+) -> Result<NoContent, ApiError> {
     let id = find(&app, &by, &robot).await?;
     app.actions.revoke_robot(&by, &id).await?;
     put_out(&app, &id);
     // One that polled would count as there for a while.
     app.presence.forget(&id);
+    app.changes.happened(Happening::Robot(id.clone(), FeedKind::RobotRevoked, "was put out".to_owned()));
     app.changes.announce(Change::Robot(id));
-    Ok(StatusCode::NO_CONTENT)
+    Ok(NoContent)
+}
+
+/// Forgets a robot that was removed; whoever is connected with its token has to go.
+pub(super) fn gone(app: &App, robot: &RobotId) {
+    put_out(app, robot);
+    app.logs.forget(robot);
+    app.vitals.forget(robot);
+    app.presence.forget(robot);
 }
 
 /// Ends a robot's session and its requests. To be called once its tokens have ended.
@@ -105,7 +140,11 @@ fn put_out(app: &App, robot: &RobotId) {
     app.visits.end(robot);
 }
 
-/// `GET /robots/{robot}/desired` (that robot): its signed desired state. Asking counts as being there.
+/// Gives the robot its signed desired state. Asking counts as being there.
+#[utoipa::path(get, path = "/api/v1/robots/{robot}/desired", tag = "agent",
+    responses((status = 200, description = "The state, as a DSSE envelope; its tag is in `ETag`.", body = Envelope),
+        (status = 304, description = "It is still the one that `If-None-Match` names."),
+        (status = 409, description = "`duplicate_identity`: two agents use this identity; `diverged`: the robot has come further than this server.")))]
 pub(super) async fn desired(
     State(app): State<App>,
     ConnectInfo(peer): ConnectInfo<SocketAddr>,
@@ -130,7 +169,9 @@ pub(super) async fn desired(
     Ok((caching, [(header::CONTENT_TYPE, "application/json")], body).into_response())
 }
 
-/// `POST /robots/{robot}/report` (that robot): stores a report; the answer comes after the commit.
+/// Stores a report of the robot; the answer comes after the commit.
+#[utoipa::path(post, path = "/api/v1/robots/{robot}/report", tag = "agent",
+    responses((status = 503, description = "Too many reports wait to be stored.")))]
 pub(super) async fn report(
     State(app): State<App>,
     ConnectInfo(peer): ConnectInfo<SocketAddr>,
@@ -147,13 +188,15 @@ pub(super) async fn report(
     Ok(Json(app.reports.submit(report, token_number).await?))
 }
 
-/// `POST /robots/{robot}/token` (that robot): a token it may go over to; the first use of it ends the one it called with.
+/// Gives the robot a token that it may go over to; the first use of it ends the one it called with.
+#[utoipa::path(post, path = "/api/v1/robots/{robot}/token", tag = "agent",
+    responses((status = 409, description = "`enrolled_anew`: another agent has enrolled as this robot meanwhile.")))]
 pub(super) async fn next_token(
     State(app): State<App>,
     PathParam(robot): PathParam<RobotId>,
-) -> Result<(StatusCode, Json<RobotToken>), ApiError> {
+) -> Result<Created<RobotToken>, ApiError> {
     let token = app.actions.next_robot_token(&robot).await?;
-    Ok((StatusCode::CREATED, Json(RobotToken { token: token.reveal() })))
+    Ok(Created(RobotToken { token: token.reveal() }))
 }
 
 /// The robot that a person names, which must be one of theirs.
@@ -169,6 +212,6 @@ pub(super) async fn find(app: &App, by: &Person, id_or_name: &RobotName) -> Resu
 async fn view(app: &App, id: &RobotId) -> Result<RobotView, ApiError> {
     let found = app.store.robot(id).await?;
     let mut view = found.ok_or_else(|| ApiError::not_found(format!("there is no robot {id}")))?;
-    complete_robot(&mut view, &app.presence, &app.conduct, app.clock.now_ms());
+    complete_robot(&mut view, &app.presence, &app.conduct, &app.vitals, app.clock.now_ms());
     Ok(view)
 }

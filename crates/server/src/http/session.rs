@@ -23,7 +23,7 @@ use crate::person::Person;
 use crate::store::TokenHolder;
 
 /// The cookie's name.
-const COOKIE: &str = "taskd_session";
+pub(super) const COOKIE: &str = "taskd_session";
 /// Scripts can't read it, and no other page makes the browser send it.
 const COOKIE_ATTRIBUTES: &str = "HttpOnly; SameSite=Strict; Path=/";
 /// How long a session lasts.
@@ -113,7 +113,12 @@ pub(super) fn begin_session(app: &App, token: Token, user: UserName, now_ms: u64
     set_cookie(app, COOKIE, &id, COOKIE_ATTRIBUTES, LIFETIME_MS / 1000)
 }
 
-/// `POST /session`: signs in.
+/// Signs in at the page: gives a cookie for a name and a password, or for a token.
+#[utoipa::path(post, path = "/api/v1/session", tag = "session",
+    responses((status = 200, description = "The session; its cookie is in `Set-Cookie`.", body = SessionView),
+        (status = 401, description = "Name, password or token are not right."),
+        (status = 403, description = "The request comes from a foreign page."),
+        (status = 429, description = "Too many attempts failed, of this user or from this address.")))]
 pub(super) async fn sign_in(
     State(app): State<App>,
     ConnectInfo(peer): ConnectInfo<SocketAddr>,
@@ -147,7 +152,8 @@ async fn known_token(app: &App, text: &str, now_ms: u64) -> Result<(Token, UserN
     }
 }
 
-/// `GET /session`: tells until when the caller is signed in.
+/// Tells until when the caller is signed in.
+#[utoipa::path(get, path = "/api/v1/session", tag = "session")]
 pub(super) async fn show(State(app): State<App>, headers: HeaderMap) -> Result<Json<SessionView>, ApiError> {
     let now_ms = app.clock.now_ms();
     let Some(session) = app.sessions.find(&headers, now_ms) else {
@@ -157,7 +163,9 @@ pub(super) async fn show(State(app): State<App>, headers: HeaderMap) -> Result<J
     Ok(Json(SessionView { expires_at_ms: is_good.then_some(session.expires_at_ms), provider: oidc::view(&app) }))
 }
 
-/// `DELETE /session`: signs out, the page or whoever signed in at the command line.
+/// Signs out, the page or whoever signed in at the command line.
+#[utoipa::path(delete, path = "/api/v1/session", tag = "session",
+    responses((status = 204, description = "Signed out; the cookie is taken back.")))]
 pub(super) async fn sign_out(State(app): State<App>, by: Person, headers: HeaderMap) -> Result<Response, ApiError> {
     app.sessions.end(&headers);
     app.actions.sign_out(&by).await?;

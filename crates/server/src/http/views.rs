@@ -9,9 +9,11 @@ use task_proto::report::{Condition, Phase};
 use crate::conduct::Conduct;
 use crate::deployment;
 use crate::presence::Presence;
+use crate::robot_vitals::RobotVitals;
 
-/// Adds where a robot is, how it behaves, and what is wrong with its identity.
-pub fn complete_robot(view: &mut RobotView, presence: &Presence, conduct: &Conduct, now_ms: u64) {
+/// Adds where a robot is, how it behaves and does, and what is wrong with its identity.
+pub fn complete_robot(view: &mut RobotView, presence: &Presence, conduct: &Conduct, vitals: &RobotVitals, now_ms: u64) {
+    view.vitals = vitals.newest(&view.id);
     if let Some(text) = conduct.trouble(&view.id) {
         view.conditions.insert(0, Condition { code: "misbehaves".to_owned(), text });
     }

@@ -1,5 +1,6 @@
 //! From a directory to a package: what the directory says of itself, whether that can run, and the bytes that travel.
-//! It reads the directory and writes one temporary file; it knows no network and no server.
+//! It reads the directory and writes one temporary file; it knows no network and no server. And back again: what is in such
+//! bytes.
 
 use std::path::PathBuf;
 
@@ -8,6 +9,8 @@ use task_proto::manifest::TaskManifest;
 use tempfile::NamedTempFile;
 
 mod archive;
+pub mod contents;
+mod launch;
 mod pack;
 pub mod package_xml;
 mod rules;
@@ -16,7 +19,8 @@ pub mod task_toml;
 mod text_file;
 mod tree;
 
-pub use pack::pack;
+pub use launch::Launch;
+pub use pack::{Described, describe, pack, pack_into, pack_to_launch};
 
 /// A package, ready to travel.
 #[derive(Debug)]

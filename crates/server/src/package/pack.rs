@@ -6,20 +6,60 @@ use std::path::Path;
 
 use task_proto::Digest;
 use task_proto::desired::{BlobRef, PackageRef};
-use task_proto::manifest::{CONTENT_RATIO_FREE_BYTES, MAX_CONTENT_RATIO, MAX_MANIFEST_BYTES};
+use task_proto::manifest::{CONTENT_RATIO_FREE_BYTES, MAX_CONTENT_RATIO, MAX_MANIFEST_BYTES, TaskManifest};
 use task_proto::oci::ImageManifest;
 use tempfile::NamedTempFile;
 
-use super::{PackageError, Packed, Problem, archive, source};
+use super::{Launch, PackageError, Packed, Problem, archive, source};
+
+/// A manifest and the bytes that it makes, for content that there is already.
+#[derive(Debug)]
+pub struct Described {
+    /// What pins it.
+    pub package: PackageRef,
+    /// The manifest as the OCI config blob.
+    pub config_bytes: Vec<u8>,
+    /// The OCI manifest.
+    pub manifest_bytes: Vec<u8>,
+}
+
+/// The package of this manifest and this content.
+pub fn describe(manifest: &TaskManifest, content: BlobRef) -> Result<Described, PackageError> {
+    let config_bytes = json(manifest)?;
+    let config = blob(&config_bytes);
+    let manifest_bytes = json(&ImageManifest::package(config, content))?;
+    let package = PackageRef {
+        name: manifest.name.clone(),
+        version: manifest.version.clone(),
+        manifest: blob(&manifest_bytes),
+        config,
+        content,
+    };
+    Ok(Described { package, config_bytes, manifest_bytes })
+}
 
 /// Packs `dir`. Reads every file once and blocks meanwhile.
 pub fn pack(dir: &Path) -> Result<Packed, PackageError> {
-    let source::Source { mut manifest, tree } = source::read(dir)?;
+    pack_as(dir, None, &std::env::temp_dir())
+}
+
+/// The same with the content in the directory `temporary`.
+pub fn pack_into(dir: &Path, temporary: &Path) -> Result<Packed, PackageError> {
+    pack_as(dir, None, temporary)
+}
+
+/// Packs `dir` to run as `launch` says in the place of what the directory says itself.
+pub fn pack_to_launch(dir: &Path, launch: &Launch) -> Result<Packed, PackageError> {
+    pack_as(dir, Some(launch), &std::env::temp_dir())
+}
+
+fn pack_as(dir: &Path, launch: Option<&Launch>, temporary: &Path) -> Result<Packed, PackageError> {
+    let source::Source { mut manifest, tree } = source::read(dir, launch)?;
     let failed = |source| PackageError::Io {
         what: "can't write the packed content to a temporary file (TMPDIR says where)".to_owned(),
         source,
     };
-    let mut content = NamedTempFile::with_prefix("taskd-content-").map_err(failed)?;
+    let mut content = NamedTempFile::with_prefix_in("taskd-content-", temporary).map_err(failed)?;
     let mut output = BufWriter::with_capacity(256 * 1024, content.as_file_mut());
     let (content_blob, facts) = archive::write(&tree, &mut output)?;
     output.flush().map_err(failed)?;
@@ -32,20 +72,11 @@ pub fn pack(dir: &Path) -> Result<Packed, PackageError> {
         return Err(invalid(dir, ".", reason));
     }
     manifest.content = facts;
-    let config_bytes = json(&manifest)?;
+    let Described { package, config_bytes, manifest_bytes } = describe(&manifest, content_blob)?;
     if config_bytes.len() > MAX_MANIFEST_BYTES {
         let reason = format!("makes a manifest of more than {MAX_MANIFEST_BYTES} bytes");
         return Err(invalid(dir, "task.toml", reason));
     }
-    let config = blob(&config_bytes);
-    let manifest_bytes = json(&ImageManifest::package(config, content_blob))?;
-    let package = PackageRef {
-        name: manifest.name.clone(),
-        version: manifest.version.clone(),
-        manifest: blob(&manifest_bytes),
-        config,
-        content: content_blob,
-    };
     Ok(Packed { package, manifest, config_bytes, manifest_bytes, content })
 }
 
@@ -346,6 +377,9 @@ mod tests {
         fs::remove_file(dir.path().join("task.toml")).unwrap();
         nix::unistd::mkfifo(&dir.path().join("task.toml"), nix::sys::stat::Mode::S_IRWXU).unwrap();
         assert!(problems(&dir).contains(&"task.toml: is not a regular file".to_owned()));
+        std::fs::remove_file(dir.path().join("task.toml")).expect("removed");
+        std::fs::write(dir.path().join("task.toml"), "#".repeat((1 << 20) + 1)).expect("written");
+        assert!(problems(&dir).contains(&"task.toml: is larger than 1048576 bytes".to_owned()));
     }
 
     #[test]

@@ -12,7 +12,7 @@ use super::package_xml::{self, BuildType, PackageXml};
 use super::task_toml::{self, TaskToml};
 use super::text_file::read_text;
 use super::tree::Tree;
-use super::{PackageError, Problem, rules};
+use super::{Launch, PackageError, Problem, rules};
 
 /// A directory that can become a package.
 #[derive(Debug)]
@@ -23,8 +23,8 @@ pub(super) struct Source {
     pub(super) tree: Tree,
 }
 
-/// Reads and checks `dir`.
-pub(super) fn read(dir: &Path) -> Result<Source, PackageError> {
+/// Reads and checks `dir`, as what runs by `launch` if that is given.
+pub(super) fn read(dir: &Path, launch: Option<&Launch>) -> Result<Source, PackageError> {
     let invalid = |problems| PackageError::Invalid { dir: dir.to_owned(), problems };
     let not_a_directory = |reason: &str| invalid(vec![Problem { file: ".".to_owned(), reason: reason.to_owned() }]);
     match fs::metadata(dir) {
@@ -38,7 +38,9 @@ pub(super) fn read(dir: &Path) -> Result<Source, PackageError> {
     let mut problems = Vec::new();
     let toml = read_text(dir, task_toml::FILE, &mut problems)?;
     let xml = read_text(dir, package_xml::FILE, &mut problems)?;
-    if toml.is_none() && problems.is_empty() {
+    // Without task.toml it takes somebody else who says how it is run.
+    let is_said = launch.is_some() && xml.is_some();
+    if toml.is_none() && !is_said && problems.is_empty() {
         let reason = match xml {
             Some(_) => "is absent; package.xml does not say how the package is run: give [run] with launch or exec",
             None => "is absent, and so is package.xml; a package needs at least task.toml with name, version and [run]",
@@ -47,7 +49,7 @@ pub(super) fn read(dir: &Path) -> Result<Source, PackageError> {
         return Err(invalid(problems));
     }
     let before = problems.len();
-    let toml = toml.map(|text| task_toml::parse(&text, &mut problems)).unwrap_or_default();
+    let mut toml = toml.map(|text| task_toml::parse(&text, &mut problems)).unwrap_or_default();
     // What the file gives wrongly must not be called absent as well.
     let toml_is_whole = problems.len() == before;
     let xml = xml.and_then(|text| match package_xml::parse(&text) {
@@ -57,6 +59,10 @@ pub(super) fn read(dir: &Path) -> Result<Source, PackageError> {
             None
         }
     });
+    if let Some(launch) = launch {
+        let name = xml.as_ref().map(|xml| xml.name.clone()).or_else(|| toml.name.as_ref().map(ToString::to_string));
+        launch.replace(&mut toml.run, &mut toml.ready, &name.unwrap_or_default());
+    }
     let tool = build_tool(&toml, xml.as_ref(), &mut problems);
     let tree = Tree::walk(dir, tool != BuildTool::None, &mut problems)?;
     let manifest = merge(toml, toml_is_whole, xml.as_ref(), tool, &mut problems);

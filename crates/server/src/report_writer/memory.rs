@@ -4,12 +4,15 @@
 
 use std::collections::{HashMap, HashSet};
 
+use task_proto::report::{Condition, FailureCode};
 use task_proto::{DeploymentId, RobotId};
 
 use crate::store::{OpenAssignment, ReportedRobot, StoreError, Write};
 
 /// Robots remembered before a batch; it may add its own.
 const MAX_ROBOTS: usize = 20_000;
+/// Conditions remembered of one robot; its others are no news.
+const MAX_CONDITIONS: usize = 16;
 
 /// What is known to be stored.
 #[derive(Default)]
@@ -19,6 +22,8 @@ pub(super) struct Memory {
     robots: HashMap<RobotId, Remembered>,
     /// Deployments without a robot whose batch has not begun: nothing moves them on.
     begun: HashSet<DeploymentId>,
+    /// The codes of what is wrong with robots. No write of others changes them, so they are not forgotten.
+    conditions: HashMap<RobotId, Vec<FailureCode>>,
 }
 
 /// One robot as it is stored.
@@ -73,6 +78,22 @@ impl Memory {
         self.begun.insert(deployment);
     }
 
+    /// Takes in what a robot says is wrong with it. Gives what it did not say before.
+    pub(super) fn new_conditions<'a>(&mut self, robot: &RobotId, conditions: &'a [Condition]) -> Vec<&'a Condition> {
+        let before = self.conditions.remove(robot).unwrap_or_default();
+        if self.conditions.len() >= MAX_ROBOTS {
+            self.conditions.clear();
+        }
+        let conditions = &conditions[..conditions.len().min(MAX_CONDITIONS)];
+        let codes: Vec<_> = conditions.iter().map(|condition| FailureCode::from(condition.code.clone())).collect();
+        let is_new = |(_, code): &(&Condition, &FailureCode)| !before.contains(code);
+        let new = conditions.iter().zip(&codes).filter(is_new).map(|(condition, _)| condition).collect();
+        if !codes.is_empty() {
+            self.conditions.insert(robot.clone(), codes);
+        }
+        new
+    }
+
     /// The write with this turn was committed, and what it changed is remembered.
     pub(super) fn committed(&mut self, turn: u64) {
         self.turn = turn;
@@ -80,6 +101,6 @@ impl Memory {
 
     /// Nothing is certain any more.
     pub(super) fn forget(&mut self) {
-        *self = Self::default();
+        *self = Self { conditions: std::mem::take(&mut self.conditions), ..Self::default() };
     }
 }

@@ -3,13 +3,18 @@
 
 use std::collections::{BTreeMap, HashSet};
 
-use sqlx::Row as _;
+use sqlx::{AssertSqlSafe, Row as _};
 use task_proto::manifest::TaskKind;
-use task_proto::report::{Report, TaskReport};
+use task_proto::report::{Phase, Report, TaskReport};
 use task_proto::{Generation, RobotId, TaskName};
 
 use super::rows::{from_json, id, json, number, stored, word};
+use super::timelines::{grown, grown_by, step};
 use super::{StoreError, Write};
+
+/// The highest run that is taken over. Beyond it a made-up one would leave no room above it, and an order for this robot and
+/// others would fail for all of them.
+const MAX_RUN: u64 = 1 << 53;
 
 impl Write {
     /// Adopts those of `robots` that are diverged.
@@ -43,11 +48,13 @@ impl Write {
         now_ms: u64,
     ) -> Result<(), StoreError> {
         // What we believed it should have is out of date, all of it; what is also reported comes back below.
-        sqlx::query(
+        sqlx::query(AssertSqlSafe(format!(
             "UPDATE assignments SET desired = 0, ended = 1, progress = NULL, updated_at_ms = $2,
-                 phase = CASE ended WHEN 1 THEN phase ELSE 'stopped' END
+                 phase = CASE ended WHEN 1 THEN phase ELSE 'stopped' END,
+                 timeline = CASE ended WHEN 1 THEN timeline ELSE {} END
              WHERE robot_id = $1 AND desired = 1",
-        )
+            grown_by(Phase::Stopped, "$2")
+        )))
         .bind(robot.as_str())
         .bind(stored(now_ms))
         .execute(self.connection())
@@ -83,25 +90,29 @@ impl Write {
         .bind(stored(now_ms))
         .execute(self.connection())
         .await?;
-        sqlx::query(
+        sqlx::query(AssertSqlSafe(format!(
             "INSERT INTO assignments (deployment_id, robot_id, task, place, released, desired, ended, wanted, run, phase,
-                 failure, updated_at_ms)
+                 failure, updated_at_ms, timeline, ran)
              SELECT id, CAST($2 AS TEXT), task, 0, 1, 1, CAST($4 AS BIGINT), CAST($5 AS TEXT), CAST($6 AS BIGINT),
-                 CAST($7 AS TEXT), CAST($8 AS TEXT), CAST($9 AS BIGINT)
+                 CAST($7 AS TEXT), CAST($8 AS TEXT), CAST($9 AS BIGINT), CAST($10 AS TEXT),
+                 CASE WHEN CAST($7 AS TEXT) IN ('running', 'succeeded') THEN 1 ELSE 0 END
              FROM deployments WHERE id = $1 AND task = $3
              ON CONFLICT (deployment_id, robot_id) DO UPDATE SET released = 1, desired = 1, ended = excluded.ended,
                  wanted = excluded.wanted, run = excluded.run, phase = excluded.phase, failure = excluded.failure,
-                 superseded_by = NULL, removed_generation = NULL, updated_at_ms = excluded.updated_at_ms",
-        )
+                 superseded_by = NULL, removed_generation = NULL, updated_at_ms = excluded.updated_at_ms,
+                 ran = CASE excluded.ran WHEN 1 THEN 1 ELSE assignments.ran END, timeline = {}",
+            grown("excluded.timeline")
+        )))
         .bind(task.deployment.as_str())
         .bind(robot.as_str())
         .bind(task.task.as_str())
         .bind(i64::from(task.phase.is_final()))
         .bind(word(&task.wanted))
-        .bind(stored(task.run))
+        .bind(stored(task.run.min(MAX_RUN)))
         .bind(task.phase.as_str())
         .bind(task.failure.as_ref().map(json))
         .bind(stored(now_ms))
+        .bind(step(task.phase, now_ms, task.attempts))
         .execute(self.connection())
         .await?;
         Ok(())

@@ -9,13 +9,16 @@ use task_proto::report::Phase;
 use task_proto::{DeploymentId, RobotId, TaskName};
 
 use super::rows::{groups, id, parts_of, stored, values};
+use super::timelines::{grown_by, step};
 use super::{StoreError, Write};
 
 /// What may be ordered about a task that a robot has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TaskOrder {
-    /// Run it (again).
+    /// Run it, if it does not.
     Start,
+    /// Run it anew.
+    Restart,
     /// Stop it, keep it installed.
     Stop,
     /// Take it off the robot.
@@ -61,28 +64,32 @@ impl Write {
         for group in groups(robots) {
             let sql = format!(
                 "WITH v (robot_id, place) AS ({})
-                 INSERT INTO assignments (deployment_id, robot_id, task, place, expires_at_ms, updated_at_ms)
-                 SELECT CAST($1 AS TEXT), v.robot_id, CAST($2 AS TEXT), v.place, CAST($3 AS BIGINT), CAST($4 AS BIGINT)
+                 INSERT INTO assignments (deployment_id, robot_id, task, place, expires_at_ms, updated_at_ms, timeline)
+                 SELECT CAST($1 AS TEXT), v.robot_id, CAST($2 AS TEXT), v.place, CAST($3 AS BIGINT), CAST($4 AS BIGINT),
+                     CAST($5 AS TEXT)
                  FROM v",
-                values(5, group.len(), &["TEXT", "BIGINT"])
+                values(6, group.len(), &["TEXT", "BIGINT"])
             );
             let mut query = sqlx::query(AssertSqlSafe(sql))
                 .bind(deployment.as_str())
                 .bind(task.as_str())
                 .bind(stored(expires_at_ms))
-                .bind(stored(now_ms));
+                .bind(stored(now_ms))
+                .bind(step(Phase::Assigned, now_ms, 0));
             for robot in group {
                 query = query.bind(robot.as_str()).bind(place);
                 place += 1;
             }
             query.execute(self.connection()).await?;
         }
-        let superseded = sqlx::query_scalar(
-            "UPDATE assignments SET phase = 'superseded', ended = 1, superseded_by = $1, updated_at_ms = $3
+        let superseded = sqlx::query_scalar(AssertSqlSafe(format!(
+            "UPDATE assignments SET phase = 'superseded', ended = 1, superseded_by = $1, updated_at_ms = $3,
+                 timeline = {}
              WHERE task = $2 AND released = 0 AND ended = 0 AND deployment_id <> $1
                AND robot_id IN (SELECT robot_id FROM assignments WHERE deployment_id = $1)
              RETURNING deployment_id",
-        )
+            grown_by(Phase::Superseded, "$3")
+        )))
         .bind(deployment.as_str())
         .bind(task.as_str())
         .bind(stored(now_ms))
@@ -120,23 +127,28 @@ impl Write {
         .bind(last)
         .execute(self.connection())
         .await?;
-        let superseded = sqlx::query_scalar(
+        let superseded = sqlx::query_scalar(AssertSqlSafe(format!(
             "UPDATE assignments SET desired = 0, superseded_by = $1, ended = 1, progress = NULL, updated_at_ms = $3,
-                 phase = CASE ended WHEN 1 THEN phase ELSE 'superseded' END
+                 phase = CASE ended WHEN 1 THEN phase ELSE 'superseded' END,
+                 timeline = CASE ended WHEN 1 THEN timeline ELSE {} END
              WHERE desired = 1 AND task = (SELECT task FROM deployments WHERE id = $1) AND robot_id IN (
                  SELECT robot_id FROM assignments
                  WHERE deployment_id = $1 AND released = 0 AND ended = 0 AND place <= $2)
              RETURNING deployment_id",
-        )
+            grown_by(Phase::Superseded, "$3")
+        )))
         .bind(deployment.as_str())
         .bind(last)
         .bind(stored(now_ms))
         .fetch_all(self.connection())
         .await?;
-        sqlx::query(
-            "UPDATE assignments SET released = 1, desired = 1, updated_at_ms = $3
+        // Of the first batch it was just said.
+        sqlx::query(AssertSqlSafe(format!(
+            "UPDATE assignments SET released = 1, desired = 1, updated_at_ms = $3,
+                 timeline = CASE WHEN updated_at_ms = $3 THEN timeline ELSE {} END
              WHERE deployment_id = $1 AND released = 0 AND ended = 0 AND place <= $2",
-        )
+            grown_by(Phase::Assigned, "$3")
+        )))
         .bind(deployment.as_str())
         .bind(last)
         .bind(stored(now_ms))
@@ -183,16 +195,24 @@ impl Write {
         phase: Phase,
         now_ms: u64,
     ) -> Result<Vec<RobotId>, StoreError> {
-        let end = "SET desired = 0, ended = 1, progress = NULL, updated_at_ms = $1,
-                       phase = CASE ended WHEN 1 THEN phase ELSE CAST($2 AS TEXT) END";
-        self.set_pairs(end, phase, now_ms, taken.iter().map(|row| (&row.deployment, &row.robot))).await?;
+        let end = format!(
+            "SET desired = 0, ended = 1, progress = NULL, updated_at_ms = $1,
+                 phase = CASE ended WHEN 1 THEN phase ELSE CAST($2 AS TEXT) END,
+                 timeline = CASE ended WHEN 1 THEN timeline ELSE {} END",
+            grown_by(phase, "$1")
+        );
+        self.set_pairs(&end, phase, now_ms, taken.iter().map(|row| (&row.deployment, &row.robot))).await?;
         // Where the replaced one stands is what the robot's next report says; $2 is what it is until then.
-        let revive = "SET desired = 1, superseded_by = NULL, removed_generation = NULL, updated_at_ms = $1,
-                          ended = CASE phase WHEN 'superseded' THEN 0 ELSE ended END,
-                          phase = CASE phase WHEN 'superseded' THEN CAST($2 AS TEXT) ELSE phase END";
+        let revive = format!(
+            "SET desired = 1, superseded_by = NULL, removed_generation = NULL, updated_at_ms = $1,
+                 ended = CASE phase WHEN 'superseded' THEN 0 ELSE ended END,
+                 timeline = CASE phase WHEN 'superseded' THEN {} ELSE timeline END,
+                 phase = CASE phase WHEN 'superseded' THEN CAST($2 AS TEXT) ELSE phase END",
+            grown_by(Phase::Assigned, "$1")
+        );
         let previous =
             taken.iter().filter(|row| row.desired).filter_map(|row| Some((row.previous.as_ref()?, &row.robot)));
-        self.set_pairs(revive, Phase::Assigned, now_ms, previous).await?;
+        self.set_pairs(&revive, Phase::Assigned, now_ms, previous).await?;
         let robots: BTreeSet<RobotId> = taken.iter().filter(|row| row.desired).map(|row| row.robot.clone()).collect();
         let robots: Vec<RobotId> = robots.into_iter().collect();
         self.raise_generations(&robots).await?;
@@ -247,12 +267,15 @@ impl Write {
         expires_at_ms: u64,
         now_ms: u64,
     ) -> Result<Vec<(DeploymentId, RobotId)>, StoreError> {
+        let begun = grown_by(Phase::Assigned, "$3");
+        let restart = format!(
+            "SET wanted = 'running', run = run + 1, phase = 'assigned', ended = 0, progress = NULL, failure = NULL,
+                 attempts = 0, expires_at_ms = $2, updated_at_ms = $3, timeline = {begun} FROM v WHERE desired = 1"
+        );
+        let start = format!("{restart} AND (wanted = 'stopped' OR ended = 1)");
         let set = match order {
-            TaskOrder::Start => {
-                "SET wanted = 'running', run = run + 1, phase = 'assigned', ended = 0, progress = NULL, failure = NULL,
-                     attempts = 0, expires_at_ms = $2, updated_at_ms = $3 FROM v
-                 WHERE desired = 1 AND (wanted = 'stopped' OR ended = 1)"
-            }
+            TaskOrder::Start => start.as_str(),
+            TaskOrder::Restart => restart.as_str(),
             TaskOrder::Stop => {
                 "SET wanted = 'stopped', expires_at_ms = CASE WHEN expires_at_ms IS NULL THEN NULL ELSE $2 END,
                      updated_at_ms = $3 FROM v
@@ -295,10 +318,12 @@ impl Write {
         let mut dropped = Vec::new();
         for group in groups(robots) {
             let sql = format!(
-                "WITH v (id) AS ({}) UPDATE assignments SET phase = 'cancelled', ended = 1, updated_at_ms = $2 FROM v
+                "WITH v (id) AS ({}) UPDATE assignments SET phase = 'cancelled', ended = 1, wanted = 'stopped', updated_at_ms = $2,
+                     timeline = {} FROM v
                  WHERE released = 0 AND ended = 0 AND robot_id = v.id AND (task = $1 OR $1 = '')
                  RETURNING deployment_id",
-                values(3, group.len(), &["TEXT"])
+                values(3, group.len(), &["TEXT"]),
+                grown_by(Phase::Cancelled, "$2")
             );
             let mut query = sqlx::query_scalar(AssertSqlSafe(sql))
                 .bind(task.map_or("", TaskName::as_str).to_owned())
@@ -311,22 +336,29 @@ impl Write {
         deployments(dropped)
     }
 
-    /// Ends everything that is ordered of a robot which is being removed. Returns the deployments concerned.
-    pub async fn end_all_of_robot(
+    /// Ends everything that is ordered of robots which are being removed. Returns the deployments concerned.
+    pub async fn end_all_of_robots(
         &mut self,
-        robot: &RobotId,
+        robots: &[RobotId],
         now_ms: u64,
     ) -> Result<BTreeSet<DeploymentId>, StoreError> {
-        let ended = sqlx::query_scalar(
-            "UPDATE assignments SET desired = 0, ended = 1, updated_at_ms = $2,
-                 phase = CASE ended WHEN 1 THEN phase ELSE 'cancelled' END
-             WHERE robot_id = $1 AND (ended = 0 OR desired = 1)
-             RETURNING deployment_id",
-        )
-        .bind(robot.as_str())
-        .bind(stored(now_ms))
-        .fetch_all(self.connection())
-        .await?;
+        let mut ended = Vec::new();
+        for group in groups(robots) {
+            let sql = format!(
+                "WITH v (id) AS ({}) UPDATE assignments SET desired = 0, ended = 1, updated_at_ms = $1,
+                     phase = CASE ended WHEN 1 THEN phase ELSE 'cancelled' END,
+                     timeline = CASE ended WHEN 1 THEN timeline ELSE {} END FROM v
+                 WHERE robot_id = v.id AND (ended = 0 OR desired = 1)
+                 RETURNING deployment_id",
+                values(2, group.len(), &["TEXT"]),
+                grown_by(Phase::Cancelled, "$1")
+            );
+            let mut query = sqlx::query_scalar(AssertSqlSafe(sql)).bind(stored(now_ms));
+            for robot in group {
+                query = query.bind(robot.as_str());
+            }
+            ended.append(&mut query.fetch_all(self.connection()).await?);
+        }
         deployments(ended)
     }
 

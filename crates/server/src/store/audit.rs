@@ -32,6 +32,10 @@ pub enum Act {
     RobotEdit,
     /// A robot was removed.
     RobotRemove,
+    /// Labels of many robots were changed.
+    BulkLabels,
+    /// Many robots were removed.
+    BulkRemove,
     /// A robot's tokens were ended.
     RobotRevoke,
     /// A robot was asked to change something at once, like a parameter.
@@ -46,8 +50,14 @@ pub enum Act {
     DeploymentCancel,
     /// A paused order was let go on.
     DeploymentResume,
+    /// What had ended badly was ordered once more.
+    DeploymentRetry,
     /// A task was ordered to start.
     TaskStart,
+    /// A task was ordered to run anew.
+    TaskRestart,
+    /// A task was ordered back to the package before.
+    TaskRollBack,
     /// A task was ordered to stop.
     TaskStop,
     /// A task was ordered to go.
@@ -89,6 +99,8 @@ impl Act {
             Self::RobotReject => "robot.reject",
             Self::RobotEdit => "robot.edit",
             Self::RobotRemove => "robot.remove",
+            Self::BulkLabels => "bulk.labels",
+            Self::BulkRemove => "bulk.remove",
             Self::RobotRevoke => "robot.revoke",
             Self::RobotAsk => "robot.ask",
             Self::EnrolmentCreate => "enrolment_token.create",
@@ -97,6 +109,9 @@ impl Act {
             Self::DeploymentCancel => "deployment.cancel",
             Self::DeploymentResume => "deployment.resume",
             Self::TaskStart => "task.start",
+            Self::DeploymentRetry => "deployment.retry",
+            Self::TaskRestart => "task.restart",
+            Self::TaskRollBack => "task.rollback",
             Self::TaskStop => "task.stop",
             Self::TaskRemove => "task.remove",
             Self::ManifestPush => "manifest.push",

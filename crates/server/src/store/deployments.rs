@@ -7,11 +7,12 @@ use task_proto::api::{AssignmentView, CreateDeployment, DeploymentView, PhaseCou
 use task_proto::desired::PackageRef;
 use task_proto::manifest::TaskKind;
 use task_proto::report::Phase;
+use task_proto::selector::Selector;
 use task_proto::{DeploymentId, RobotId};
 
-use super::deliveries;
 use super::rows::{from_json, from_optional_json, from_word, groups, id, json, number, priority, stored, values, word};
 use super::{Store, StoreError, Write};
+use super::{deliveries, timelines};
 use crate::deployment;
 use crate::rollout::{Rollout, Tally};
 
@@ -30,54 +31,98 @@ pub struct NewDeployment<'a> {
     pub expires_at_ms: u64,
 }
 
-/// The most deployments that are listed; older ones are found by id.
-const LISTED: &str = "(SELECT id FROM deployments WHERE id = $1 OR $1 = '' ORDER BY number DESC LIMIT 200)";
+/// Some of the deployments, the newest first.
+#[derive(Debug)]
+pub struct DeploymentPage {
+    /// Without assignments.
+    pub deployments: Vec<DeploymentView>,
+    /// The last one that was looked at, if there are older ones.
+    pub next: Option<DeploymentId>,
+}
+
+/// What is read of each deployment. The selector may name thousands of robots, which is too much for lists and events.
+const ROWS: &str =
+    "SELECT id, number, package, kind, CASE WHEN length(selector) <= 1000 THEN selector END AS selector, delivery,
+         priority, batch, max_failures, paused, created_at_ms, expires_at_ms, cancelled_at_ms
+     FROM deployments";
+
+/// Those with numbers from $1 to $2, so that what is ordered meanwhile is not counted.
+const LISTED: &str = "(SELECT id FROM deployments WHERE number BETWEEN $1 AND $2)";
 
 impl Store {
-    /// The newest deployments, newest first, without assignments.
-    pub async fn deployments(&self) -> Result<Vec<DeploymentView>, StoreError> {
-        self.deployment_views("", self.counted("", None).await?).await
-    }
-
-    /// Of the newest deployments those that concern one of these robots, as far as they do.
-    pub async fn deployments_of(&self, robots: &[RobotId]) -> Result<Vec<DeploymentView>, StoreError> {
-        let mut counts: HashMap<String, Vec<PhaseCount>> = HashMap::new();
-        for group in groups(robots) {
-            for (deployment, counted) in self.counted("", Some(group)).await? {
-                let sum = counts.entry(deployment).or_default();
-                for PhaseCount { phase, count } in counted {
-                    match sum.iter_mut().find(|known| known.phase == phase) {
-                        Some(known) => known.count += count,
-                        None => sum.push(PhaseCount { phase, count }),
-                    }
+    /// The newest `limit` deployments, or the newest older than `before`; `None` if there is no such deployment. With `robots`
+    /// of them those that concern one of these, as far as they do.
+    pub async fn deployments(
+        &self,
+        robots: Option<&[RobotId]>,
+        before: Option<&DeploymentId>,
+        limit: u32,
+    ) -> Result<Option<DeploymentPage>, StoreError> {
+        let number = match before {
+            Some(before) => {
+                let query = sqlx::query_scalar("SELECT number FROM deployments WHERE id = $1").bind(before.as_str());
+                match query.fetch_optional(&self.reads).await? {
+                    Some(number) => number,
+                    None => return Ok(None),
                 }
             }
-        }
-        let mut views = self.deployment_views("", counts).await?;
-        views.retain(|view| !view.counts.is_empty());
-        Ok(views)
+            None => i64::MAX,
+        };
+        // Those of one write have the same number.
+        let older = "number < $1 OR (number = $1 AND id < $2)";
+        let sql = format!("{ROWS} WHERE {older} ORDER BY number DESC, id DESC LIMIT $3");
+        let mut rows = sqlx::query(AssertSqlSafe(sql))
+            .bind(number)
+            .bind(before.map_or("", DeploymentId::as_str))
+            .bind(i64::from(limit) + 1)
+            .fetch_all(&self.reads)
+            .await?;
+        let has_more = rows.len() > limit as usize;
+        rows.truncate(limit as usize);
+        let next = match rows.last() {
+            Some(last) if has_more => Some(id("deployments.id", last.try_get("id")?)?),
+            _ => None,
+        };
+        let mut deployments = self.deployment_views(&rows, robots).await?;
+        deployments.retain(|view| robots.is_none() || !view.counts.is_empty());
+        Ok(Some(DeploymentPage { deployments, next }))
     }
 
-    /// One deployment without its assignments.
+    /// One deployment without its assignments, and without its selector if that is long.
     pub async fn deployment_summary(&self, id: &DeploymentId) -> Result<Option<DeploymentView>, StoreError> {
-        Ok(self.deployment_views(id.as_str(), self.counted(id.as_str(), None).await?).await?.pop())
+        let query = sqlx::query(AssertSqlSafe(format!("{ROWS} WHERE id = $1"))).bind(id.as_str());
+        Ok(self.deployment_views(&query.fetch_all(&self.reads).await?, None).await?.pop())
     }
 
-    /// One deployment with its assignments, sorted by robot name; their `online` is left false.
-    pub async fn deployment(&self, id: &DeploymentId) -> Result<Option<DeploymentView>, StoreError> {
+    /// One deployment with its assignments, sorted by robot name; their `online` is left false, and most don't ask for their
+    /// timelines.
+    pub async fn deployment(
+        &self,
+        id: &DeploymentId,
+        with_timelines: bool,
+    ) -> Result<Option<DeploymentView>, StoreError> {
         let Some(mut view) = self.deployment_summary(id).await? else { return Ok(None) };
-        let rows = sqlx::query(
+        let timeline = if with_timelines { "a.timeline" } else { "NULL" };
+        let rows = sqlx::query(AssertSqlSafe(format!(
             "SELECT a.robot_id, r.name, a.released, a.phase, a.progress, a.failure, a.attempts, a.superseded_by,
-                 a.updated_at_ms, a.mechanism, a.rule, a.because
-             FROM assignments a JOIN robots r ON r.id = a.robot_id WHERE a.deployment_id = $1",
-        )
+                 a.updated_at_ms, a.mechanism, a.rule, a.because, CAST({timeline} AS TEXT) AS timeline
+             FROM assignments a JOIN robots r ON r.id = a.robot_id WHERE a.deployment_id = $1"
+        )))
         .bind(id.as_str())
         .fetch_all(&self.reads)
         .await?;
         let mut assignments = rows.iter().map(assignment_view).collect::<Result<Vec<_>, _>>()?;
         assignments.sort_by(|one, other| one.name.cmp(&other.name));
         view.assignments = Some(assignments);
+        view.selector = self.deployment_selector(id).await?;
         Ok(Some(view))
+    }
+
+    /// The selector that a deployment was ordered with.
+    pub async fn deployment_selector(&self, deployment: &DeploymentId) -> Result<Option<Selector>, StoreError> {
+        let query = sqlx::query_scalar("SELECT selector FROM deployments WHERE id = $1").bind(deployment.as_str());
+        let selector: Option<String> = query.fetch_optional(&self.reads).await?;
+        selector.map(|selector| id("deployments.selector", &selector)).transpose()
     }
 
     /// The packages some robot should have, or may get (back): what must not be collected.
@@ -92,52 +137,21 @@ impl Store {
         rows.iter().map(|row| from_json("deployments.package", row)).collect()
     }
 
-    /// How many assignments of each deployment stand in which phase: of one, or with an empty `id` of the newest; of all
-    /// robots or of a group of them.
-    async fn counted(
-        &self,
-        id: &str,
-        robots: Option<&[RobotId]>,
-    ) -> Result<HashMap<String, Vec<PhaseCount>>, StoreError> {
-        let among = match robots {
-            Some(group) => format!("AND robot_id IN ({})", values(2, group.len(), &["TEXT"])),
-            None => String::new(),
-        };
-        let sql = format!(
-            "SELECT deployment_id, phase, COUNT(*) FROM assignments WHERE deployment_id IN {LISTED} {among}
-             GROUP BY deployment_id, phase"
-        );
-        let mut query = sqlx::query_as::<_, (String, String, i64)>(AssertSqlSafe(sql)).bind(id);
-        for robot in robots.unwrap_or_default() {
-            query = query.bind(robot.as_str());
-        }
-        let mut counts: HashMap<String, Vec<PhaseCount>> = HashMap::new();
-        for (deployment, phase, count) in query.fetch_all(&self.reads).await? {
-            let count = PhaseCount { phase: Phase::from_text(&phase), count: number(count) };
-            counts.entry(deployment).or_default().push(count);
-        }
-        Ok(counts)
-    }
-
-    /// The views of one deployment, or with an empty `id` of the newest, with these counts.
+    /// The views of these rows, which follow each other, as far as they concern `robots`, or in whole.
     async fn deployment_views(
         &self,
-        id: &str,
-        mut counts: HashMap<String, Vec<PhaseCount>>,
+        rows: &[sqlx::any::AnyRow],
+        robots: Option<&[RobotId]>,
     ) -> Result<Vec<DeploymentView>, StoreError> {
-        let rows = sqlx::query(AssertSqlSafe(format!(
-            "SELECT id, package, kind, selector, delivery, priority, batch, max_failures, paused, created_at_ms, expires_at_ms,
-                 cancelled_at_ms
-             FROM deployments WHERE id IN {LISTED} ORDER BY number DESC"
-        )))
-        .bind(id)
-        .fetch_all(&self.reads)
-        .await?;
+        let (Some(newest), Some(oldest)) = (rows.first(), rows.last()) else { return Ok(Vec::new()) };
+        let numbers = (oldest.try_get("number")?, newest.try_get("number")?);
+        let mut counts = self.counted(numbers, robots).await?;
         let superseded: Vec<(String, String)> = sqlx::query_as(AssertSqlSafe(format!(
             "SELECT DISTINCT superseded_by, deployment_id FROM assignments WHERE superseded_by IN {LISTED}
              ORDER BY deployment_id"
         )))
-        .bind(id)
+        .bind(numbers.0)
+        .bind(numbers.1)
         .fetch_all(&self.reads)
         .await?;
         let mut supersedes: HashMap<String, Vec<DeploymentId>> = HashMap::new();
@@ -149,6 +163,40 @@ impl Store {
             deployment_view(row, counts.remove(&id).unwrap_or_default(), supersedes.remove(&id).unwrap_or_default())
         };
         rows.iter().map(view).collect()
+    }
+
+    /// How many assignments of each deployment with one of these numbers stand in which phase: of all robots or of some.
+    async fn counted(
+        &self,
+        numbers: (i64, i64),
+        robots: Option<&[RobotId]>,
+    ) -> Result<HashMap<String, Vec<PhaseCount>>, StoreError> {
+        let groups: Vec<&[RobotId]> = robots.map_or_else(|| vec![[].as_slice()], |robots| groups(robots).collect());
+        let mut counts: HashMap<String, Vec<PhaseCount>> = HashMap::new();
+        for group in groups {
+            let among = match group.len() {
+                0 => String::new(),
+                robots => format!("AND robot_id IN ({})", values(3, robots, &["TEXT"])),
+            };
+            let sql = format!(
+                "SELECT deployment_id, phase, COUNT(*) FROM assignments WHERE deployment_id IN {LISTED} {among}
+                 GROUP BY deployment_id, phase"
+            );
+            let mut query =
+                sqlx::query_as::<_, (String, String, i64)>(AssertSqlSafe(sql)).bind(numbers.0).bind(numbers.1);
+            for robot in group {
+                query = query.bind(robot.as_str());
+            }
+            for (deployment, phase, count) in query.fetch_all(&self.reads).await? {
+                let (phase, count) = (Phase::from_text(&phase), number(count));
+                let sum = counts.entry(deployment).or_default();
+                match sum.iter_mut().find(|known| known.phase == phase) {
+                    Some(known) => known.count += count,
+                    None => sum.push(PhaseCount { phase, count }),
+                }
+            }
+        }
+        Ok(counts)
     }
 }
 
@@ -258,7 +306,7 @@ fn deployment_view(
         id: id("deployments.id", row.try_get("id")?)?,
         package: from_json("deployments.package", row.try_get("package")?)?,
         kind,
-        selector: id("deployments.selector", row.try_get("selector")?)?,
+        selector: row.try_get::<Option<&str>, _>("selector")?.map(|it| id("deployments.selector", it)).transpose()?,
         delivery: from_word("deployments.delivery", row.try_get("delivery")?)?,
         priority: priority(row)?,
         state: deployment::state(kind, cancelled, paused, &counts),
@@ -286,5 +334,6 @@ fn assignment_view(row: &sqlx::any::AnyRow) -> Result<AssignmentView, StoreError
         attempts: u32::try_from(row.try_get::<i64, _>("attempts")?).unwrap_or(u32::MAX),
         superseded_by: superseded_by.map(|newer| id("assignments.superseded_by", &newer)).transpose()?,
         updated_at_ms: number(row.try_get("updated_at_ms")?),
+        timeline: row.try_get::<Option<&str>, _>("timeline")?.map(timelines::read),
     })
 }

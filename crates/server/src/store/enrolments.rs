@@ -143,7 +143,7 @@ impl Write {
         .fetch_optional(self.connection())
         .await?;
         if revoked.is_some() {
-            self.revoke_tokens(robot, now_ms).await?;
+            self.revoke_tokens(std::slice::from_ref(robot), now_ms).await?;
         }
         Ok(revoked.is_some())
     }

@@ -21,6 +21,9 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[
     (11, "client_keys", include_str!("../migrations/0011_client_keys.sql")),
     (12, "provider", include_str!("../migrations/0012_provider.sql")),
     (13, "approval", include_str!("../migrations/0013_approval.sql")),
+    (14, "history", include_str!("../migrations/0014_history.sql")),
+    (15, "ran", include_str!("../migrations/0015_ran.sql")),
+    (16, "ran_before", include_str!("../migrations/0016_ran_before.sql")),
 ];
 
 /// Applies what has not been applied yet.

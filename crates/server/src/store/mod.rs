@@ -9,17 +9,21 @@ mod assignments;
 mod audit;
 mod deliveries;
 mod deployments;
+mod earlier;
 mod enrolments;
 mod fan_outs;
 mod first_use;
 mod migrate;
 mod orders;
 mod outputs;
+mod package_use;
 mod packages;
 mod publishers;
 mod reports;
+mod robot_pages;
 mod robots;
 mod rows;
+mod timelines;
 mod tokens;
 mod users;
 
@@ -34,13 +38,17 @@ use access::{Access, Ending};
 pub use assignments::{Released, Revocable, TaskOrder};
 pub use audit::{Act, Deed};
 pub use deliveries::{Decided, DeliveryOrder, RobotFacts};
-pub use deployments::NewDeployment;
+pub use deployments::{DeploymentPage, NewDeployment};
+pub use earlier::{EarlierPackage, Unsuccessful};
 use first_use::FirstUses;
 pub use orders::PastOrder;
+pub use package_use::{DeletePackage, PackageUsers};
 pub use packages::{NewManifest, PutManifest, Reference, StoredManifest};
 pub use publishers::SignedDocument;
 pub use reports::{OpenAssignment, ReportedRobot};
+pub use robot_pages::RobotPage;
 pub use robots::{BrokerCredential, DesiredTasks, FetchedBy, KnownRobot};
+pub use timelines::{HistoryPage, HistoryQuery};
 pub use tokens::{Admitted, EnrolmentTerms, TokenHolder};
 pub use users::{NewToken, User};
 
@@ -60,6 +68,16 @@ pub struct Store {
     writes: AnyPool,
     access: Access,
     first_uses: FirstUses,
+    is_postgres: bool,
+}
+
+/// Which database it is, and how large.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct DatabaseSize {
+    /// `sqlite` or `postgres`.
+    pub kind: &'static str,
+    /// Its size, if it says so.
+    pub bytes: Option<u64>,
 }
 
 /// Why the database did not do as it was told.
@@ -163,7 +181,8 @@ impl Store {
         let writes = pool_options(url, 1, WRITER_CACHE).connect(url).await.map_err(open_error)?;
         migrate::run(&writes).await.map_err(|source| StoreError::Migrate { url: without_password(url), source })?;
         let reads = pool_options(url, READERS, READER_CACHE).connect(url).await.map_err(open_error)?;
-        Ok(Self { reads, writes, access: Access::default(), first_uses: FirstUses::default() })
+        let is_postgres = url.starts_with("postgres");
+        Ok(Self { reads, writes, access: Access::default(), first_uses: FirstUses::default(), is_postgres })
     }
 
     /// Ends all connections, after the writes that are under way.
@@ -178,16 +197,27 @@ impl Store {
         Ok(())
     }
 
+    /// Which database it is, and how large.
+    pub async fn size(&self) -> Result<DatabaseSize, StoreError> {
+        let (kind, sql) = match self.is_postgres {
+            true => ("postgres", "SELECT pg_database_size(current_database())"),
+            false => ("sqlite", "SELECT page_count * page_size FROM pragma_page_count(), pragma_page_size()"),
+        };
+        // One that must not be asked this is none the worse for it.
+        let bytes: Option<i64> = sqlx::query_scalar(sql).fetch_optional(&self.reads).await.unwrap_or_default();
+        Ok(DatabaseSize { kind, bytes: bytes.map(rows::number) })
+    }
+
     /// Begins a write. Its first statement is an update of one row that every write updates, so on both databases a
     /// second write waits here, before it has read anything, until the first has ended.
     pub async fn begin(&self) -> Result<Write, StoreError> {
-        let mut write = self.begin_reports().await?;
+        let mut write = self.begin_keeping_rights().await?;
         write.changes_access();
         Ok(write)
     }
 
-    /// Begins a write of what robots report, which changes nobody's rights unless it moves a rollout on.
-    pub async fn begin_reports(&self) -> Result<Write, StoreError> {
+    /// Begins a write that changes nobody's rights, like what robots report, or that is never committed.
+    pub async fn begin_keeping_rights(&self) -> Result<Write, StoreError> {
         let mut transaction = self.writes.begin().await?;
         let turn: i64 = sqlx::query_scalar("UPDATE write_lock SET turn = turn + 1 WHERE id = 1 RETURNING turn")
             .fetch_one(&mut *transaction)

@@ -305,7 +305,7 @@ impl Store {
 }
 
 impl Write {
-    async fn delete_manifest(
+    pub(super) async fn delete_manifest(
         &mut self,
         repository: &RepositoryName,
         digest: &Digest,
@@ -429,7 +429,7 @@ fn descriptor(row: &AnyRow) -> Result<Descriptor, StoreError> {
     })
 }
 
-fn package_view(row: &AnyRow) -> Result<PackageView, StoreError> {
+pub(super) fn package_view(row: &AnyRow) -> Result<PackageView, StoreError> {
     Ok(PackageView {
         package: rows::from_json("packages.package", row.try_get("package")?)?,
         pushed_at_ms: rows::number(row.try_get("pushed_at_ms")?),

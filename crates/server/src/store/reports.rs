@@ -7,9 +7,12 @@ use task_proto::report::{Phase, Report};
 use task_proto::{DeploymentId, Generation, RobotId, RobotName};
 
 use super::rows::{from_json, from_optional_json, from_word, groups, id, json, number, stored, values};
+use super::timelines::{grown, step};
 use super::{StoreError, Write};
 use crate::deployment::Standing;
 
+/// Columns of where an assignment stands in a statement.
+const STANDING: &[&str] = &["TEXT", "TEXT", "TEXT", "BIGINT", "TEXT", "TEXT", "BIGINT", "BIGINT", "TEXT"];
 /// The highest generation a robot is believed. Beyond it a made-up one would leave no room above it.
 const MAX_GENERATION: Generation = Generation(1 << 53);
 
@@ -148,16 +151,18 @@ impl Write {
         Ok(())
     }
 
-    /// Stores where assignments stand now. One that has run or ended does not expire any more.
+    /// Stores where assignments stand now, and that they came there or try again. One that has run or ended does not expire any more.
     pub async fn store_standings(&mut self, assignments: &[OpenAssignment], now_ms: u64) -> Result<(), StoreError> {
         for group in groups(assignments) {
             let sql = format!(
-                "WITH v (deployment_id, robot_id, phase, ended, progress, failure, attempts, reached) AS ({})
+                "WITH v (deployment_id, robot_id, phase, ended, progress, failure, attempts, reached, step) AS ({})
                  UPDATE assignments SET phase = v.phase, ended = v.ended, progress = v.progress, failure = v.failure,
-                     attempts = v.attempts, updated_at_ms = $1,
-                     expires_at_ms = CASE v.reached WHEN 1 THEN NULL ELSE expires_at_ms END
+                     attempts = v.attempts, updated_at_ms = $1, timeline = {},
+                     expires_at_ms = CASE v.reached WHEN 1 THEN NULL ELSE expires_at_ms END,
+                     ran = CASE WHEN v.phase IN ('running', 'succeeded') THEN 1 ELSE ran END
                  FROM v WHERE assignments.deployment_id = v.deployment_id AND assignments.robot_id = v.robot_id",
-                values(2, group.len(), &["TEXT", "TEXT", "TEXT", "BIGINT", "TEXT", "TEXT", "BIGINT", "BIGINT"])
+                values(2, group.len(), STANDING),
+                grown("v.step")
             );
             let mut query = sqlx::query(AssertSqlSafe(sql)).bind(stored(now_ms));
             for OpenAssignment { deployment, robot, standing, .. } in group {
@@ -170,7 +175,8 @@ impl Write {
                     .bind(standing.progress.as_ref().map(json))
                     .bind(standing.failure.as_ref().map(json))
                     .bind(i64::from(standing.attempts))
-                    .bind(i64::from(ended || standing.phase == Phase::Running));
+                    .bind(i64::from(ended || standing.phase == Phase::Running))
+                    .bind(step(standing.phase, now_ms, standing.attempts));
             }
             query.execute(self.connection()).await?;
         }

@@ -7,8 +7,9 @@ use sqlx::{AssertSqlSafe, Row as _};
 use task_proto::api::{AWAITS_APPROVAL, RobotTask, RobotView};
 use task_proto::desired::{BlobRef, Delivery, DesiredTask, Evidence, PackageRef};
 use task_proto::id::Labels;
-use task_proto::report::{Condition, Phase, Report};
+use task_proto::report::{Condition, LinkFacts, Phase, Report};
 use task_proto::selector::Selector;
+use task_proto::settings::RobotSettings;
 use task_proto::{DeploymentId, Digest, Generation, MacAddress, RobotId, RobotName, TaskName};
 
 use super::deliveries;
@@ -53,6 +54,8 @@ pub struct DesiredTasks {
     pub along: Vec<BlobRef>,
     /// What publishers have signed about these tasks' packages.
     pub evidence: Evidence,
+    /// What was set for it.
+    pub settings: RobotSettings,
 }
 
 /// An order for which a robot fetches something.
@@ -66,7 +69,7 @@ pub struct FetchedBy {
     pub labels: Labels,
 }
 
-const KNOWN: &str = "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL";
+pub(super) const KNOWN: &str = "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL";
 
 /// Those that can be ordered something.
 const ORDERABLE: &str = "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL AND awaits_approval = 0";
@@ -117,10 +120,26 @@ impl Store {
 
     /// The robots in a scope.
     pub async fn robots_in(&self, scope: &Scope) -> Result<Vec<RobotId>, StoreError> {
+        Ok(self.known_robots(scope).await?.into_iter().map(|robot| robot.id).collect())
+    }
+
+    /// The robots of a scope, with what transfers to them have shown.
+    pub async fn robots_and_links(&self, scope: &Scope) -> Result<Vec<(KnownRobot, Option<LinkFacts>)>, StoreError> {
+        let sql = "SELECT id, name, mac, labels, link FROM robots WHERE removed_at_ms IS NULL";
+        let rows = sqlx::query(sql).fetch_all(&self.reads).await?;
+        let read =
+            |row: &sqlx::any::AnyRow| Ok((known_robot(row)?, from_optional_json("robots.link", row.try_get("link")?)?));
+        let mut robots = rows.iter().map(read).collect::<Result<Vec<(KnownRobot, _)>, StoreError>>()?;
+        robots.retain(|(robot, _)| scope.covers(&robot.id, &robot.name, &robot.labels));
+        Ok(robots)
+    }
+
+    /// The robots of a scope.
+    pub async fn known_robots(&self, scope: &Scope) -> Result<Vec<KnownRobot>, StoreError> {
         let rows = sqlx::query(KNOWN).fetch_all(&self.reads).await?;
         let mut robots = rows.iter().map(known_robot).collect::<Result<Vec<_>, _>>()?;
         robots.retain(|robot| scope.covers(&robot.id, &robot.name, &robot.labels));
-        Ok(robots.into_iter().map(|robot| robot.id).collect())
+        Ok(robots)
     }
 
     /// Every robot.
@@ -156,7 +175,7 @@ impl Store {
         for group in groups(robots) {
             // One statement, so that generation and tasks belong together.
             let sql = format!(
-                "SELECT r.id, r.generation, r.observed_generation, a.task, a.deployment_id, a.wanted, a.run, d.package,
+                "SELECT r.id, r.generation, r.observed_generation, r.settings, a.task, a.deployment_id, a.wanted, a.run, d.package,
                      a.phase, COALESCE(a.mechanism, d.delivery) AS mechanism, d.priority
                  FROM robots r
                  LEFT JOIN assignments a ON a.robot_id = r.id AND a.desired = 1
@@ -179,6 +198,7 @@ impl Store {
                         tasks: Vec::new(),
                         along: Vec::new(),
                         evidence: Evidence::default(),
+                        settings: settings(&row)?.unwrap_or_default(),
                     });
                 }
                 if let (Some(last), Some(task)) = (found.last_mut(), desired_task(&row)?) {
@@ -282,6 +302,37 @@ impl Write {
         Ok(())
     }
 
+    /// Stores what is set for a robot, if that is something else than what was. It is part of its desired state, whose
+    /// generation is raised then.
+    pub async fn update_settings(&mut self, robot: &RobotId, settings: &RobotSettings) -> Result<bool, StoreError> {
+        let settings = Some(settings).filter(|settings| !settings.is_empty()).map(json);
+        let changed = sqlx::query(
+            "UPDATE robots SET settings = $2, generation = generation + 1
+             WHERE id = $1 AND COALESCE(settings, '') <> COALESCE(CAST($2 AS TEXT), '')",
+        )
+        .bind(robot.as_str())
+        .bind(settings)
+        .execute(self.connection())
+        .await?;
+        Ok(changed.rows_affected() > 0)
+    }
+
+    /// Stores these robots' labels.
+    pub async fn update_labels(&mut self, robots: &[&KnownRobot]) -> Result<(), StoreError> {
+        for group in groups(robots) {
+            let sql = format!(
+                "WITH v (id, labels) AS ({}) UPDATE robots SET labels = v.labels FROM v WHERE robots.id = v.id",
+                values(1, group.len(), &["TEXT", "TEXT"])
+            );
+            let mut query = sqlx::query(AssertSqlSafe(sql));
+            for robot in group {
+                query = query.bind(robot.id.as_str()).bind(json(&robot.labels));
+            }
+            query.execute(self.connection()).await?;
+        }
+        Ok(())
+    }
+
     /// Forgets what a robot has reported: it registers again, perhaps with an empty disk, and counts from 1.
     pub async fn forget_report(&mut self, robot: &RobotId) -> Result<(), StoreError> {
         sqlx::query(
@@ -303,13 +354,19 @@ impl Write {
         Ok(())
     }
 
-    /// Marks a robot as removed: its MAC and name are free, its id is not.
-    pub async fn remove_robot(&mut self, robot: &RobotId, now_ms: u64) -> Result<(), StoreError> {
-        sqlx::query("UPDATE robots SET removed_at_ms = $2, report = NULL WHERE id = $1")
-            .bind(robot.as_str())
-            .bind(stored(now_ms))
-            .execute(self.connection())
-            .await?;
+    /// Marks robots as removed: their MACs and names are free, their ids are not.
+    pub async fn remove_robots(&mut self, robots: &[RobotId], now_ms: u64) -> Result<(), StoreError> {
+        for group in groups(robots) {
+            let sql = format!(
+                "UPDATE robots SET removed_at_ms = $1, report = NULL WHERE id IN ({})",
+                values(2, group.len(), &["TEXT"])
+            );
+            let mut query = sqlx::query(AssertSqlSafe(sql)).bind(stored(now_ms));
+            for robot in group {
+                query = query.bind(robot.as_str());
+            }
+            query.execute(self.connection()).await?;
+        }
         Ok(())
     }
 }
@@ -320,7 +377,7 @@ const CREDENTIALS: &str = "SELECT id, broker_credential FROM robots
 const WITH_TASK: &str = "SELECT robot_id FROM assignments WHERE task = $1 AND desired = 1";
 
 const ROBOT_ROWS: &str = "SELECT r.id, r.name, r.mac, r.labels, r.enrolled_at_ms, r.generation, r.observed_generation,
-         r.report, r.link, r.last_seen_ms, r.revoked_at_ms, r.awaits_approval
+         r.report, r.link, r.last_seen_ms, r.revoked_at_ms, r.awaits_approval, r.settings
      FROM robots r WHERE r.removed_at_ms IS NULL";
 
 /// What each robot should have, and what it is still getting rid of. The first condition is that of an index, word for
@@ -349,6 +406,11 @@ pub(super) fn known_robot(row: &sqlx::any::AnyRow) -> Result<KnownRobot, StoreEr
 fn broker_credential(row: &sqlx::any::AnyRow) -> Result<BrokerCredential, StoreError> {
     let number = number(row.try_get("broker_credential")?);
     Ok(BrokerCredential { robot: id("robots.id", row.try_get("id")?)?, number })
+}
+
+/// What was set for a robot; `None`: nothing.
+fn settings(row: &sqlx::any::AnyRow) -> Result<Option<RobotSettings>, StoreError> {
+    from_optional_json("robots.settings", row.try_get("settings")?)
 }
 
 fn desired_task(row: &sqlx::any::AnyRow) -> Result<Option<DesiredTask>, StoreError> {
@@ -407,9 +469,10 @@ fn robot_view(row: &sqlx::any::AnyRow, mut tasks: Vec<RobotTask>) -> Result<Robo
         );
         conditions.push(Condition { code: "diverged".to_owned(), text });
     }
-    let (mut host, mut reported) = (None, Vec::new());
-    if let Some(report) = report {
+    let (mut host, mut effective_settings, mut reported) = (None, None, Vec::new());
+    if let Some(mut report) = report {
         conditions.extend(report.conditions);
+        effective_settings = report.host.settings.take();
         host = Some(report.host);
         reported = report.tasks;
     }
@@ -437,6 +500,9 @@ fn robot_view(row: &sqlx::any::AnyRow, mut tasks: Vec<RobotTask>) -> Result<Robo
         link: from_optional_json("robots.link", row.try_get("link")?)?,
         tasks,
         mqtt: None,
+        vitals: None,
+        settings: settings(row)?,
+        effective_settings,
     })
 }
 

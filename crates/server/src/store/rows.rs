@@ -104,6 +104,13 @@ mod tests {
     use super::*;
 
     #[test]
+    fn a_number_beyond_the_columns_range_is_the_last_in_it() {
+        for (given, kept) in [(0, 0), (1 << 53, 1 << 53), (1 << 63, i64::MAX), (u64::MAX, i64::MAX)] {
+            assert_eq!(stored(given), kept, "{given}");
+        }
+    }
+
+    #[test]
     fn groups_cover_all_rows_in_few_lengths() {
         let rows: Vec<u32> = (0..139).collect();
         let lengths: Vec<usize> = groups(&rows).map(<[u32]>::len).collect();

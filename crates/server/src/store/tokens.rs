@@ -3,7 +3,7 @@
 
 use std::collections::BTreeSet;
 
-use sqlx::Row as _;
+use sqlx::{AssertSqlSafe, Row as _};
 use subtle::ConstantTimeEq as _;
 use task_proto::api::TokenOrigin;
 use task_proto::envelope::PublicKey;
@@ -13,7 +13,7 @@ use task_proto::selector::Selector;
 use task_proto::token::{Token, TokenKind};
 use task_proto::{RobotId, UserName};
 
-use super::rows::{from_optional_json, from_word, id, json, number, optional, stored};
+use super::rows::{from_optional_json, from_word, groups, id, json, number, optional, stored, values};
 use super::{Store, StoreError, Write};
 use crate::person::{Person, Scope};
 use crate::tls::ClientProof;
@@ -259,13 +259,19 @@ impl Write {
         Ok(found.is_some())
     }
 
-    /// Ends all tokens made for `robot`.
-    pub async fn revoke_tokens(&mut self, robot: &RobotId, now_ms: u64) -> Result<(), StoreError> {
-        sqlx::query("UPDATE tokens SET revoked_at_ms = $2 WHERE robot_id = $1 AND revoked_at_ms IS NULL")
-            .bind(robot.as_str())
-            .bind(stored(now_ms))
-            .execute(self.connection())
-            .await?;
+    /// Ends all tokens made for `robots`.
+    pub async fn revoke_tokens(&mut self, robots: &[RobotId], now_ms: u64) -> Result<(), StoreError> {
+        for group in groups(robots) {
+            let sql = format!(
+                "UPDATE tokens SET revoked_at_ms = $1 WHERE revoked_at_ms IS NULL AND robot_id IN ({})",
+                values(2, group.len(), &["TEXT"])
+            );
+            let mut query = sqlx::query(AssertSqlSafe(sql)).bind(stored(now_ms));
+            for robot in group {
+                query = query.bind(robot.as_str());
+            }
+            query.execute(self.connection()).await?;
+        }
         Ok(())
     }
 

@@ -60,6 +60,7 @@ impl<B: Body<Data = Bytes> + Unpin> Body for TransferBody<B> {
             },
         };
         this.next = None;
+        this.transfer.sent(length as u64);
         Poll::Ready(Some(Ok(Frame::data(this.held.split_to(length)))))
     }
 

@@ -5,7 +5,8 @@ mod body;
 mod pace;
 mod queue;
 
-use std::collections::HashMap;
+use std::collections::{HashMap, VecDeque};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -23,6 +24,8 @@ use crate::config::TransferLimits;
 
 /// How long a request waits for its turn.
 const PATIENCE: Duration = Duration::from_secs(2);
+/// Over how many looks the speed is shown.
+const LOOKS: usize = 6;
 /// When a robot should come back for which there was no place.
 const NO_PLACE_MS: u64 = 30_000;
 
@@ -37,6 +40,10 @@ struct Shared {
     site_label: LabelKey,
     turns: Mutex<Turns>,
     paces: Mutex<Paces>,
+    /// Bytes that went to robots.
+    sent: AtomicU64,
+    /// How many they were, and when.
+    looks: Mutex<VecDeque<(Instant, u64)>>,
 }
 
 struct Turns {
@@ -74,7 +81,8 @@ impl Transfers {
         let paces = Paces { all: pace(limits.all.bytes_per_s), sites: sites.collect() };
         let turns = Turns { queue: Queue::new(limits), asking: HashMap::new() };
         let (turns, paces) = (Mutex::new(turns), Mutex::new(paces));
-        Self { shared: Arc::new(Shared { started: now, site_label, turns, paces }) }
+        let (sent, looks) = (AtomicU64::new(0), Mutex::default());
+        Self { shared: Arc::new(Shared { started: now, site_label, turns, paces, sent, looks }) }
     }
 
     /// Where a robot with these labels is.
@@ -85,6 +93,28 @@ impl Transfers {
     /// How many run now.
     pub fn running(&self) -> u64 {
         self.shared.turns().queue.running()
+    }
+
+    /// How many wait for their turn.
+    pub fn waiting(&self) -> u64 {
+        self.shared.turns().queue.waiting()
+    }
+
+    /// What all together got a second, lately; see [`Transfers::look`].
+    pub fn bytes_per_s(&self) -> u64 {
+        let looks = self.shared.looks.lock().unwrap_or_else(PoisonError::into_inner);
+        let (Some((from, sent_before)), Some((to, sent))) = (looks.front(), looks.back()) else { return 0 };
+        let seconds = to.duration_since(*from).as_secs_f64();
+        if seconds > 0.0 { (sent.saturating_sub(*sent_before) as f64 / seconds) as u64 } else { 0 }
+    }
+
+    /// Looks how much was sent so far. To be called every second or so: the speed shown is over the last looks.
+    pub fn look(&self) {
+        let mut looks = self.shared.looks.lock().unwrap_or_else(PoisonError::into_inner);
+        if looks.len() >= LOOKS {
+            looks.pop_front();
+        }
+        looks.push_back((Instant::now(), self.shared.sent.load(Ordering::Relaxed)));
     }
 
     /// Waits for `robot`'s turn to pull `blob`, for a moment.
@@ -171,6 +201,10 @@ impl Shared {
 }
 
 impl Transfer {
+    fn sent(&self, bytes: u64) {
+        self.shared.sent.fetch_add(bytes, Ordering::Relaxed);
+    }
+
     /// How many of `bytes` may go next, and when; `None`: all, and now.
     fn reserve(&self, bytes: u64) -> Option<(u64, Instant)> {
         let mut paces = self.shared.paces();

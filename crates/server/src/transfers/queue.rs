@@ -118,6 +118,11 @@ impl Queue {
         self.all.running
     }
 
+    /// Robots that wait for their turn, here or away.
+    pub(super) fn waiting(&self) -> u64 {
+        self.waiting.len() as u64
+    }
+
     /// A robot asks. Its request waits from now on, in the place that it has if it was here before; an earlier request of
     /// the same place waits no longer. `None`: there are as many places as there may be.
     pub(super) fn ask(&mut self, place: Place, claim: &Claim, now_ms: u64) -> Option<Asking> {

@@ -17,6 +17,7 @@ use crate::story::code;
 
 on_both_databases! {
     a_robot_waits_until_it_is_approved_or_turned_away_or_a_week_has_passed,
+    no_more_than_a_thousand_wait,
 }
 
 const DAY_MS: u64 = 24 * 60 * 60 * 1000;
@@ -64,6 +65,21 @@ async fn a_robot_waits_until_it_is_approved_or_turned_away_or_a_week_has_passed(
     assert_eq!(holder(&two.token).await, None);
     let left: Vec<RobotId> = store.robots().await.expect("reads").into_iter().map(|robot| robot.id).collect();
     assert_eq!(left, [one.robot_id]);
+}
+
+async fn no_more_than_a_thousand_wait(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let token = fleet.enrolment_token(CreateEnrollmentToken { approval: true, ..Default::default() }).await;
+    let mut first = None;
+    for number in 0..1_000 {
+        let came = fleet.try_enroll(&token, mac(number), None).await.expect("enrols");
+        first.get_or_insert(came.robot_id);
+    }
+    let one_more = async || fleet.try_enroll(&token, mac(1_000), None).await;
+    assert_eq!(code(one_more().await), "too_many_requests");
+    assert!(fleet.try_enroll(&token, mac(0), None).await.is_ok(), "who waits already may ask again");
+    fleet.actions.approve_robot(&fleet.operator, &first.expect("came")).await.expect("approved");
+    assert!(one_more().await.expect("enrols").awaits_approval);
 }
 
 async fn enrol(server: &TestServer, token: &str, number: u8) -> EnrollResponse {

@@ -22,6 +22,7 @@ struct Stage {
     manifest: String,
     deployment: String,
     paused: String,
+    failed: String,
     enrolment: String,
     signed_in: AccessToken,
     other_token: AccessToken,
@@ -31,6 +32,13 @@ impl Stage {
     async fn new() -> Self {
         let server = TestServer::start().await;
         let (mut robot, _) = (server.enroll("atlas").await, server.enroll("boreas").await);
+        server.push("spare", "1.0.0").await;
+        let old = server.push("runner", "1.0.0").await;
+        server.deploy(&old, "*", "old-runner").await;
+        let state = server.desired(&robot).await;
+        assert_eq!(server.report(&mut robot, &state, Phase::Running).await.status(), 200);
+        let runner = server.push("runner", "2.0.0").await;
+        let failed = server.deploy(&runner, "*", "new-runner").await.id.to_string();
         let climber = server.push("climber", "1.0.0").await;
         let careful = json!({
             "package": "climber", "manifest": climber.manifest.digest, "selector": "*", "batch": 1, "max_failures": 0,
@@ -50,7 +58,7 @@ impl Stage {
         let enrolment: EnrollmentToken = server.post("/api/v1/enrollment-tokens", &json!({})).await;
         let enrolment = enrolment.token;
         let paused = paused.id.to_string();
-        Self { server, robot, talker, walker, manifest, deployment, paused, enrolment, signed_in, other_token }
+        Self { server, robot, talker, walker, manifest, deployment, paused, failed, enrolment, signed_in, other_token }
     }
 
     fn order(&self, path: &str, body: &Value) -> RequestBuilder {
@@ -82,6 +90,14 @@ impl Stage {
             ("deployment.create", self.order(&api("deployments"), &deploy)),
             ("task.stop", self.order(&api("tasks/talker/stop"), &all)),
             ("task.start", self.order(&api("tasks/talker/start"), &all)),
+            ("task.restart", self.order(&api("tasks/talker/restart"), &all)),
+            ("deployment.retry", self.order(&api(&format!("deployments/{}/retry", self.failed)), &json!({}))),
+            ("task.rollback", self.order(&api("tasks/runner/rollback"), &all)),
+            (
+                "bulk.labels",
+                request(Method::POST, &api("bulk/labels"), json!({ "selector": "*", "set": { "a": "b" } })),
+            ),
+            ("manifest.delete", delete(&api("packages/spare/1.0.0"))),
             ("task.remove", self.order(&api("tasks/talker/remove"), &all)),
             (
                 "deployment.cancel",
@@ -107,6 +123,7 @@ impl Stage {
                 request(Method::PUT, &api("users/alice/password"), json!({ "password": "another long one" })),
             ),
             ("user.remove", delete(&api("users/alice"))),
+            ("bulk.remove", request(Method::POST, &api("bulk/remove"), json!({ "selector": "boreas" }))),
             ("robot.remove", delete(&robot(""))),
         ]
     }
@@ -141,6 +158,8 @@ async fn what_can_not_be_written_down_is_not_done() {
         let status = send(request, act, "/v2/talker/manifests/2.0.0").await;
         // The robot that is asked is not there; that it was asked is written down.
         assert!(status < 300 || act == "robot.ask", "{act}: {status}");
+        // Of each robot that is removed with others there is one as well.
+        expected.extend((act == "bulk.remove").then(|| "robot.remove".to_owned()));
         expected.push(act.to_owned());
         assert_eq!(stage.entries().await, expected, "{act} is one entry");
         assert_ne!(contents(&stage.database()).await, was, "{act}");

@@ -13,6 +13,8 @@ use taskd::config::Config;
 use taskd::serve::Server;
 use tempfile::TempDir;
 
+use crate::outputs::{Push, file, output};
+
 /// A server and the directory its operator works in.
 pub struct Bench {
     pub server: Option<Server>,
@@ -68,12 +70,18 @@ pub async fn run(mut command: std::process::Command) -> Ran {
 
 impl Bench {
     pub async fn start() -> Self {
+        Self::start_with(|_| {}, Clock::system()).await
+    }
+
+    /// With other settings, and by another clock.
+    pub async fn start_with(set: impl FnOnce(&mut Config), clock: Clock) -> Self {
         let _ = rustls::crypto::ring::default_provider().install_default();
         let dir = tempfile::tempdir().unwrap();
         let mut config = Config::with_data(dir.path().join("server"));
         config.http = ([127, 0, 0, 1], 0).into();
         config.mqtt = ([127, 0, 0, 1], 0).into();
-        let server = Server::start(config, Clock::system()).await.unwrap();
+        set(&mut config);
+        let server = Server::start(config, clock).await.unwrap();
         Self { server: Some(server), dir, http: reqwest::Client::new() }
     }
 
@@ -114,7 +122,7 @@ impl Bench {
         format!("http://{}/api/v1{path}", self.server().addresses().http)
     }
 
-    async fn enroll(&self, number: u8) -> Robot {
+    pub async fn enroll(&self, number: u8) -> Robot {
         let token =
             self.taskd(&["enroll-token", "create", "-o", "json"]).await.json()["token"].as_str().unwrap().to_owned();
         let body = json!({ "mac": format!("02:00:00:00:00:{number:02x}"), "name": format!("robot-{number}") });
@@ -123,8 +131,20 @@ impl Bench {
         Robot { identity: answer.json().await.unwrap(), seq: 0.into() }
     }
 
+    /// Robot `robot` brings these files back from a task called mapping.
+    pub async fn bring_back(&self, robot: &Robot, files: &[(&str, &[u8])]) {
+        let EnrollResponse { robot_id, token, .. } = &robot.identity;
+        let url = format!("http://{}/v2/outputs/{robot_id}/mapping", self.server().addresses().http);
+        let push = Push { client: self.http.clone(), url, token: token.clone() };
+        let mut set = output(robot_id, 1, Vec::new());
+        for (path, bytes) in files {
+            set.files.push(file(path, push.blob(bytes).await));
+        }
+        assert_eq!(push.output(&set).await, 201);
+    }
+
     /// Robot `robot` says that it has everything it was told to, and that the task of `deployment` is in `phase`.
-    async fn report(&self, robot: &Robot, deployment: &Value, phase: &str) {
+    pub async fn report(&self, robot: &Robot, deployment: &Value, phase: &str) {
         let mut task = json!({
             "task": "hello", "deployment": deployment["id"], "package": deployment["package"], "wanted": "running",
             "run": 1, "kind": "service", "phase": phase, "phase_ms": 1,
@@ -157,8 +177,8 @@ impl Bench {
     }
 }
 
-struct Robot {
-    identity: EnrollResponse,
+pub struct Robot {
+    pub identity: EnrollResponse,
     seq: std::cell::Cell<u64>,
 }
 
@@ -283,7 +303,9 @@ async fn robots_and_deployments_are_shown_and_removed() {
     {
         assert_eq!(run(command(&order)).await.expect(0, "").stdout, list.stdout, "options stand anywhere");
     }
-    assert!(list.stdout.contains("robot-7") && list.stdout.contains("02:00:00:00:00:07"), "{}", list.stdout);
+    assert!(list.stdout.contains("robot-7") && !list.stdout.contains("02:00:00:00:00:07"), "{}", list.stdout);
+    let wide = bench.taskd(&["robot", "list", "-o", "wide"]).await.expect(0, "");
+    assert!(wide.stdout.contains("02:00:00:00:00:07"), "{}", wide.stdout);
     let deployment = bench.taskd(&["push", &bench.package("1", ""), "--to", "*", "-o", "json"]).await.json();
     let deployment = deployment["id"].as_str().unwrap();
     let shown = bench.taskd(&["deploy", "info", deployment]).await.expect(0, "");
@@ -312,6 +334,7 @@ async fn robots_and_deployments_are_shown_and_removed() {
     bench.taskd(&["deploy", "info", "d0000000000000000"]).await.expect(1, "not_found");
     bench.taskd(&["robot", "rm", "robot-7"]).await.expect(2, "give --yes");
     bench.taskd(&["robot", "rm", "robot-7", "--yes"]).await.expect(0, id);
+    bench.taskd(&["robot", "rm", "robot-7", "--yes"]).await.expect(2, "robot-7: no robot matches");
     bench.taskd(&["robot", "info", "robot-7"]).await.expect(2, "no robot has the name or id robot-7");
 }
 
@@ -353,7 +376,7 @@ async fn a_closed_pipe_is_no_panic() {
 }
 
 /// A pipe whose reader has gone.
-fn closed_pipe() -> Stdio {
+pub fn closed_pipe() -> Stdio {
     let (reader, writer) = std::io::pipe().unwrap();
     drop(reader);
     writer.into()

@@ -42,7 +42,7 @@ async fn label(fleet: &Fleet, robot: &Robot, key: &str, value: &str) {
     let labels = [(key.parse().expect("a key"), value.parse().expect("a value"))].into();
     fleet
         .actions
-        .edit_robot(&fleet.operator, &robot.id, &EditRobot { name: None, labels: Some(labels) })
+        .edit_robot(&fleet.operator, &robot.id, &EditRobot { labels: Some(labels), ..EditRobot::default() })
         .await
         .expect("edited");
 }

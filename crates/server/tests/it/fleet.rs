@@ -105,7 +105,13 @@ impl Fleet {
     }
 
     pub async fn deployment(&self, id: &DeploymentId) -> DeploymentView {
-        self.database.store.deployment(id).await.expect("reads").expect("there")
+        self.database.store.deployment(id, true).await.expect("reads").expect("there")
+    }
+
+    /// The newest ones.
+    pub async fn deployments(&self) -> Vec<DeploymentView> {
+        let page = self.database.store.deployments(None, None, 1_000).await.expect("reads");
+        page.expect("no other was named").deployments
     }
 
     pub async fn view(&self, robot: &Robot) -> RobotView {

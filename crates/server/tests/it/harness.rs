@@ -171,9 +171,13 @@ impl TestServer {
     /// The robot reports that it accepted `state` and that all of its tasks stand in `phase`.
     pub async fn report(&self, robot: &mut TestRobot, state: &DesiredState, phase: Phase) -> Response {
         let report = robot.next_report(state, phase);
+        self.send_report(robot, &report).await
+    }
+
+    pub async fn send_report(&self, robot: &TestRobot, report: &Report) -> Response {
         let path = format!("/api/v1/robots/{}/report", robot.id);
         let request = self.bare(Method::POST, &path).bearer_auth(&robot.token);
-        request.json(&report).send().await.expect("an answer")
+        request.json(report).send().await.expect("an answer")
     }
 }
 

@@ -12,7 +12,6 @@ use taskd::config::{Config, OidcSettings, RoleRule};
 use taskd::serve::Server;
 use tempfile::TempDir;
 
-use crate::browser::Browser;
 use crate::harness::{TestServer, answer, refusal};
 use crate::people::PASSWORD;
 use crate::provider::{CLIENT_ID, Provider, SECRET};
@@ -365,30 +364,6 @@ async fn failed_sign_ins_by_the_provider_are_counted_by_address() {
         provider.lies(json!({}), json!({ "exp": server.clock.now_ms() / 1000 + 60 }));
         assert_eq!(Visitor::new(&server).sign_in().await, "/");
     }
-}
-
-#[tokio::test(flavor = "multi_thread")]
-async fn the_page_offers_the_provider_and_says_what_went_wrong() {
-    let (server, provider) = town().await;
-    let browser = Browser::start().await;
-    browser.open(&server.url("/")).await;
-    browser.wait("document.querySelector('a.by-provider')?.innerText === 'Sign in with the lab'").await;
-    provider.says(json!({ "groups": [] }));
-    browser.run("document.querySelector('a.by-provider').click()").await;
-    browser
-        .wait("document.querySelector('[role=alert]')?.innerText === 'You have no role here. Ask an administrator.'")
-        .await;
-    assert_eq!(
-        browser.run("return location.href").await,
-        json!(server.url("/")),
-        "the problem has left the address bar"
-    );
-    provider.says(json!({ "groups": ["admins"] }));
-    browser.run("document.querySelector('a.by-provider').click()").await;
-    browser.wait("document.querySelector('.stream')?.innerText.includes('Live')").await;
-    browser.wait("document.querySelector('header.top').innerText.includes('alice')").await;
-    assert_eq!(browser.console().await, Vec::<Value>::new(), "no error, no warning, no violated policy");
-    server.stop().await;
 }
 
 /// A provider that others made, as a process.

@@ -1,28 +1,30 @@
 //! Files that come back from robots: pushed by the robot into its own repository, listed and read by operators.
 
 use reqwest::{Method, StatusCode};
-use task_proto::Digest;
 use task_proto::api::OutputList;
 use task_proto::desired::BlobRef;
 use task_proto::oci::MANIFEST_TYPE;
 use task_proto::output::{OutputFile, OutputSet};
+use task_proto::{Digest, RobotId};
 
 use crate::harness::{TestRobot, TestServer, refusal};
 
 /// A push in the robot's name, blob by blob.
-pub struct Push<'a> {
-    server: &'a TestServer,
-    robot: &'a TestRobot,
-    repository: String,
+pub struct Push {
+    pub client: reqwest::Client,
+    /// Where its repository is.
+    pub url: String,
+    pub token: String,
 }
 
-impl<'a> Push<'a> {
-    pub fn new(server: &'a TestServer, robot: &'a TestRobot, repository: String) -> Self {
-        Self { server, robot, repository }
+impl Push {
+    pub fn new(server: &TestServer, robot: &TestRobot, repository: String) -> Self {
+        let url = server.url(&format!("/v2/{repository}"));
+        Self { client: server.client.clone(), url, token: robot.token.clone() }
     }
 
     fn ask(&self, method: Method, rest: &str) -> reqwest::RequestBuilder {
-        self.server.bare(method, &format!("/v2/{}/{rest}", self.repository)).bearer_auth(&self.robot.token)
+        self.client.request(method, format!("{}/{rest}", self.url)).bearer_auth(&self.token)
     }
 
     pub async fn blob(&self, bytes: &[u8]) -> BlobRef {
@@ -41,9 +43,9 @@ impl<'a> Push<'a> {
     }
 }
 
-pub fn output(robot: &TestRobot, run: u64, files: Vec<OutputFile>) -> OutputSet {
+pub fn output(robot: &RobotId, run: u64, files: Vec<OutputFile>) -> OutputSet {
     OutputSet {
-        robot_id: robot.id.clone(),
+        robot_id: robot.clone(),
         task: "mapping".parse().expect("valid"),
         version: "1.0.0".parse().expect("valid"),
         deployment: "d00000000000000b2".parse().expect("valid"),
@@ -63,12 +65,12 @@ async fn a_robot_brings_files_back_and_operators_read_them() {
     let push = Push::new(&server, &robot, format!("outputs/{}/mapping", robot.id));
     let map = push.blob(b"P5 1 1 255 x").await;
     for run in 1..=12 {
-        let set = output(&robot, run, vec![file("maps/corridor.pgm", map)]);
+        let set = output(&robot.id, run, vec![file("maps/corridor.pgm", map)]);
         server.clock.advance_ms(1000);
         assert_eq!(push.output(&set).await, StatusCode::CREATED, "run {run}");
         assert_eq!(push.output(&set).await, StatusCode::CREATED, "run {run}, whose answer was lost");
     }
-    let corrected = output(&robot, 12, vec![file("maps/other.pgm", map)]);
+    let corrected = output(&robot.id, 12, vec![file("maps/other.pgm", map)]);
     assert_eq!(push.output(&corrected).await, StatusCode::CREATED);
 
     let list: OutputList = server.get("/api/v1/outputs?robot=atlas&task=mapping").await;
@@ -89,13 +91,13 @@ async fn what_is_kept_of_a_robot_is_bounded_whatever_its_tasks_are_called() {
     let (robot, other) = (server.enroll("atlas").await, server.enroll("husky").await);
     let push = Push::new(&server, &other, format!("outputs/{}/mapping", other.id));
     let map = push.blob(b"x").await;
-    assert_eq!(push.output(&output(&other, 1, vec![file("a", map)])).await, StatusCode::CREATED);
+    assert_eq!(push.output(&output(&other.id, 1, vec![file("a", map)])).await, StatusCode::CREATED);
     for number in 1..=TASKS {
         let task = format!("task{number}");
         let push = Push::new(&server, &robot, format!("outputs/{}/{task}", robot.id));
         push.blob(b"x").await;
         for run in 1..=10 {
-            let set = OutputSet { task: task.parse().expect("valid"), ..output(&robot, run, vec![file("a", map)]) };
+            let set = OutputSet { task: task.parse().expect("valid"), ..output(&robot.id, run, vec![file("a", map)]) };
             server.clock.advance_ms(1);
             assert_eq!(push.output(&set).await, StatusCode::CREATED, "{task} {run}");
         }
@@ -122,7 +124,7 @@ async fn a_robot_pushes_nothing_else_and_nowhere_else() {
             (Method::HEAD, &*format!("blobs/{}", secret.content.digest)),
         ] {
             let status = push.ask(method.clone(), rest).send().await.expect("an answer").status();
-            assert_eq!(status, StatusCode::FORBIDDEN, "{method} {rest} in {}", push.repository);
+            assert_eq!(status, StatusCode::FORBIDDEN, "{method} {rest} in {}", push.url);
         }
     }
     // What another repository holds is neither shown nor mounted.
@@ -135,17 +137,25 @@ async fn a_robot_pushes_nothing_else_and_nowhere_else() {
     let package = task_proto::oci::ImageManifest::package(map, map);
     let put = own.ask(Method::PUT, "manifests/latest").header("content-type", MANIFEST_TYPE).json(&package);
     assert_eq!(put.send().await.expect("an answer").status(), StatusCode::FORBIDDEN, "no package");
-    let set = output(&robot, 1, vec![file("a", map)]);
+    let set = output(&robot.id, 1, vec![file("a", map)]);
     let config = own.blob(&serde_json::to_vec(&set).expect("json")).await;
     let put =
         own.ask(Method::PUT, "manifests/latest").header("content-type", MANIFEST_TYPE).json(&set.manifest(config));
     assert_eq!(put.send().await.expect("an answer").status(), StatusCode::FORBIDDEN, "another tag than the run's");
-    let lie = OutputSet { robot_id: other.id.clone(), ..output(&robot, 1, vec![file("a", map)]) };
+    let lie = OutputSet { robot_id: other.id.clone(), ..output(&robot.id, 1, vec![file("a", map)]) };
     assert_eq!(own.output(&lie).await, StatusCode::BAD_REQUEST, "another robot's");
     let larger = BlobRef { size: 2, ..map };
-    assert_eq!(own.output(&output(&robot, 1, vec![file("a", larger)])).await, StatusCode::BAD_REQUEST, "a wrong size");
+    assert_eq!(
+        own.output(&output(&robot.id, 1, vec![file("a", larger)])).await,
+        StatusCode::BAD_REQUEST,
+        "a wrong size"
+    );
     let missing = BlobRef { digest: Digest::of(b"never pushed"), size: 1 };
-    assert_ne!(own.output(&output(&robot, 1, vec![file("a", missing)])).await, StatusCode::CREATED, "a missing file");
+    assert_ne!(
+        own.output(&output(&robot.id, 1, vec![file("a", missing)])).await,
+        StatusCode::CREATED,
+        "a missing file"
+    );
     let delete = own.ask(Method::DELETE, &format!("blobs/{}", map.digest));
     assert_eq!(delete.send().await.expect("an answer").status(), StatusCode::FORBIDDEN);
 

@@ -11,7 +11,7 @@ use task_proto::person::{Permission, Roles};
 use task_proto::report::Phase;
 use task_proto::selector::Selector;
 use task_proto::token::{Token, TokenKind};
-use task_proto::{Digest, TokenId, UserName};
+use task_proto::{Digest, RobotId, TokenId, UserName};
 use taskd::actions::{ActionError, TaskOrder};
 use taskd::person::Person;
 use taskd::store::{Store, StoreError, TokenHolder};
@@ -85,7 +85,7 @@ impl Fleet {
     async fn label(&self, robot: &crate::fleet::Robot, labels: &str) {
         let labels = labels.split_once('=').expect("a label");
         let labels = [(labels.0.parse().expect("a key"), labels.1.parse().expect("a value"))].into();
-        let edit = EditRobot { name: None, labels: Some(labels) };
+        let edit = EditRobot { labels: Some(labels), ..EditRobot::default() };
         self.actions.edit_robot(&self.operator, &robot.id, &edit).await.expect("edited");
     }
 
@@ -197,10 +197,13 @@ async fn an_order_beyond_the_scope_is_refused_as_a_whole(database: TestDatabase)
     // And of lists she sees her part.
     let mine = fleet.database.store.robots_in(&alice.scope).await.expect("reads");
     assert_eq!(mine.len(), 2);
-    let parts = fleet.database.store.deployments_of(&mine).await.expect("reads");
+    let parts = async |robots: &[RobotId]| {
+        let page = fleet.database.store.deployments(Some(robots), None, 10).await.expect("reads");
+        page.expect("no other was named").deployments
+    };
+    let (none, parts) = (parts(&[]).await, parts(&mine).await);
     let counted = parts.iter().map(|part| (part.id.clone(), part.counts.iter().map(|count| count.count).sum::<u64>()));
     assert_eq!(counted.collect::<Vec<_>>(), [(everywhere, 2), (own, 2)]);
-    let none = fleet.database.store.deployments_of(&[]).await.expect("reads");
     assert_eq!(none, []);
 }
 
@@ -211,13 +214,13 @@ async fn a_robot_stays_in_its_editors_scope(database: TestDatabase) {
     fleet.add("boss", "admin", Some("site=lab")).await;
     let boss = fleet.signed_in("boss").await;
     let field = [("site".parse().expect("a key"), "field".parse().expect("a value"))].into();
-    let out = EditRobot { name: None, labels: Some(field) };
+    let out = EditRobot { labels: Some(field), ..EditRobot::default() };
     assert_eq!(code(fleet.actions.edit_robot(&boss, &robots[0].id, &out).await), "out_of_scope");
     let lab = [("site".parse().expect("a key"), "lab".parse().expect("a value"))].into();
-    let pulled_in = EditRobot { name: None, labels: Some(lab) };
+    let pulled_in = EditRobot { labels: Some(lab), ..EditRobot::default() };
     assert_eq!(code(fleet.actions.edit_robot(&boss, &robots[1].id, &pulled_in).await), "out_of_scope");
     assert_eq!(code(fleet.actions.remove_robot(&boss, &robots[1].id).await), "out_of_scope");
-    let renamed = EditRobot { name: Some("atlas".parse().expect("a name")), labels: None };
+    let renamed = EditRobot { name: Some("atlas".parse().expect("a name")), ..EditRobot::default() };
     fleet.actions.edit_robot(&boss, &robots[0].id, &renamed).await.expect("it is his");
     fleet.actions.remove_robot(&boss, &robots[0].id).await.expect("it is his");
 }
@@ -416,7 +419,7 @@ async fn an_act_that_fails_leaves_no_entry(database: TestDatabase) {
     let fleet = Fleet::new(database);
     let robots = fleet.enroll(2).await;
     let before = fleet.audit().await.len();
-    let taken = EditRobot { name: Some("r1".parse().expect("a name")), labels: None };
+    let taken = EditRobot { name: Some("r1".parse().expect("a name")), ..EditRobot::default() };
     assert_eq!(code(fleet.actions.edit_robot(&fleet.operator, &robots[0].id, &taken).await), "name_taken");
     let repository = "talker".parse().expect("a name");
     let deed = taskd::store::Deed::by(&fleet.operator, taskd::store::Act::ManifestDelete, &repository);

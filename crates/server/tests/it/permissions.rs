@@ -163,6 +163,7 @@ impl Town {
         }
         path =
             path.replace("{task}", "walker").replace("{*file}", "app.js").replace("{itself}", self.robot.id.as_str());
+        path = path.replace("{package}", "walker").replace("{version}", "1.0.0");
         path = path.replace("{blob}", &self.package.content.digest.to_string());
         assert!(!path.contains('{'), "{path}: this test has to be told of a value for the parameter");
         path
@@ -251,6 +252,9 @@ fn body(method: &Method, path: &str) -> Option<Value> {
             let digest = Digest::of(b"x");
             json!({ "package": "walker", "manifest": digest, "selector": "atlas", "dry_run": true })
         }
+        ("POST", "/api/v1/deployments/{deployment}/retry") => json!({ "dry_run": true }),
+        ("POST", "/api/v1/bulk/labels") => json!({ "selector": "atlas", "set": { "site": "lab" }, "dry_run": true }),
+        ("POST", "/api/v1/bulk/remove") => json!({ "selector": "atlas", "dry_run": true }),
         ("POST", path) if path.starts_with("/api/v1/tasks/") => json!({ "selector": "atlas", "dry_run": true }),
         ("POST", "/api/v1/robots/{robot}/ask") => json!({ "type": "nodes" }),
         ("POST", "/api/v1/users") => {

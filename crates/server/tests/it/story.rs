@@ -29,6 +29,7 @@ on_both_databases! {
     reports_at_once_are_all_acknowledged,
     a_report_that_can_not_be_stored_is_answered_so,
     a_restored_database_leaves_robots_alone_until_the_next_order,
+    numbers_at_the_end_of_their_range_stop_no_order,
     a_reopened_database_knows_everything,
 }
 
@@ -53,7 +54,7 @@ async fn a_removed_robot_leaves_its_mac_and_name(database: TestDatabase) {
     let new = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("both are free");
     assert_ne!(new.robot_id, old.robot_id);
     // A name that a selector could take for another robot's id is refused.
-    let edit = EditRobot { name: Some(old.robot_id.as_str().parse().expect("a name")), labels: None };
+    let edit = EditRobot { name: Some(old.robot_id.as_str().parse().expect("a name")), ..EditRobot::default() };
     assert_eq!(code(fleet.actions.edit_robot(&fleet.operator, &new.robot_id, &edit).await), "invalid_request");
 }
 
@@ -88,7 +89,7 @@ async fn an_order_reaches_all_that_match_and_settles(database: TestDatabase) {
     assert_eq!((robot.generation, robot.observed_generation), (Generation(1), Generation(1)));
     assert_eq!((robot.tasks[0].phase, robot.tasks[0].run), (Phase::Running, 1));
     assert_eq!(store.packages_in_use().await.expect("reads").len(), 1);
-    assert_eq!(store.deployments().await.expect("reads").len(), 1);
+    assert_eq!(fleet.deployments().await.len(), 1);
 }
 
 async fn an_idempotency_key_orders_once(database: TestDatabase) {
@@ -114,7 +115,7 @@ async fn an_idempotency_key_orders_once(database: TestDatabase) {
     let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
     let refused = fleet.actions.order_task(&fleet.operator, &key, TaskOrder::Stop, &task, &everyone).await;
     assert_eq!(code(refused), "idempotency_key_reused");
-    assert_eq!(fleet.database.store.deployments().await.expect("reads").len(), 1);
+    assert_eq!(fleet.deployments().await.len(), 1);
 }
 
 async fn racing_operators_leave_one_winner(database: TestDatabase) {
@@ -153,7 +154,7 @@ async fn racing_operators_leave_one_winner(database: TestDatabase) {
         winners.insert(desired.tasks[0].deployment.clone());
     }
     assert_eq!(winners.len(), 1);
-    let newest = fleet.database.store.deployments().await.expect("reads").remove(0);
+    let newest = fleet.deployments().await.remove(0);
     assert_eq!(Some(&newest.id), winners.first());
     assert_eq!(newest.supersedes.len(), 1);
 }
@@ -412,6 +413,33 @@ async fn a_restored_database_leaves_robots_alone_until_the_next_order(database: 
     fleet.actions.cancel_deployment(&fleet.operator, &next).await.expect("cancelled");
     assert_eq!(fleet.desired(&robots[1]).await.expect("state").tasks[0].deployment, lost.tasks[0].deployment);
     assert!(fleet.view(&robots[1]).await.conditions.is_empty());
+}
+
+async fn numbers_at_the_end_of_their_range_stop_no_order(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let mut robots = fleet.enroll(2).await;
+    fleet.deploy("1", |_| ()).await;
+    for robot in &mut robots {
+        fleet.follow(robot, Phase::Running).await;
+    }
+    // One robot makes numbers up; what it says it has is taken over with the next order.
+    let liar = &mut robots[0];
+    (liar.observed, liar.start) = (Generation(u64::MAX), u64::MAX);
+    for task in liar.tasks.values_mut() {
+        (task.run, task.phase_ms, task.attempts, task.restarts) = (u64::MAX, u64::MAX, u32::MAX, u32::MAX);
+    }
+    for _ in 0..2 {
+        fleet.report(liar).await;
+    }
+    let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
+    for order in [TaskOrder::Stop, TaskOrder::Start] {
+        fleet.actions.order_task(&fleet.operator, &random_key(), order, &task, &everyone).await.expect("ordered");
+    }
+    for robot in &robots {
+        let desired = fleet.desired(robot).await.expect("state");
+        assert_eq!((desired.tasks.len(), desired.tasks[0].wanted), (1, Wanted::Running));
+        assert!(desired.tasks[0].run > 1, "{desired:?}");
+    }
 }
 
 async fn a_reopened_database_knows_everything(database: TestDatabase) {

@@ -20,6 +20,7 @@ use task_proto::token::Token;
 use task_transport::{ClientKey, Duplex, Route, Trust, dial};
 use taskd::clock::Clock;
 use taskd::config::Config;
+use taskd::http::listener::{Limits, serve};
 use tempfile::TempDir;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
@@ -31,6 +32,8 @@ use crate::mqtt_harness::{Connect, PATIENCE, Raw};
 
 /// Less than a handshake may take: who is served within it has waited for nobody else's to end.
 const IN_TIME: Duration = Duration::from_secs(6);
+/// The first bytes of a handshake record, whose rest does not come.
+const BEGUN: [u8; 11] = [0x16, 0x03, 0x01, 0x02, 0x00, 0x01, 0x00, 0x01, 0xfc, 0x03, 0x03];
 
 /// An authority that the operator has got certificates from.
 struct Authority {
@@ -169,7 +172,7 @@ async fn the_websocket_has_the_doors_of_mqtts_own_port() {
     let mut raw = Raw { stream: dial(&websocket).await.expect("connected") };
     raw.send(&[0x10, 0xff, 0xff, 0x7f]).await;
     let mut nothing = Vec::new();
-    let _ = timeout(PATIENCE, raw.stream.read_to_end(&mut nothing)).await.expect("it ends");
+    let _ = timeout(IN_TIME, raw.stream.read_to_end(&mut nothing)).await.expect("it ends at once");
     assert_eq!(nothing, b"");
     let plain = server.bare(Method::GET, "/mqtt").send().await.expect("an answer");
     assert_eq!(plain.status(), StatusCode::UPGRADE_REQUIRED);
@@ -411,14 +414,12 @@ async fn a_thousand_half_open_connections_keep_nobody_out() {
     let server = encrypted().await;
     let robot = server.enroll("atlas").await;
     let tls = pinned(pin_of(&server));
-    // The first bytes of a handshake record, whose rest does not come.
-    let begun = [0x16, 0x03, 0x01, 0x02, 0x00, 0x01, 0x00, 0x01, 0xfc, 0x03, 0x03];
     let mut half_open = Vec::new();
     for number in 0..500 {
         for address in [http_of(&server), mqtt_of(&server)] {
             let mut stream = TcpStream::connect(address).await.expect("connected");
             if number % 2 == 0 {
-                stream.write_all(&begun).await.expect("written");
+                stream.write_all(&BEGUN).await.expect("written");
             }
             half_open.push(stream);
         }
@@ -448,27 +449,57 @@ async fn a_thousand_half_open_connections_keep_nobody_out() {
     }
 }
 
-/// An HTTP listener that gives a handshake this long.
-async fn hasty_listener(patience: Duration) -> (SocketAddr, tokio_util::sync::CancellationToken, TempDir) {
-    use taskd::http::listener::{Limits, serve};
+/// An HTTP listener that speaks TLS.
+async fn listener(limits: Limits) -> (SocketAddr, tokio_util::sync::DropGuard, TempDir) {
     let directory = TempDir::new().expect("a directory");
     let data = taskd::data_directory::DataDirectory::open(directory.path()).expect("opens");
     let tls = taskd::tls::Tls::open(Default::default(), &data, Clock::system()).expect("made");
     let listener = taskd::backlog::listen(([127, 0, 0, 1], 0).into()).expect("listens");
     let address = listener.local_addr().expect("bound");
     let stop = tokio_util::sync::CancellationToken::new();
-    let limits = Limits { max_connections: 1, max_silent_per_address: 10, handshake_timeout: patience };
     let (router, traffic) = (axum::Router::new(), Arc::default());
     tokio::spawn(serve(listener, router, Some(tls), limits, traffic, stop.clone(), Duration::from_secs(1)));
-    (address, stop, directory)
+    (address, stop.drop_guard(), directory)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_oldest_silent_connection_gives_way_during_its_handshake() {
+    const HOUR: Duration = Duration::from_secs(3600);
+    let limits = Limits { max_connections: 1000, max_silent_per_address: 1, handshake_timeout: HOUR };
+    let (http, _stop, _directory) = listener(limits).await;
+    let broker = crate::mqtt_harness::TestBroker::encrypted(|limits| {
+        (limits.max_silent_per_address, limits.connect_timeout) = (1, HOUR);
+    })
+    .await;
+    for address in [http, broker.address()] {
+        let mut oldest = TcpStream::connect(address).await.expect("connected");
+        oldest.write_all(&BEGUN).await.expect("written");
+        let newcomers = async {
+            let (mut ticks, mut all) = (tokio::time::interval(Duration::from_millis(200)), Vec::new());
+            loop {
+                ticks.tick().await;
+                all.push(TcpStream::connect(address).await.expect("connected"));
+            }
+        };
+        let mut rest = Vec::new();
+        let ended = timeout(PATIENCE, async {
+            tokio::select! {
+                ended = oldest.read_to_end(&mut rest) => ended,
+                () = newcomers => unreachable!("they go on coming"),
+            }
+        });
+        // A reset is an end as well.
+        let _ = ended.await.expect("the connection ends");
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_silent_socket_and_a_slow_handshake_end_by_themselves() {
-    let (http, _stop, _directory) = hasty_listener(Duration::from_millis(200)).await;
+    let hasty = Duration::from_millis(200);
+    let (http, _stop, _directory) =
+        listener(Limits { max_connections: 1, max_silent_per_address: 10, handshake_timeout: hasty }).await;
     let broker = crate::mqtt_harness::TestBroker::encrypted(|limits| {
-        limits.connect_timeout = Duration::from_millis(200);
-        limits.max_connections = 1;
+        (limits.connect_timeout, limits.max_connections) = (hasty, 1);
     })
     .await;
     for address in [http, broker.address()] {

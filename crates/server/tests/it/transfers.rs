@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
+use reqwest::header::CONNECTION;
 use reqwest::{Method, Response, StatusCode};
 use serde_json::json;
 use task_proto::Digest;
@@ -13,14 +14,16 @@ use tempfile::TempDir;
 
 use crate::harness::{TestRobot, TestServer, answer};
 
-/// More than a connection holds while nobody reads.
+/// More than a new connection holds while nobody reads.
 const BLOB_BYTES: usize = 8 * 1024 * 1024;
 const ROBOTS: usize = 200;
 const LIMIT: usize = 8;
 
+/// On a connection of its own: one that has carried a blob holds so much that a whole one fits it, read or not.
 async fn get(server: &TestServer, robot: &TestRobot, blob: Digest) -> Response {
     let path = format!("/v2/anything/blobs/{blob}");
-    server.bare(Method::GET, &path).bearer_auth(&robot.token).send().await.expect("an answer")
+    let request = server.bare(Method::GET, &path).bearer_auth(&robot.token).header(CONNECTION, "close");
+    request.send().await.expect("an answer")
 }
 
 /// Asks until it is this robot's turn, as often and as late as it is told.

@@ -24,14 +24,23 @@ pub struct Session {
 
 impl Session {
     pub async fn open(server: &TestServer, robot: &TestRobot) -> Self {
-        let mut session = Self::dial(server, robot.id.as_str(), &robot.token);
+        Self::open_at(&server.server.addresses().mqtt, robot.id.as_str(), &robot.token).await
+    }
+
+    /// The same with the server's address for MQTT, `host:port`, and what the robot says of itself.
+    pub async fn open_at(address: &str, id: &str, token: &str) -> Self {
+        let mut session = Self::dial_at(address, id, token);
         session.until(|packet| matches!(packet, Packet::ConnAck(_))).await;
         session.client.subscribe(format!("{}/desired", session.topics), QoS::AtLeastOnce).await.expect("queued");
         session
     }
 
     fn dial(server: &TestServer, id: &str, token: &str) -> Self {
-        let (host, port) = server.server.addresses().mqtt.rsplit_once(':').expect("host:port");
+        Self::dial_at(&server.server.addresses().mqtt, id, token)
+    }
+
+    fn dial_at(address: &str, id: &str, token: &str) -> Self {
+        let (host, port) = address.rsplit_once(':').expect("host:port");
         let mut options = MqttOptions::new(id, host, port.parse().expect("a port"));
         options.set_credentials(id, token).set_max_packet_size(256 * 1024, 256 * 1024);
         let (client, packets) = AsyncClient::new(options, 16);
@@ -76,6 +85,35 @@ impl Session {
         let question = self.until(|packet| matches!(packet, Packet::Publish(publish) if publish.topic == topic)).await;
         let Packet::Publish(question) = question else { panic!("a question is published") };
         serde_json::from_slice(&question.payload).expect("json")
+    }
+
+    /// Answers each question with what `reply` makes of it, for as long as what comes back is polled. When that comes
+    /// back, the robot can be asked.
+    pub async fn answer_all(mut self, reply: impl Fn(&[u8]) -> Vec<u8>) -> impl Future<Output = ()> {
+        let topic = format!("{}/request", self.topics);
+        self.client.subscribe(&topic, QoS::AtLeastOnce).await.expect("queued");
+        // The broker takes one after the other: what is acknowledged comes after the subscription.
+        let status = json!({ "online": true, "start": 1, "instance": "i00000000000000c3", "connection": 1 });
+        self.publish("status", status.to_string().into_bytes()).await;
+        async move {
+            loop {
+                // The server may be stopped before the robot is.
+                let Ok(event) = self.packets.poll().await else { return };
+                if let Event::Incoming(Packet::Publish(question)) = event
+                    && question.topic == topic
+                {
+                    let reply = reply(&question.payload);
+                    let topic = format!("{}/reply", self.topics);
+                    self.client.publish(topic, QoS::AtLeastOnce, false, reply).await.expect("queued");
+                }
+            }
+        }
+    }
+
+    /// Says that it goes, and is gone when the broker has hung up.
+    pub async fn leave(mut self) {
+        self.client.disconnect().await.expect("queued");
+        self.hung_up().await;
     }
 
     /// The next state it is told of, from `generation` on.

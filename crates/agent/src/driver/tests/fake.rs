@@ -176,6 +176,10 @@ impl Effects for Fake {
         self.state(|state| state.health.subscribe())
     }
 
+    fn parallel_tasks(&self) -> usize {
+        2
+    }
+
     fn heed(&self, desired: &DesiredState) {
         self.state(|state| state.heeded.push(desired.generation));
     }

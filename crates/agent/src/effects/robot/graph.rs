@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use task_proto::TaskName;
 use task_proto::desired::PackageRef;
-use task_proto::report::Failure;
+use task_proto::report::{Failure, RosFacts};
 
 use super::Robot;
 use crate::graph::Graph;
@@ -17,17 +17,16 @@ impl Robot {
         self.graph.settled(self.ros_facts().as_ref()).await
     }
 
-    /// Takes part in the graph while this version runs, if it is one of ROS 2, so that what its nodes say is kept also
+    /// Takes part in the graph that `facts` say while this version runs, if it is one of ROS 2, so that what its nodes say is kept also
     /// where the package promises nothing about them.
-    pub(super) fn listen_to(&self, package: &PackageRef) {
+    pub(super) fn listen_to(&self, package: &PackageRef, facts: Option<&RosFacts>) {
         let Some(manifest) = fetch::stored_manifest(&self.data, package) else { return };
         let is_ros_2 = match launch::of(&manifest).ros {
             Some(version) => version == RosVersion::Ros2,
             // An install tree names what it needs; other programs need nothing of ROS.
             None => !manifest.exec_depends.is_empty(),
         };
-        let facts = self.ros_facts().filter(|facts| is_ros_2 && facts.domain_id.is_some());
-        if let Some(facts) = facts {
+        if let Some(facts) = facts.filter(|facts| is_ros_2 && facts.domain_id.is_some()).cloned() {
             let graph = self.graph.clone();
             // A graph that can't be opened has been logged; the task runs all the same.
             tokio::spawn(async move { graph.open(Some(&facts)).await.is_ok() });

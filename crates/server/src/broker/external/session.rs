@@ -42,7 +42,7 @@ const MAX_SENT_BYTES: usize = MAX_PART_BYTES + 1024;
 /// The largest status that is read.
 const MAX_STATUS_BYTES: usize = 4 * 1024;
 /// What robots say that is not a report.
-const HEARD: [RobotTopic; 3] = [RobotTopic::Status, RobotTopic::Reply, RobotTopic::Log];
+const HEARD: [RobotTopic; 4] = [RobotTopic::Status, RobotTopic::Reply, RobotTopic::Log, RobotTopic::Telemetry];
 /// MQTT's fixed header at most, and the packet id.
 const HEADER_BYTES: usize = 7;
 

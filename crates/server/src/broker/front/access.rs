@@ -22,8 +22,6 @@ pub(super) enum Visitor {
 pub(super) enum Route {
     /// To the inbox before it is acknowledged, and then to whoever listens.
     Inbox(RobotTopic),
-    /// To whoever listens.
-    Listeners,
     /// Through the router whether anyone listens or not.
     Canary,
 }
@@ -49,10 +47,11 @@ pub(super) fn may_publish(visitor: &Visitor, prefix: &TopicPrefix, topic: &str) 
         Visitor::Operator(_) => None,
         Visitor::Robot { robot, .. } => match prefix.parse(topic)? {
             Topic::Robot(owner, last) if owner == *robot => match last {
-                RobotTopic::Report | RobotTopic::Status | RobotTopic::Reply | RobotTopic::Log => {
-                    Some(Route::Inbox(last))
-                }
-                RobotTopic::Telemetry => Some(Route::Listeners),
+                RobotTopic::Report
+                | RobotTopic::Status
+                | RobotTopic::Reply
+                | RobotTopic::Log
+                | RobotTopic::Telemetry => Some(Route::Inbox(last)),
                 RobotTopic::Desired | RobotTopic::Request => None,
             },
             Topic::Robot(..) | Topic::Package(_) => None,
@@ -110,7 +109,7 @@ mod tests {
         let route = |topic: &str| may_publish(&robot(), &prefix, topic);
         assert_eq!(route("taskd/v1/r/r00000000000000a1/report"), Some(Route::Inbox(RobotTopic::Report)));
         assert_eq!(route("taskd/v1/r/r00000000000000a1/log"), Some(Route::Inbox(RobotTopic::Log)));
-        assert_eq!(route("taskd/v1/r/r00000000000000a1/telemetry"), Some(Route::Listeners));
+        assert_eq!(route("taskd/v1/r/r00000000000000a1/telemetry"), Some(Route::Inbox(RobotTopic::Telemetry)));
         for denied in [
             "taskd/v1/r/r00000000000000a1/desired",
             "taskd/v1/r/r00000000000000a1/request",

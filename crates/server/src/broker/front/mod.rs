@@ -23,7 +23,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
-use task_proto::api::{MqttTraffic, Traffic};
+use task_proto::api::{MqttTraffic, Subscription, Traffic};
 use task_proto::topic::TopicPrefix;
 use task_proto::{RobotId, UserName};
 use tokio::io::{AsyncRead, AsyncWrite};
@@ -141,6 +141,10 @@ impl Front {
 
     pub(super) fn traffic_of(&self, robot: &RobotId) -> Option<Traffic> {
         self.context.seats.meter(robot).map(|meter| meter.read())
+    }
+
+    pub(super) fn subscriptions_of(&self, robot: &RobotId) -> Vec<Subscription> {
+        self.context.seats.subscriptions(robot)
     }
 
     pub(super) fn connected_count(&self) -> usize {

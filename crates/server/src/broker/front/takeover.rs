@@ -5,6 +5,7 @@ use std::collections::HashMap;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
+use task_proto::api::Subscription;
 use task_proto::{RobotId, UserName};
 use tokio_util::sync::CancellationToken;
 
@@ -42,6 +43,7 @@ struct Occupant {
     left: CancellationToken,
     doorbell: Arc<Doorbell>,
     meter: Arc<Meter>,
+    subscriptions: Mutex<Vec<Subscription>>,
 }
 
 /// A session's hold on its seat; dropping it says that the session has fully ended.
@@ -72,6 +74,7 @@ impl Seats {
             left: CancellationToken::new(),
             doorbell: Arc::new(Doorbell::default()),
             meter,
+            subscriptions: Mutex::default(),
         });
         let before = table.occupants.insert(name.clone(), occupant.clone());
         if before.is_none() && matches!(name, SeatName::Robot(_)) {
@@ -88,6 +91,12 @@ impl Seats {
     /// The figures of the robot's session.
     pub(super) fn meter(&self, robot: &RobotId) -> Option<Arc<Meter>> {
         self.table().occupants.get(&SeatName::Robot(robot.clone())).map(|occupant| occupant.meter.clone())
+    }
+
+    /// What the robot's session listens to.
+    pub(super) fn subscriptions(&self, robot: &RobotId) -> Vec<Subscription> {
+        let occupant = self.table().occupants.get(&SeatName::Robot(robot.clone())).cloned();
+        occupant.map_or_else(Vec::new, |occupant| occupant.subscriptions().clone())
     }
 
     /// How often a robot was put out so far. Who was let in before the number changed has to be asked again.
@@ -123,7 +132,20 @@ impl Seats {
     }
 }
 
+impl Occupant {
+    fn subscriptions(&self) -> MutexGuard<'_, Vec<Subscription>> {
+        // Replaced as a whole.
+        self.subscriptions.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
 impl Seat {
+    /// Notes what the session listens to, for whoever looks.
+    pub(super) fn listens_to(&self, mut subscriptions: Vec<Subscription>) {
+        subscriptions.sort_by(|one, other| one.topic_filter.cmp(&other.topic_filter));
+        *self.occupant.subscriptions() = subscriptions;
+    }
+
     /// The session's number; later sessions have higher ones.
     pub(super) fn number(&self) -> u64 {
         self.occupant.number

@@ -8,6 +8,7 @@ use http::{HeaderValue, StatusCode};
 use serde_json::{Value, json};
 use task_proto::Digest;
 
+use super::super::error::ApiError;
 use crate::blobs::BlobError;
 use crate::store::StoreError;
 use crate::transfers::NotYet;
@@ -127,7 +128,7 @@ impl OciError {
         Self::new(StatusCode::BAD_REQUEST, "PAGINATION_NUMBER_INVALID", message)
     }
 
-    fn internal(error: &(dyn std::error::Error + 'static)) -> Self {
+    pub(super) fn internal(error: &(dyn std::error::Error + 'static)) -> Self {
         tracing::error!(error, "a registry request failed");
         Self::new(StatusCode::INTERNAL_SERVER_ERROR, "UNKNOWN", "the server failed; its log says why")
     }
@@ -162,6 +163,21 @@ impl From<BlobError> for OciError {
             BlobError::DiskFull => Self::new(StatusCode::INSUFFICIENT_STORAGE, "DENIED", message),
             BlobError::Disk { .. } => Self::internal(&error),
         }
+    }
+}
+
+/// Where the registry did something for the rest of the API.
+impl From<OciError> for ApiError {
+    fn from(error: OciError) -> Self {
+        let code = match error.status {
+            StatusCode::PAYLOAD_TOO_LARGE => "too_large",
+            StatusCode::INSUFFICIENT_STORAGE => "disk_full",
+            StatusCode::TOO_MANY_REQUESTS => "too_many_requests",
+            StatusCode::INTERNAL_SERVER_ERROR => "internal",
+            _ => "invalid_request",
+        };
+        let message = error.messages.into_iter().next().map_or_else(String::new, |(message, _)| message);
+        Self::new(error.status, code, message)
     }
 }
 

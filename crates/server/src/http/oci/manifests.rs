@@ -7,7 +7,7 @@ use axum::body::Body;
 use bytes::Bytes;
 use http::header::CONTENT_TYPE;
 use http::request::Parts;
-use http::{HeaderValue, StatusCode};
+use http::{HeaderMap, HeaderValue, StatusCode};
 use task_proto::desired::{BlobRef, PackageRef};
 use task_proto::manifest::TaskManifest;
 use task_proto::oci::{ImageManifest, PACKAGE_TYPE};
@@ -18,6 +18,7 @@ use super::blobs::serve;
 use super::parsed::Parsed;
 use super::{Answer, OciError, Registry, empty, signed};
 use crate::blobs::Blob;
+use crate::changes::Change;
 use crate::person::Person;
 use crate::store::{Act, Deed, NewManifest, PutManifest, Reference, StoredManifest};
 
@@ -59,17 +60,30 @@ pub(super) struct Push<'a> {
 }
 
 /// `PUT`: stores the exact bytes, if all they refer to is in the repository.
-pub(super) async fn put(registry: &Registry, push: Push<'_>, parts: &Parts, body: Body) -> Answer {
-    let Push { repository, reference, by, only } = push;
+pub(super) async fn put(registry: &Registry, as_said: Push<'_>, parts: &Parts, body: Body) -> Answer {
     let bytes = read_body(body).await?;
+    let tags = tags_to_set(parts, &as_said.reference)?;
+    let repository = as_said.repository;
+    let stored = push(registry, as_said, tags, &parts.headers, bytes).await?;
+    created(repository, &stored.manifest.digest, stored.subject, parts, &stored.tags)
+}
+
+/// Stores a manifest's bytes, and says what was stored.
+pub(super) async fn push(
+    registry: &Registry,
+    push: Push<'_>,
+    tags: Vec<Tag>,
+    headers: &HeaderMap,
+    bytes: Bytes,
+) -> Result<NewManifest, OciError> {
+    let Push { repository, reference, by, only } = push;
     let digest = Digest::of(&bytes);
-    let tags = tags_to_set(parts, &reference)?;
     if let Reference::Digest(expected) = reference
         && expected != digest
     {
         return Err(OciError::digest_invalid(format!("the manifest hashes to {digest}, not to {expected}")));
     }
-    let content_type = parts.headers.get(CONTENT_TYPE).and_then(|value| value.to_str().ok());
+    let content_type = headers.get(CONTENT_TYPE).and_then(|value| value.to_str().ok());
     let parsed = Parsed::new(content_type, &bytes)?;
     if only.is_some_and(|only| parsed.artifact_type.as_deref() != Some(only)) {
         return Err(OciError::denied("a robot may only push outputs"));
@@ -94,7 +108,6 @@ pub(super) async fn put(registry: &Registry, push: Push<'_>, parts: &Parts, body
     let now_ms = registry.clock.now_ms();
     registry.blobs.put(bytes).await?;
     registry.blobs.touch(digest, now_ms).await?;
-    let subject = parsed.subject.clone();
     let new = NewManifest {
         manifest: StoredManifest { digest, size: manifest.size, media_type: parsed.media_type },
         artifact_type: parsed.artifact_type,
@@ -112,7 +125,10 @@ pub(super) async fn put(registry: &Registry, push: Push<'_>, parts: &Parts, body
         PutManifest::Outdated => Err(OciError::manifest_invalid("there is a list of publishers as new as this one")),
         PutManifest::Stored => {
             signed::tell(registry, repository, new.document.as_ref()).await;
-            created(repository, &digest, subject, parts, &new.tags)
+            if let Some((package, _)) = &new.package {
+                registry.changes.announce(Change::Package(package.name.clone()));
+            }
+            Ok(new)
         }
     }
 }
@@ -144,6 +160,9 @@ pub(super) async fn delete(
             let deed = by.map(|by| Deed::by(by, Act::ManifestDelete, repository).with("manifest", digest));
             let parts = registry.store.delete_manifest(repository, &digest, deed.as_ref(), now_ms).await?;
             let parts = parts.ok_or_else(OciError::manifest_unknown)?;
+            if let Ok(name) = repository.as_str().parse() {
+                registry.changes.announce(Change::Package(name));
+            }
             // An order that looked the package up a moment ago still finds its bytes: they stay for a while.
             for blob in parts.into_iter().chain([digest]) {
                 registry.blobs.touch(blob, now_ms).await?;

@@ -6,6 +6,7 @@ mod error;
 mod lists;
 mod manifests;
 pub mod parsed;
+mod publish;
 mod signed;
 mod uploads;
 
@@ -19,6 +20,7 @@ use task_proto::publisher::LIST_REPOSITORY;
 use task_proto::{Digest, RepositoryName, RobotId};
 
 pub use error::OciError;
+pub use publish::publish;
 
 use super::auth::Caller;
 use crate::blobs::Blobs;
@@ -75,7 +77,9 @@ fn endpoint(path: &str) -> Option<(&str, Endpoint<'_>)> {
     Some((path[..bytes].strip_suffix('/')?, endpoint))
 }
 
-/// `GET /v2/`: tells that this is a registry, and whether the caller's token is good.
+/// Tells that this is a registry, and whether the caller's token is good.
+#[utoipa::path(get, path = "/v2/", tag = "registry",
+    responses((status = 200, description = "It is.", body = serde_json::Value, example = json!({}))))]
 pub async fn version(request: Request) -> Answer {
     match request.extensions().get::<Caller>() {
         Some(Caller::Person(_) | Caller::Robot(_)) => {}
@@ -89,8 +93,16 @@ pub async fn version(request: Request) -> Answer {
     Ok((headers, axum::Json(serde_json::json!({}))).into_response())
 }
 
-/// Everything else below `/v2/`. The caller is taken from the request's extensions, where the guard put it; without one,
-/// nobody is let in.
+/// The OCI distribution API, pull and push.
+///
+/// Manifests, blobs, uploads, tags and referrers of packages, of lists of publishers and of what tasks brought back, as the
+/// specification of that API says. People pull and push as their roles allow; a robot reads the blobs of the packages it
+/// should have and pushes its own outputs.
+// The caller is taken from the request's extensions, where the guard put it; without one, nobody is let in.
+#[utoipa::path(get, path = "/v2/{path}", tag = "registry",
+    params(("path" = String, Path, description = "A repository and what of it, which has slashes.")),
+    responses((status = 200, description = "As the OCI distribution specification says.", body = String,
+        content_type = "application/octet-stream")))]
 pub async fn dispatch(State(registry): State<Registry>, Path(path): Path<String>, request: Request) -> Answer {
     let (parts, body) = request.into_parts();
     let caller = parts.extensions.get::<Caller>().cloned();

@@ -59,7 +59,7 @@ pub(super) async fn begin(
     begun(registry, repository).await?.accepted(StatusCode::ACCEPTED, 0)
 }
 
-async fn begun<'a>(registry: &'a Registry, repository: &'a RepositoryName) -> Result<Upload<'a>, OciError> {
+pub(super) async fn begun<'a>(registry: &'a Registry, repository: &'a RepositoryName) -> Result<Upload<'a>, OciError> {
     let id = registry.blobs.begin_upload(repository).await?;
     Ok(Upload { registry, repository, id })
 }
@@ -115,7 +115,7 @@ impl Upload<'_> {
     }
 
     /// Makes the upload a blob of the repository, in one go as the collector sees it.
-    async fn complete(&self, digest: Digest) -> Answer {
+    pub(super) async fn complete(&self, digest: Digest) -> Answer {
         let Self { registry, repository, id } = self;
         let _hold = registry.blobs.hold_collection().await;
         registry.blobs.finish_upload(repository, id, digest).await?;

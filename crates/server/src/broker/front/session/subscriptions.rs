@@ -2,6 +2,7 @@
 
 use rumqttd::protocol::{Packet, QoS, SubAck, SubscribeReasonCode, UnsubAck};
 use task_proto::Digest;
+use task_proto::api::Subscription;
 use tokio::io::{AsyncRead, AsyncWrite};
 
 use super::{End, Session, lower};
@@ -34,8 +35,17 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
                 _ => SubscribeReasonCode::Failure,
             });
         }
+        self.note_subscriptions();
         self.send(Packet::SubAck(SubAck { pkid, return_codes }, None));
         Ok(())
+    }
+
+    fn note_subscriptions(&self) {
+        let subscription = |(filter, (_, qos)): (&String, &(Hearing, QoS))| Subscription {
+            topic_filter: filter.clone(),
+            qos: *qos as u8,
+        };
+        self.seat.listens_to(self.hearing.iter().map(subscription).collect());
     }
 
     pub(super) fn unsubscribe(&mut self, pkid: u16, filters: &[String]) {
@@ -44,6 +54,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
                 self.parts.leave(&digest);
             }
         }
+        self.note_subscriptions();
         self.send(Packet::UnsubAck(UnsubAck { pkid, reasons: Vec::new() }, None));
     }
 

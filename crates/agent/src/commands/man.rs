@@ -1,0 +1,21 @@
+//! `task-agent man`: its man pages, made of the command line itself.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::Context as _;
+
+/// Arguments of `man`.
+#[derive(Debug, clap::Args)]
+pub struct Arguments {
+    /// The directory, made if need be
+    directory: PathBuf,
+}
+
+/// Writes a page for each subcommand.
+pub fn run(arguments: &Arguments, command_line: clap::Command) -> anyhow::Result<ExitCode> {
+    let directory = &arguments.directory;
+    let written = std::fs::create_dir_all(directory).and_then(|()| clap_mangen::generate_to(command_line, directory));
+    written.with_context(|| format!("cannot write to {}", directory.display()))?;
+    Ok(ExitCode::SUCCESS)
+}

@@ -1,0 +1,115 @@
+//! What `taskd doctor` and `task-agent doctor` have found: each check with its verdict in words, and how to mend what is
+//! wrong. Data and text; who checks reads it elsewhere.
+
+use serde::{Deserialize, Serialize};
+
+/// What was found, in the order in which it was looked at.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Checkup {
+    /// The checks.
+    pub checks: Vec<Check>,
+}
+
+/// One thing that was looked at.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Check {
+    /// What was looked at, in a word.
+    pub check: String,
+    /// How it is.
+    pub verdict: Verdict,
+    /// What was found.
+    pub found: String,
+    /// How to mend it; absent where there is nothing to mend.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mend: Option<String>,
+}
+
+/// How something is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Verdict {
+    /// As it should be.
+    Good,
+    /// It works, and may not for long or not for all.
+    Notice,
+    /// It does not work.
+    Bad,
+}
+
+impl Verdict {
+    /// The sign that stands before a line; the line's words say the same.
+    pub fn sign(self) -> char {
+        match self {
+            Self::Good => '✓',
+            Self::Notice => '!',
+            Self::Bad => '✗',
+        }
+    }
+}
+
+impl Checkup {
+    /// Something is as it should be.
+    pub fn good(&mut self, check: &str, found: impl Into<String>) {
+        self.add(check, Verdict::Good, found.into(), None);
+    }
+
+    /// Something should be looked at.
+    pub fn notice(&mut self, check: &str, found: impl Into<String>, mend: impl Into<String>) {
+        self.add(check, Verdict::Notice, found.into(), Some(mend.into()));
+    }
+
+    /// Something does not work.
+    pub fn bad(&mut self, check: &str, found: impl Into<String>, mend: impl Into<String>) {
+        self.add(check, Verdict::Bad, found.into(), Some(mend.into()));
+    }
+
+    fn add(&mut self, check: &str, verdict: Verdict, found: String, mend: Option<String>) {
+        self.checks.push(Check { check: check.to_owned(), verdict, found, mend });
+    }
+
+    /// Whether nothing is bad.
+    pub fn is_healthy(&self) -> bool {
+        self.checks.iter().all(|check| check.verdict != Verdict::Bad)
+    }
+
+    /// A line for each check, below it how to mend it, and at the end how many are not good. Control characters are left
+    /// out; `paint` may put colours around a sign.
+    pub fn text(&self, paint: impl Fn(Verdict) -> String) -> String {
+        let one_line = |text: &str| text.replace(char::is_control, " ");
+        let mut text = String::new();
+        for Check { check, verdict, found, mend } in &self.checks {
+            text.push_str(&format!("{} {check:<12} {}\n", paint(*verdict), one_line(found)));
+            if let Some(mend) = mend {
+                text.push_str(&format!("{:15}→ {}\n", "", one_line(mend)));
+            }
+        }
+        let count = |verdict| self.checks.iter().filter(|check| check.verdict == verdict).count();
+        let (bad, notices) = (count(Verdict::Bad), count(Verdict::Notice));
+        text.push_str(&match (bad, notices) {
+            (0, 0) => "all is well\n".to_owned(),
+            _ => format!("{bad} bad, {notices} to look at, {} good\n", count(Verdict::Good)),
+        });
+        text
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_check_has_a_line_and_what_to_do_below_it() {
+        let mut checkup = Checkup::default();
+        checkup.good("http", "answers");
+        assert_eq!(checkup.text(|v| v.sign().to_string()), "✓ http         answers\nall is well\n");
+        checkup.notice("clock", "6 s\u{1b}[31m ahead", "set it");
+        assert!(checkup.is_healthy());
+        checkup.bad("disk", "full", "make room");
+        assert!(!checkup.is_healthy());
+        assert_eq!(
+            checkup.text(|v| v.sign().to_string()),
+            "✓ http         answers\n! clock        6 s [31m ahead\n               → set it\n\
+             ✗ disk         full\n               → make room\n1 bad, 1 to look at, 1 good\n"
+        );
+    }
+}

@@ -1,0 +1,62 @@
+//! `taskd completions` and `taskd man`: what a packager installs beside the program. Both are made of the command line
+//! itself, so they can't tell of anything that is not there.
+
+use std::path::PathBuf;
+
+use clap::{Args, ValueEnum};
+use clap_complete::env::Shells;
+
+use super::complete::VARIABLE;
+use super::output::{say, stream_text};
+use super::{CommandError, Outcome};
+
+/// Which shell.
+#[derive(Debug, Args)]
+pub struct CompletionsOrder {
+    /// The shell
+    shell: Shell,
+}
+
+/// A shell whose words can be completed.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum Shell {
+    /// source <(taskd completions bash)
+    Bash,
+    /// source <(taskd completions zsh), after compinit
+    Zsh,
+    /// taskd completions fish | source
+    Fish,
+}
+
+/// Where the pages go.
+#[derive(Debug, Args)]
+pub struct ManOrder {
+    /// The directory, made if need be; MANPATH is the one above a man1
+    directory: PathBuf,
+}
+
+/// Prints the script for a shell. It asks this program, by its name in PATH, at each completion.
+pub(super) fn completions(order: &CompletionsOrder) -> Result<Outcome, CommandError> {
+    let name = match order.shell {
+        Shell::Bash => "bash",
+        Shell::Zsh => "zsh",
+        Shell::Fish => "fish",
+    };
+    let failed = |source| CommandError::Io { what: "can't write the script".to_owned(), source };
+    let shells = Shells::builtins();
+    let shell = shells.completer(name).ok_or_else(|| CommandError::Usage(format!("{name}: no such shell")))?;
+    let mut script = Vec::new();
+    shell.write_registration(VARIABLE, "taskd", "taskd", "taskd", &mut script).map_err(failed)?;
+    stream_text(&String::from_utf8_lossy(&script))?;
+    Ok(Outcome::Succeeded)
+}
+
+/// Writes a page for each command.
+pub(super) fn man(order: &ManOrder, command_line: clap::Command) -> Result<Outcome, CommandError> {
+    let directory = &order.directory;
+    let failed = |source| CommandError::Io { what: format!("can't write to {}", directory.display()), source };
+    std::fs::create_dir_all(directory).map_err(failed)?;
+    clap_mangen::generate_to(command_line, directory).map_err(failed)?;
+    say(&format!("read them with: man {}", directory.join("taskd.1").display()));
+    Ok(Outcome::Succeeded)
+}

@@ -1,0 +1,45 @@
+//! What is done to many robots at once.
+
+use axum::Json;
+use axum::extract::State;
+use task_proto::api::{BulkLabels, BulkRemove, MatchedRobot, MatchedRobots};
+
+use super::App;
+use super::error::ApiError;
+use super::extract::JsonBody;
+use super::robots::gone;
+use super::views::complete_matched;
+use crate::person::Person;
+
+/// Sets and removes labels of many robots, of all that are meant or of none.
+#[utoipa::path(post, path = "/api/v1/bulk/labels", tag = "robots",
+    responses((status = 409, description = "`no_robots_match`: the selector means nobody.")))]
+pub(super) async fn labels(
+    State(app): State<App>,
+    by: Person,
+    JsonBody(order): JsonBody<BulkLabels>,
+) -> Result<Json<MatchedRobots>, ApiError> {
+    Ok(completed(&app, app.actions.label_robots(&by, &order).await?))
+}
+
+/// Removes many robots, all that are meant or none.
+#[utoipa::path(post, path = "/api/v1/bulk/remove", tag = "robots",
+    responses((status = 409, description = "`no_robots_match`: the selector means nobody.")))]
+pub(super) async fn remove(
+    State(app): State<App>,
+    by: Person,
+    JsonBody(order): JsonBody<BulkRemove>,
+) -> Result<Json<MatchedRobots>, ApiError> {
+    if order.dry_run {
+        return Ok(completed(&app, app.actions.matching_robots(&by, &order.selector).await?));
+    }
+    let removed = app.actions.remove_robots(&by, &order.selector).await?;
+    let answer = completed(&app, removed);
+    answer.robots.iter().for_each(|robot| gone(&app, &robot.id));
+    Ok(answer)
+}
+
+fn completed(app: &App, mut robots: Vec<MatchedRobot>) -> Json<MatchedRobots> {
+    complete_matched(&mut robots, &app.presence, app.clock.now_ms());
+    Json(MatchedRobots { robots })
+}

@@ -1,0 +1,59 @@
+//! A package that the server packed itself, put into the registry by the way that a pusher's takes.
+
+use std::io;
+
+use http::header::CONTENT_TYPE;
+use http::{HeaderMap, HeaderValue};
+use task_proto::api::PackageView;
+use task_proto::desired::BlobRef;
+use task_proto::oci::MANIFEST_TYPE;
+use task_proto::{RepositoryName, Tag};
+use tokio_util::io::ReaderStream;
+
+use super::manifests::{Push, push};
+use super::uploads::begun;
+use super::{OciError, Registry};
+use crate::package::Packed;
+use crate::person::Person;
+use crate::store::Reference;
+
+/// How much of the content is read at once.
+const CHUNK_BYTES: usize = 256 * 1024;
+
+/// Stores a package, whose tag is its version, as `by` would have pushed it.
+pub async fn publish(registry: &Registry, by: &Person, packed: &Packed) -> Result<PackageView, OciError> {
+    let package = &packed.package;
+    let repository = RepositoryName::of_package(&package.name);
+    let tag: Tag = package.version.as_str().parse().map_err(|error| OciError::tag_invalid(&error))?;
+    let unreadable = |error: io::Error| OciError::internal(&error);
+    let content = tokio::fs::File::open(packed.content.path()).await.map_err(unreadable)?;
+    store(registry, &repository, package.content, ReaderStream::with_capacity(content, CHUNK_BYTES)).await?;
+    let config = ReaderStream::new(&packed.config_bytes[..]);
+    store(registry, &repository, package.config, config).await?;
+    let mut headers = HeaderMap::new();
+    headers.insert(CONTENT_TYPE, HeaderValue::from_static(MANIFEST_TYPE));
+    let manifest = packed.manifest_bytes.clone().into();
+    let as_tag = Push { repository: &repository, reference: Reference::Tag(tag.clone()), by: Some(by), only: None };
+    push(registry, as_tag, vec![tag], &headers, manifest).await?;
+    let view = registry.store.package(&package.name, &package.manifest.digest).await?;
+    view.ok_or_else(OciError::manifest_unknown)
+}
+
+/// Makes these bytes a blob of the repository, unless it has it.
+async fn store<S>(registry: &Registry, repository: &RepositoryName, blob: BlobRef, bytes: S) -> Result<(), OciError>
+where
+    S: futures_util::Stream<Item = io::Result<bytes::Bytes>> + Send,
+{
+    let is_there = registry.store.has_blob(Some(repository), &blob.digest).await?
+        && registry.blobs.touch(blob.digest, registry.clock.now_ms()).await?;
+    if is_there {
+        return Ok(());
+    }
+    let upload = begun(registry, repository).await?;
+    if let Err(error) = registry.blobs.append(repository, &upload.id, Some(0), bytes).await {
+        // Best effort, for the collector would find it; what the caller has to know is the error.
+        let _ = upload.cancel().await;
+        return Err(error.into());
+    }
+    upload.complete(blob.digest).await.map(drop)
+}

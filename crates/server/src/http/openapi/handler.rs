@@ -1,0 +1,142 @@
+//! What a handler's own types say of it: each argument of what it takes, its answer of what it gives. A handler whose types
+//! say nothing of a body gets it from its attribute.
+
+use std::net::SocketAddr;
+
+use axum::Json;
+use axum::extract::{ConnectInfo, Extension, Path, Request, State};
+use axum::response::sse::Sse;
+use axum::response::{IntoResponse, NoContent, Response};
+use http::{HeaderMap, StatusCode};
+use utoipa::{IntoParams, ToSchema};
+
+use super::super::auth::Caller;
+use super::super::error::ApiError;
+use super::super::extract::{JsonBody, PathParam, PathParams, QueryParams, TolerantJson};
+use super::super::oci::OciError;
+use super::Draft;
+use crate::person::Person;
+
+/// 201, with what was made.
+pub(in crate::http) struct Created<T>(pub(in crate::http) T);
+
+impl<T: serde::Serialize> IntoResponse for Created<T> {
+    fn into_response(self) -> Response {
+        (StatusCode::CREATED, Json(self.0)).into_response()
+    }
+}
+
+/// Something a handler takes out of a request.
+pub(in crate::http) trait Argument {
+    /// Says what of it the caller has to send. Most are found out by the server.
+    fn describe(_draft: &mut Draft) {}
+}
+
+impl<S> Argument for State<S> {}
+impl<T> Argument for Extension<T> {}
+impl Argument for ConnectInfo<SocketAddr> {}
+impl Argument for HeaderMap {}
+impl Argument for Request {}
+impl Argument for Caller {}
+impl Argument for Person {}
+
+impl<T: ToSchema> Argument for JsonBody<T> {
+    fn describe(draft: &mut Draft) {
+        draft.takes_json::<T>(true);
+    }
+}
+
+impl<T: ToSchema> Argument for TolerantJson<T> {
+    fn describe(draft: &mut Draft) {
+        draft.takes_json::<T>(false);
+    }
+}
+
+impl<T: ToSchema> Argument for PathParam<T> {
+    fn describe(draft: &mut Draft) {
+        draft.takes_path::<T>();
+    }
+}
+
+impl<A: ToSchema, B: ToSchema> Argument for PathParams<A, B> {
+    fn describe(draft: &mut Draft) {
+        draft.takes_path::<A>();
+        draft.takes_path::<B>();
+    }
+}
+
+impl<T: ToSchema> Argument for Path<T> {
+    fn describe(draft: &mut Draft) {
+        draft.takes_path::<T>();
+    }
+}
+
+impl<T: IntoParams> Argument for QueryParams<T> {
+    fn describe(draft: &mut Draft) {
+        draft.takes_query::<T>();
+    }
+}
+
+/// Something a handler answers.
+pub(in crate::http) trait Answer {
+    /// Says what of it the caller gets.
+    fn describe(_draft: &mut Draft) {}
+}
+
+impl Answer for Response {}
+impl<S> Answer for Sse<S> {}
+
+impl<T: ToSchema> Answer for Json<T> {
+    fn describe(draft: &mut Draft) {
+        draft.gives_json::<T>(StatusCode::OK);
+    }
+}
+
+impl<T: ToSchema> Answer for Created<T> {
+    fn describe(draft: &mut Draft) {
+        draft.gives_json::<T>(StatusCode::CREATED);
+    }
+}
+
+impl Answer for NoContent {
+    fn describe(draft: &mut Draft) {
+        draft.gives_nothing();
+    }
+}
+
+impl<T: Answer> Answer for Result<T, ApiError> {
+    fn describe(draft: &mut Draft) {
+        T::describe(draft);
+    }
+}
+
+impl<T: Answer> Answer for Result<T, OciError> {
+    fn describe(draft: &mut Draft) {
+        T::describe(draft);
+    }
+}
+
+/// A handler, whose arguments are `T`.
+pub(in crate::http) trait Describe<T> {
+    /// Says what its arguments and its answer say.
+    fn describe(&self, draft: &mut Draft);
+}
+
+macro_rules! describe_handlers {
+    ($(($($argument:ident),*))*) => { $(
+        impl<F, A, $($argument,)*> Describe<($($argument,)*)> for F
+        where
+            F: Fn($($argument),*) -> A,
+            A: Future,
+            A::Output: Answer,
+            $($argument: Argument,)*
+        {
+            fn describe(&self, draft: &mut Draft) {
+                $($argument::describe(draft);)*
+                A::Output::describe(draft);
+            }
+        }
+    )* };
+}
+
+describe_handlers! { () (T1) (T1, T2) (T1, T2, T3) (T1, T2, T3, T4) (T1, T2, T3, T4, T5) (T1, T2, T3, T4, T5, T6) }

@@ -1,0 +1,221 @@
+//! A package's directory that the page brings as an archive: unpacked beside the blobs, packed like `taskd push` does, and put
+//! into the registry. The archive is by a browser, and believed in nothing.
+
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::body::Body;
+use axum::extract::{FromRef as _, Request, State};
+use bytes::Bytes;
+use futures_util::StreamExt as _;
+use http::{HeaderMap, StatusCode, header};
+use task_archive::{Compression, Limits, Refusal, UnpackError, unpack_unannounced};
+use task_proto::api::PackageView;
+use tempfile::TempDir;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+
+use super::App;
+use super::error::ApiError;
+use super::oci::{self, Registry};
+use super::openapi::Created;
+use crate::package::{PackageError, Packed, pack_into};
+use crate::person::Person;
+
+/// Archives that are unpacked and packed at the same time.
+const AT_ONCE: usize = 2;
+/// How many look into packages at the same time.
+const READERS: usize = 2;
+/// How long an archive may take to arrive and be packed.
+const DEADLINE: Duration = Duration::from_secs(60 * 60);
+/// How long a sender may be silent.
+const SILENCE: Duration = Duration::from_secs(60);
+/// Pieces of a body that wait to be unpacked.
+const WAITING: usize = 16;
+/// What an archive may have beside what is in it.
+const OVERHEAD_BYTES: u64 = 1 << 20;
+
+/// Where archives are unpacked, and who may read some.
+pub struct UploadSpace {
+    directory: PathBuf,
+    limits: Limits,
+    places: Arc<Semaphore>,
+    /// Whose turn it is to look into a package.
+    pub(super) readers: Arc<Semaphore>,
+}
+
+impl UploadSpace {
+    /// In a directory that is empty; of an archive at most `most_bytes` are unpacked.
+    pub fn new(directory: PathBuf, most_bytes: u64) -> Self {
+        let limits = Limits::default();
+        let limits = Limits { bytes: limits.bytes.min(most_bytes), ..limits };
+        let [places, readers] = [AT_ONCE, READERS].map(|most| Arc::new(Semaphore::new(most)));
+        Self { directory, limits, places, readers }
+    }
+}
+
+/// Why an archive did not become a package.
+#[derive(Debug, thiserror::Error)]
+enum UploadError {
+    #[error(transparent)]
+    Unpack(#[from] UnpackError),
+    #[error(transparent)]
+    Package(#[from] PackageError),
+    #[error("the directory for uploads can't be used")]
+    Disk(#[from] io::Error),
+}
+
+/// Takes a package's directory as a tar archive, compressed with zstd or not, and packs it as `taskd push` would.
+#[utoipa::path(post, path = "/api/v1/packages", tag = "packages",
+    request_body(description = "The directory: its files, directories and links, or that one directory with all that is in it.",
+        content((String = "application/x-tar"), (String = "application/zstd"))),
+    responses((status = 400, description = "The body broke off."),
+        (status = 413, description = "`too_large`: it is more than the server unpacks."),
+        (status = 415, description = "The body is neither `application/x-tar` nor `application/zstd`."),
+        (status = 422, description = "`archive_refused`: there is something in it that a package can't have. \
+            `package_invalid`: it can't be run; the message says all that is wrong."),
+        (status = 408, description = "It took too long to arrive."),
+        (status = 507, description = "`disk_full`: the server's disk is.")))]
+pub(super) async fn package(
+    State(app): State<App>,
+    by: Person,
+    request: Request,
+) -> Result<Created<PackageView>, ApiError> {
+    let compression = compression(request.headers())?;
+    let place = app.uploads.places.clone().try_acquire_owned().map_err(|_| {
+        ApiError::too_many(format!("{AT_ONCE} packages are being uploaded already; try again in a moment"))
+    })?;
+    let working = async {
+        let (packed, _place) = receive(&app, place, compression, request.into_body()).await?;
+        Ok(oci::publish(&Registry::from_ref(&app), &by, &packed).await?)
+    };
+    match tokio::time::timeout(DEADLINE, working).await {
+        Ok(published) => published.map(Created),
+        Err(_) => Err(timeout("the upload took longer than an hour")),
+    }
+}
+
+fn timeout(message: &str) -> ApiError {
+    ApiError::new(StatusCode::REQUEST_TIMEOUT, "timeout", message)
+}
+
+fn compression(headers: &HeaderMap) -> Result<Compression, ApiError> {
+    let content_type = headers.get(header::CONTENT_TYPE).and_then(|value| value.to_str().ok()).unwrap_or_default();
+    match content_type.split(';').next().unwrap_or_default().trim().to_ascii_lowercase().as_str() {
+        "application/x-tar" => Ok(Compression::None),
+        "application/zstd" => Ok(Compression::Zstd),
+        _ => {
+            let message = "Content-Type: expected application/x-tar or application/zstd";
+            Err(ApiError::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "unsupported_media_type", message))
+        }
+    }
+}
+
+/// Unpacks the body as it comes, and packs what was in it. The work goes on if the caller goes away, so its place must as well.
+async fn receive(
+    app: &App,
+    place: OwnedSemaphorePermit,
+    compression: Compression,
+    body: Body,
+) -> Result<(Packed, OwnedSemaphorePermit), ApiError> {
+    let (sender, receiver) = mpsc::channel(WAITING);
+    let (directory, limits) = (app.uploads.directory.clone(), app.uploads.limits);
+    let work = tokio::task::spawn_blocking(move || {
+        packed(Arriving { receiver, current: Bytes::new() }, compression, &limits, &directory).map(|it| (it, place))
+    });
+    let (fed, worked) = tokio::join!(feed(body, sender, limits.bytes.saturating_add(OVERHEAD_BYTES)), work);
+    // Where the body did not come whole, the archive in it was not whole either.
+    fed?;
+    match worked {
+        Ok(worked) => worked.map_err(refused),
+        Err(panic) => std::panic::resume_unwind(panic.into_panic()),
+    }
+}
+
+/// Hands the body on, until it ends or nobody takes any more of it.
+async fn feed(body: Body, sender: mpsc::Sender<Bytes>, most: u64) -> Result<(), ApiError> {
+    let (mut chunks, mut taken) = (body.into_data_stream(), 0);
+    loop {
+        let chunk = match tokio::time::timeout(SILENCE, chunks.next()).await {
+            Ok(Some(Ok(chunk))) => chunk,
+            Ok(Some(Err(_))) => return Err(ApiError::invalid("the body broke off")),
+            Ok(None) => return Ok(()),
+            Err(_) => return Err(timeout("the upload stopped for a minute")),
+        };
+        taken += chunk.len() as u64;
+        if taken > most {
+            return Err(too_large(format!("the archive has more than {most} bytes, the most that this server takes")));
+        }
+        if sender.send(chunk).await.is_err() {
+            return Ok(());
+        }
+    }
+}
+
+/// A body as a thread reads it. It ends where the sender is gone.
+struct Arriving {
+    receiver: mpsc::Receiver<Bytes>,
+    current: Bytes,
+}
+
+impl Read for Arriving {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        while self.current.is_empty() {
+            match self.receiver.blocking_recv() {
+                Some(chunk) => self.current = chunk,
+                None => return Ok(0),
+            }
+        }
+        let piece = self.current.split_to(buffer.len().min(self.current.len()));
+        buffer[..piece.len()].copy_from_slice(&piece);
+        Ok(piece.len())
+    }
+}
+
+fn packed(body: Arriving, compression: Compression, limits: &Limits, directory: &Path) -> Result<Packed, UploadError> {
+    let temporary = TempDir::new_in(directory)?;
+    let unpacked = temporary.path().join("package");
+    unpack_unannounced(body, compression, limits, &unpacked)?;
+    let package = only_directory(&unpacked)?.unwrap_or(unpacked);
+    Ok(pack_into(&package, directory)?)
+}
+
+/// The directory in `unpacked`, if there is nothing else: whoever archives a directory mostly has its name in the archive.
+fn only_directory(unpacked: &Path) -> io::Result<Option<PathBuf>> {
+    let mut entries = std::fs::read_dir(unpacked)?;
+    match (entries.next().transpose()?, entries.next()) {
+        (Some(only), None) if only.file_type()?.is_dir() => Ok(Some(only.path())),
+        _ => Ok(None),
+    }
+}
+
+fn refused(error: UploadError) -> ApiError {
+    let unprocessable = |code, message| ApiError::new(StatusCode::UNPROCESSABLE_ENTITY, code, message);
+    let source = match &error {
+        UploadError::Unpack(UnpackError::Refused(refusal @ Refusal::Limit { .. })) => {
+            return too_large(refusal.to_string());
+        }
+        UploadError::Unpack(UnpackError::Refused(refusal)) => {
+            return unprocessable("archive_refused", refusal.to_string());
+        }
+        // Its own text has the path of a directory that nobody else knows.
+        UploadError::Package(PackageError::Invalid { problems, .. }) => {
+            let lines: Vec<String> = problems.iter().map(ToString::to_string).collect();
+            return unprocessable("package_invalid", lines.join("\n"));
+        }
+        UploadError::Unpack(UnpackError::Source(source) | UnpackError::Disk { source, .. })
+        | UploadError::Package(PackageError::Io { source, .. })
+        | UploadError::Disk(source) => source,
+    };
+    match source.kind() {
+        io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {
+            ApiError::new(StatusCode::INSUFFICIENT_STORAGE, "disk_full", "the server's disk is full")
+        }
+        _ => ApiError::internal(&error),
+    }
+}
+
+fn too_large(message: String) -> ApiError {
+    ApiError::new(StatusCode::PAYLOAD_TOO_LARGE, "too_large", message)
+}

@@ -1,0 +1,304 @@
+//! Orders that follow from earlier ones, told on every database: a task run anew, what failed once more, and back.
+
+use task_proto::api::{PackageView, RetryDeployment};
+use task_proto::manifest::TaskKind;
+use task_proto::oci::MANIFEST_TYPE;
+use task_proto::report::{Failure, FailureCode, Phase};
+use task_proto::selector::Selector;
+use task_proto::{DeploymentId, RepositoryName, TaskName};
+use taskd::actions::{ActionError, Rollback, TaskOrder};
+use taskd::person::{Person, Scope};
+use taskd::store::{NewManifest, PutManifest, Reference, StoredManifest};
+
+use crate::database::{TestDatabase, on_both_databases};
+use crate::fleet::{Fleet, Robot, package, random_key};
+use crate::story::code;
+
+on_both_databases! {
+    a_restart_is_a_new_run_of_all_that_have_the_task,
+    a_retry_is_for_those_that_ended_badly_and_got_nothing_since,
+    a_retry_may_be_for_some_and_keeps_the_orders_ways,
+    a_rollback_brings_back_what_ran_before,
+    a_rollback_passes_over_what_never_ran_and_what_is_gone,
+    orders_that_follow_stay_in_ones_scope,
+}
+
+fn task() -> TaskName {
+    "talker".parse().expect("a name")
+}
+
+fn selector(text: &str) -> Selector {
+    text.parse().expect("a selector")
+}
+
+impl Fleet {
+    /// Makes a version one that can be ordered again.
+    async fn publish(&self, version: &str) -> PackageView {
+        let view = package(version, TaskKind::Service);
+        let manifest = &view.package.manifest;
+        let new = NewManifest {
+            manifest: StoredManifest {
+                digest: manifest.digest,
+                size: manifest.size,
+                media_type: MANIFEST_TYPE.to_owned(),
+            },
+            artifact_type: None,
+            annotations: Default::default(),
+            subject: None,
+            parts: Vec::new(),
+            tags: vec![version.parse().expect("a tag")],
+            package: Some((view.package.clone(), view.manifest.clone())),
+            output: None,
+            document: None,
+        };
+        let repository = RepositoryName::of_package(&task());
+        let put = self.database.store.put_manifest(&repository, &new, None, self.clock.now_ms()).await;
+        assert_eq!(put.expect("writes"), PutManifest::Stored);
+        view
+    }
+
+    async fn unpublish(&self, version: &str) {
+        let digest = package(version, TaskKind::Service).package.manifest.digest;
+        let repository = RepositoryName::of_package(&task());
+        let gone = self.database.store.delete_manifest(&repository, &digest, None, self.clock.now_ms()).await;
+        assert!(gone.expect("writes").is_some());
+    }
+
+    async fn fail(&self, robot: &mut Robot, code: FailureCode) {
+        let desired = self.desired(robot).await.expect("not withheld");
+        robot.accept(&desired, Phase::Failed);
+        for task in robot.tasks.values_mut() {
+            task.failure = Some(Failure::new(code.clone(), "it did not work"));
+        }
+        self.report(robot).await;
+    }
+
+    async fn retry(
+        &self,
+        by: &Person,
+        id: &DeploymentId,
+        retry: &RetryDeployment,
+    ) -> Result<DeploymentId, ActionError> {
+        self.actions.retry_deployment(by, &random_key(), id, retry).await
+    }
+
+    async fn roll_back(&self, robots: &str) -> Result<Rollback, ActionError> {
+        self.actions.roll_back(&self.operator, &random_key(), &task(), &selector(robots)).await
+    }
+
+    async fn version(&self, robot: &Robot) -> String {
+        self.desired(robot).await.expect("not withheld").tasks[0].package.version.to_string()
+    }
+}
+
+fn names(robots: &[task_proto::api::MatchedRobot]) -> Vec<&str> {
+    robots.iter().map(|robot| robot.name.as_str()).collect()
+}
+
+async fn a_restart_is_a_new_run_of_all_that_have_the_task(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    let mut robots = fleet.enroll(3).await;
+    let id = fleet.deploy("1", |order| order.selector = selector("!r2")).await;
+    fleet.follow(&mut robots[0], Phase::Running).await;
+    fleet.follow(&mut robots[1], Phase::Failed).await;
+    fleet.changes.take_rings().await;
+    let (key, all, task) = (random_key(), selector("*"), task());
+    let restart = || fleet.actions.order_task(&fleet.operator, &key, TaskOrder::Restart, &task, &all);
+    assert_eq!(names(&restart().await.expect("ordered")), ["r0", "r1"]);
+    assert_eq!(names(&restart().await.expect("the same answer")), ["r0", "r1"]);
+    assert_eq!(fleet.changes.take_rings().await.robots.len(), 2);
+    assert_eq!(fleet.phases(&id).await, [Phase::Assigned, Phase::Assigned]);
+    for robot in &mut robots[..2] {
+        assert_eq!(fleet.desired(robot).await.expect("state").tasks[0].run, 2);
+        fleet.follow(robot, Phase::Running).await;
+    }
+    assert_eq!(fleet.phases(&id).await, [Phase::Running, Phase::Running]);
+}
+
+async fn a_retry_is_for_those_that_ended_badly_and_got_nothing_since(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    fleet.publish("1").await;
+    let mut robots = fleet.enroll(7).await;
+    let id = fleet.deploy("1", |_| ()).await;
+    fleet.follow(&mut robots[0], Phase::Running).await;
+    for (robot, phase) in [(1, Phase::Failed), (2, Phase::RolledBack), (3, Phase::Unmet)] {
+        fleet.follow(&mut robots[robot], phase).await;
+    }
+    for robot in &mut robots[4..] {
+        fleet.follow(robot, Phase::Failed).await;
+    }
+    // Somebody has seen to the last ones already.
+    fleet.deploy("2", |order| order.selector = selector("r4")).await;
+    for (order, robot) in [(TaskOrder::Stop, "r5"), (TaskOrder::Remove, "r6")] {
+        let ordered = fleet.actions.order_task(&fleet.operator, &random_key(), order, &task(), &selector(robot)).await;
+        ordered.expect("ordered");
+    }
+    let retry = RetryDeployment::default();
+    let meant = fleet.actions.robots_to_retry(&fleet.operator, &id, &retry).await.expect("there are some");
+    assert_eq!(names(&meant), ["r1", "r2", "r3"]);
+    assert_eq!(fleet.deployments().await.len(), 2, "a dry run orders nothing");
+    let key = random_key();
+    let ordered = || fleet.actions.retry_deployment(&fleet.operator, &key, &id, &retry);
+    let new = ordered().await.expect("ordered");
+    assert_eq!(ordered().await.expect("the same"), new);
+    assert_eq!(fleet.phases(&new).await, [Phase::Assigned; 3]);
+    assert_eq!(fleet.deployment(&new).await.package, fleet.deployment(&id).await.package);
+    assert_eq!(code(fleet.retry(&fleet.operator, &id, &retry).await), "nothing_to_retry");
+    let other = RetryDeployment { code: Some(FailureCode::DISK_FULL), ..RetryDeployment::default() };
+    let reused = fleet.actions.retry_deployment(&fleet.operator, &key, &id, &other).await;
+    assert_eq!(code(reused), "idempotency_key_reused");
+    // What expired or was taken back can be ordered again as well, but not once its package is gone.
+    fleet.actions.cancel_deployment(&fleet.operator, &new).await.expect("cancelled");
+    fleet.unpublish("1").await;
+    assert_eq!(code(fleet.retry(&fleet.operator, &new, &retry).await), "package_not_found");
+    fleet.publish("1").await;
+    let third = fleet.retry(&fleet.operator, &new, &retry).await.expect("ordered");
+    assert_eq!(fleet.phases(&third).await.len(), 3);
+    assert_eq!(code(fleet.retry(&fleet.operator, &DeploymentId::random(), &retry).await), "not_found");
+}
+
+async fn a_retry_may_be_for_some_and_keeps_the_orders_ways(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    fleet.publish("1").await;
+    let mut robots = fleet.enroll(4).await;
+    let id = fleet
+        .deploy("1", |order| {
+            order.priority = 7;
+            order.max_failures = Some(3);
+            order.batch = Some(4);
+            order.expires_in_s = Some(600);
+            order.delivery = task_proto::api::DeliveryChoice::PushPull;
+        })
+        .await;
+    for (robot, code) in robots.iter_mut().zip([
+        FailureCode::DISK_FULL,
+        FailureCode::BUILD_FAILED,
+        FailureCode::DISK_FULL,
+        FailureCode::DISK_FULL,
+    ]) {
+        fleet.fail(robot, code).await;
+    }
+    let retry = RetryDeployment {
+        selector: Some(selector("!r3")),
+        code: Some(FailureCode::DISK_FULL),
+        ..RetryDeployment::default()
+    };
+    let new = fleet.retry(&fleet.operator, &id, &retry).await.expect("ordered");
+    let view = fleet.deployment(&new).await;
+    let robots: Vec<_> = view.assignments.as_ref().expect("there").iter().map(|one| one.name.as_str()).collect();
+    assert_eq!(robots, ["r0", "r2"]);
+    let ways = (view.priority, view.max_failures, view.batch, view.delivery, view.selector.expect("whole").to_string());
+    let delivery = task_proto::api::DeliveryChoice::PushPull;
+    assert_eq!(ways, (7, Some(3), Some(4), delivery, "!r3".to_owned()));
+    assert_eq!(view.expires_at_ms - view.created_at_ms, 600_000);
+}
+
+async fn a_rollback_brings_back_what_ran_before(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    for version in ["1", "2", "3"] {
+        fleet.publish(version).await;
+    }
+    let mut robots = fleet.enroll(4).await;
+    fleet.deploy("1", |order| order.selector = selector("r0,r1")).await;
+    fleet.deploy("2", |order| order.selector = selector("r2")).await;
+    for robot in &mut robots[..3] {
+        fleet.follow(robot, Phase::Running).await;
+    }
+    fleet.deploy("3", |_| ()).await;
+    for robot in &mut robots {
+        fleet.follow(robot, Phase::Running).await;
+    }
+    let planned = fleet.actions.rollback(&fleet.operator, &task(), &selector("*")).await.expect("reads");
+    assert_eq!((names(&planned.robots), names(&planned.without)), (vec!["r0", "r1", "r2"], vec!["r3"]));
+    assert_eq!((planned.deployments.len(), fleet.deployments().await.len()), (0, 3));
+    fleet.changes.take_rings().await;
+    let key = random_key();
+    let order = || async {
+        let all = selector("*");
+        fleet.actions.roll_back(&fleet.operator, &key, &task(), &all).await.expect("ordered")
+    };
+    let done = order().await;
+    assert_eq!(order().await, done, "the same key orders once");
+    assert_eq!((&done.robots, &done.without, done.deployments.len()), (&planned.robots, &planned.without, 2));
+    assert_eq!(fleet.changes.take_rings().await.robots.len(), 3);
+    for (robot, version) in robots.iter().zip(["1", "1", "2", "3"]) {
+        assert_eq!(fleet.version(robot).await, version);
+    }
+    // Pages cut between deployments of one write lose none of them.
+    let mut paged = Vec::new();
+    let mut before = None;
+    loop {
+        let page = fleet.database.store.deployments(None, before.as_ref(), 1).await.expect("reads").expect("there");
+        paged.extend(page.deployments.into_iter().map(|view| view.id));
+        before = page.next;
+        if before.is_none() {
+            break;
+        }
+    }
+    assert_eq!(paged.len(), 5);
+    assert!(done.deployments.iter().all(|id| paged.contains(id)));
+    // Once more is back again: the newest other package that ran is the one that was left.
+    for robot in &mut robots {
+        fleet.follow(robot, Phase::Running).await;
+    }
+    fleet.roll_back("r0").await.expect("ordered");
+    assert_eq!(fleet.version(&robots[0]).await, "3");
+    let nobody = fleet.roll_back("r3").await;
+    assert_eq!(code(nobody), "nothing_to_roll_back");
+    let unknown = fleet.actions.rollback(&fleet.operator, &"walker".parse().expect("a name"), &selector("*")).await;
+    assert_eq!(code(unknown), "no_robots_match");
+}
+
+async fn a_rollback_passes_over_what_never_ran_and_what_is_gone(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    for version in ["1", "2", "3", "4", "5"] {
+        fleet.publish(version).await;
+    }
+    let mut robots = fleet.enroll(1).await;
+    let runs = [("1", Phase::Running), ("2", Phase::Succeeded), ("3", Phase::Failed), ("4", Phase::Running)];
+    for (version, phase) in runs {
+        fleet.deploy(version, |_| ()).await;
+        fleet.follow(&mut robots[0], phase).await;
+    }
+    // The same package once more is nothing to go back to, nor is what has not begun yet.
+    fleet.deploy("5", |_| ()).await;
+    fleet.deploy("4", |_| ()).await;
+    fleet.follow(&mut robots[0], Phase::Failed).await;
+    fleet.roll_back("*").await.expect("ordered");
+    assert_eq!(fleet.version(&robots[0]).await, "2");
+    fleet.actions.cancel_deployment(&fleet.operator, &fleet.deployments().await[0].id).await.expect("cancelled");
+    fleet.unpublish("2").await;
+    fleet.roll_back("*").await.expect("ordered");
+    assert_eq!(fleet.version(&robots[0]).await, "1");
+    let found = fleet.database.store.find_package(&task(), &Reference::Tag("1".parse().expect("a tag"))).await;
+    assert_eq!(found.expect("reads").map(|view| view.package), Some(package("1", TaskKind::Service).package));
+}
+
+async fn orders_that_follow_stay_in_ones_scope(database: TestDatabase) {
+    let fleet = Fleet::new(database);
+    for version in ["1", "2"] {
+        fleet.publish(version).await;
+    }
+    let mut robots = fleet.enroll(2).await;
+    let one = fleet.deploy("1", |_| ()).await;
+    for robot in &mut robots {
+        fleet.follow(robot, Phase::Running).await;
+    }
+    let two = fleet.deploy("2", |_| ()).await;
+    for robot in &mut robots {
+        fleet.follow(robot, Phase::Failed).await;
+    }
+    let of_robot = |name: &str| Person { scope: Scope::of([selector(name)]), ..fleet.operator.clone() };
+    let (alice, carol) = (of_robot("r0"), of_robot("r7"));
+    let all = RetryDeployment::default();
+    assert_eq!(code(fleet.retry(&alice, &two, &all).await), "out_of_scope");
+    assert_eq!(code(fleet.retry(&carol, &one, &all).await), "out_of_scope");
+    let back = fleet.actions.roll_back(&alice, &random_key(), &task(), &selector("*")).await;
+    assert_eq!(code(back), "out_of_scope");
+    let own = RetryDeployment { selector: Some(selector("r0")), ..RetryDeployment::default() };
+    let new = fleet.retry(&alice, &two, &own).await.expect("hers");
+    assert_eq!(fleet.phases(&new).await.len(), 1);
+    let back = fleet.actions.roll_back(&alice, &random_key(), &task(), &selector("r0")).await.expect("hers");
+    assert_eq!(names(&back.robots), ["r0"]);
+    assert_eq!(fleet.version(&robots[1]).await, "2");
+}

@@ -1,0 +1,173 @@
+// What an operator does with a fleet of real agents: from the first robot to a task that runs, fails, is followed and is taken back.
+
+import { randomBytes } from 'node:crypto';
+import { test } from 'node:test';
+import { agent, assert, assertQuiet, eventually, open, PATIENCE_MS, Puppet, Server, until } from './harness.mjs';
+
+const row = (page, name) => page.locator('.row[data-robot]', { hasText: name });
+const phase = (page, name, text) => row(page, name).locator('.phase', { hasText: text });
+
+test('a robot that enrols by the shown command appears by itself', async (t) => {
+  const server = await Server.start(t);
+  const page = await open(t, server);
+  await page.getByText('Waiting for the first robot…').waitFor();
+  await page.evaluate(() => (window.isSameDocument = true));
+  await page.getByRole('button', { name: 'Show the command' }).click();
+  const line = await page.locator('.command code', { hasText: '--token' }).innerText();
+  const [, url, token] = line.match(/^task-agent enroll --server (\S+) --token (\S+)$/);
+  assert.equal(url, server.url);
+  await server.ask('POST', '/enroll', { mac: '02:00:00:00:00:77', name: 'first' }, { token });
+  await row(page, 'first').locator('.state', { hasText: 'Offline' }).waitFor();
+  await agent(t, server, 'atlas');
+  await row(page, 'atlas').locator('.state', { hasText: 'Online' }).waitFor();
+  assert.equal(await page.evaluate(() => window.isSameDocument), true, 'the page was never loaded again');
+  assertQuiet(page);
+});
+
+test('two robots are chosen, get a package while it is seen to come, and run it', async (t) => {
+  // So slow that the progress can be looked at.
+  const server = await Server.start(t, { environment: { TASKD_TRANSFERS_BYTES_PER_S: '1 MB' } });
+  for (const name of ['atlas', 'borea', 'corvus']) await agent(t, server, name);
+  server.push('talker', '1.0.0', { files: { 'run.sh': '#!/bin/sh\nexec sleep 1000\n', model: randomBytes(3_000_000) } });
+  const page = await open(t, server);
+  for (const name of ['atlas', 'borea']) await row(page, name).getByRole('checkbox').click();
+  await page.getByRole('button', { name: 'Push…' }).click();
+  await page.getByRole('dialog').getByText('Push to 2 robots').waitFor();
+  await page.getByRole('dialog').getByRole('button', { name: 'Deploy' }).click();
+  await page.waitForURL(/#\/deployments\/d/);
+  await page.getByRole('link', { name: 'Robots' }).click();
+  // Two values of one robot's bar, one after the other.
+  await page.getByRole('searchbox').fill('atlas');
+  const values = await page.evaluate((patience) => new Promise((resume, reject) => {
+    const seen = new Set();
+    const end = performance.now() + patience;
+    const look = () => {
+      const bar = document.querySelector('[data-task=talker] progress');
+      if (bar?.value > 0) seen.add(bar.value);
+      if (seen.size > 1) resume([...seen]);
+      else if (performance.now() > end) reject(new Error(`the bar showed no two values, but ${[...seen]}`));
+      else requestAnimationFrame(look);
+    };
+    look();
+  }), PATIENCE_MS);
+  assert.ok(values[0] < values[1], `the bar grows: ${values}`);
+  await page.getByRole('searchbox').fill('');
+  for (const name of ['atlas', 'borea']) await phase(page, name, 'running').waitFor();
+  assert.equal(await row(page, 'corvus').locator('[data-task]').count(), 0, 'who was not chosen gets nothing');
+  assertQuiet(page);
+});
+
+test('who fails is found by the counter, and says why', async (t) => {
+  const server = await Server.start(t);
+  for (const name of ['atlas', 'borea']) await agent(t, server, name);
+  server.push('sensor', '0.1.0', { files: { 'run.sh': '#!/bin/sh\necho no such sensor >&2\nexit 3\n' }, more: 'restart = "never"\n', to: 'atlas' });
+  const page = await open(t, server);
+  await phase(page, 'atlas', 'failed').waitFor();
+  await row(page, 'atlas').locator('.failure').waitFor();
+  await page.getByRole('button', { name: 'Failed' }).click();
+  await until(page, () => document.querySelectorAll('.row[data-robot]').length === 1);
+  assert.match(page.url(), /state=failed/);
+  await row(page, 'atlas').getByRole('link', { name: 'atlas' }).click();
+  await page.getByText('exited with code 3').first().waitFor();
+  assertQuiet(page);
+});
+
+test('a deployment is cancelled, and the version before goes on', async (t) => {
+  const server = await Server.start(t);
+  await agent(t, server, 'atlas');
+  server.push('talker', '1.0.0', { to: 'atlas' });
+  const page = await open(t, server);
+  await phase(page, 'atlas', 'running').waitFor();
+  // Not settled before it is cancelled.
+  const newest = server.push('talker', '2.0.0', { more: '\n[ready]\nhold_s = 30\ntimeout_s = 60\n', to: 'atlas' });
+  await page.goto(`${server.url}/#/deployments/${newest.id}`);
+  await page.getByRole('button', { name: 'Cancel…' }).click();
+  await page.getByRole('dialog').getByRole('button', { name: /^Cancel the/ }).click();
+  await page.locator('.standing', { hasText: 'Cancelled' }).waitFor();
+  await eventually('the version before to be what is wanted', async () => (await server.ask('GET', '/robots/atlas')).tasks[0]?.version === '1.0.0');
+  assertQuiet(page);
+});
+
+test('the log is followed, paused and filtered', async (t) => {
+  const server = await Server.start(t);
+  await agent(t, server, 'atlas');
+  server.push('talker', '1.0.0', { to: 'atlas', files: { 'run.sh': '#!/bin/sh\ni=0\nwhile :; do i=$((i+1)); echo "line $i"; sleep 0.2; done\n' } });
+  const page = await open(t, server, { hash: '#/robots/atlas/logs' });
+  const lines = () => page.getByRole('log').innerText();
+  await eventually('lines to come', async () => /line 3\b/.test(await lines()));
+  await page.getByRole('button', { name: 'Pause' }).click();
+  const before = await lines();
+  // The button counts what waits.
+  const goOn = page.getByRole('button', { name: /Go on \([2-9]\d* wait\)/ });
+  await goOn.waitFor();
+  assert.equal(await lines(), before, 'nothing moves while it is paused');
+  await goOn.click();
+  await eventually('lines to go on', async () => (await lines()) !== before);
+  await page.getByLabel('Level').selectOption('error');
+  await eventually('only errors to be left', async () => !/line \d/.test(await lines()));
+  assert.match(page.url(), /level=error/);
+  assertQuiet(page);
+});
+
+test('labels are edited one by one and in bulk', async (t) => {
+  const server = await Server.start(t);
+  for (const name of ['atlas', 'borea']) await Puppet.enroll(server, name);
+  const page = await open(t, server);
+  await row(page, 'atlas').getByRole('button', { name: 'Edit atlas' }).click();
+  await page.getByRole('textbox', { name: 'Labels' }).fill('site=lab, floor=2');
+  await page.getByRole('button', { name: 'Save' }).click();
+  await eventually('the labels', async () => (await server.ask('GET', '/robots/atlas')).labels.floor === '2');
+  await page.getByRole('checkbox', { name: 'Select all that are shown' }).click();
+  await page.getByRole('button', { name: 'Label…' }).click();
+  await page.getByLabel('Labels to set').fill('site=yard');
+  await page.getByRole('dialog').getByRole('checkbox', { name: 'floor' }).check();
+  await page.getByRole('dialog').getByRole('button', { name: 'Label' }).click();
+  for (const name of ['atlas', 'borea']) {
+    await eventually(`the labels of ${name}`, async () => JSON.stringify((await server.ask('GET', `/robots/${name}`)).labels) === '{"site":"yard"}');
+  }
+  // Typed wrong, it is said in the dialog, and nothing is lost.
+  await row(page, 'atlas').getByRole('button', { name: 'Edit atlas' }).click();
+  await page.getByRole('textbox', { name: 'Labels' }).fill('site');
+  await page.getByRole('button', { name: 'Save' }).click();
+  await page.getByRole('dialog').getByText('site: a label is written as name=value').waitFor();
+  assert.equal(await page.getByRole('textbox', { name: 'Labels' }).inputValue(), 'site');
+  assertQuiet(page);
+});
+
+test('an order is for whoever was chosen, while the rest of the list is on its way', async (t) => {
+  const server = await Server.start(t);
+  // One more than the first page of the list holds.
+  for (let arm = 1; arm <= 101; arm += 1) await Puppet.enroll(server, `arm${arm}`);
+  const page = await open(t, server);
+  await page.route(/\/robots\?.*after=/, () => {});
+  await page.reload();
+  await page.getByRole('checkbox', { name: 'Select all that are shown' }).click();
+  await page.getByText('100 selected').waitFor();
+  await page.getByRole('button', { name: 'Label…' }).click();
+  await page.getByLabel('Labels to set').fill('floor=2');
+  await page.getByRole('dialog').getByRole('button', { name: 'Label' }).click();
+  await page.getByText('100 robots labelled.').waitFor();
+  await page.getByRole('button', { name: 'Delete…' }).click();
+  await page.getByRole('dialog').getByRole('button', { name: 'Delete' }).click();
+  await page.getByText('100 robots deleted.').waitFor();
+  const { robots } = await server.ask('GET', '/robots');
+  assert.deepEqual(robots.map(({ labels }) => labels), [{}], 'whom the page did not know is left, and as it was');
+  assertQuiet(page);
+});
+
+test('who is limited to some robots gives orders to all that they see', async (t) => {
+  const server = await Server.start(t);
+  for (const name of ['atlas', 'borea']) await Puppet.enroll(server, name, { site: 'lab' });
+  await Puppet.enroll(server, 'corvus', { site: 'yard' });
+  server.push('talker', '1.0.0');
+  await server.ask('POST', '/users', { name: 'alice', roles: ['operator'], scope: 'site=lab' });
+  const { token } = await server.ask('POST', '/tokens', { user: 'alice', title: 'the page' });
+  const page = await open(t, server, { token });
+  await page.getByRole('checkbox', { name: 'Select all that are shown' }).click();
+  await page.getByRole('button', { name: 'Push…' }).click();
+  await page.getByRole('dialog').getByRole('button', { name: 'Deploy' }).click();
+  await page.waitForURL(/#\/deployments\/d/);
+  const { deployments: [{ counts }] } = await server.ask('GET', '/deployments');
+  assert.equal(counts.reduce((sum, { count }) => sum + count, 0), 2);
+  assertQuiet(page);
+});

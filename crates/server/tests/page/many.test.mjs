@@ -1,0 +1,209 @@
+// What does not depend on agents: many tabs, signing in, what robots say, keys, and that everybody can use it.
+
+import { test } from 'node:test';
+import { assert, assertAccessible, assertQuiet, browser, eventually, live, open, Puppet, Server, settled, takeComplaints, until } from './harness.mjs';
+
+const HOSTILE = '<img src=x onerror="document.title=\'owned\'"><script>document.title=\'owned\'</script>';
+
+test('nine tabs are live at once', async (t) => {
+  const server = await Server.start(t);
+  const first = await open(t, server);
+  const tabs = [first];
+  for (let tab = 1; tab < 9; tab += 1) {
+    const page = await first.context().newPage();
+    await page.goto(server.url);
+    tabs.push(page);
+  }
+  await Promise.all(tabs.map(live));
+  await Puppet.enroll(server, 'atlas');
+  await Promise.all(tabs.map((page) => page.locator('[data-robot]', { hasText: 'atlas' }).waitFor()));
+  assertQuiet(first);
+});
+
+test('what a robot says is text', async (t) => {
+  const server = await Server.start(t);
+  const atlas = await Puppet.enroll(server, 'atlas');
+  server.push('talker', '1.0.0', { to: 'atlas' });
+  const page = await open(t, server);
+  await atlas.report('failed', {
+    each: () => ({ failure: { code: 'build_failed', text: HOSTILE } }),
+    conditions: [{ code: 'held', text: HOSTILE }],
+    host: { hostname: HOSTILE },
+  });
+  await page.locator('.failure', { hasText: '<img src=x' }).waitFor();
+  await page.locator('.condition', { hasText: '<img src=x' }).waitFor();
+  for (const tab of ['', '/tasks', '/control', '/edit']) {
+    await page.goto(`${server.url}/#/robots/atlas${tab}`);
+    await page.getByRole('heading', { name: 'atlas' }).waitFor();
+    await settled(page);
+    assert.equal(await page.locator('body img, body script').count(), 0);
+  }
+  await page.goto(`${server.url}/#/robots/atlas`);
+  await page.locator('dd', { hasText: '<img src=x' }).waitFor();
+  assert.match(await page.title(), /taskd/);
+  assertQuiet(page);
+  // And it would have been seen:
+  await page.evaluate(() => document.body.setAttribute('style', 'color: red'));
+  assert.equal(takeComplaints(page).length, 1);
+});
+
+test('a wrong token is refused in words, and a restarted server is found again', async (t) => {
+  const server = await Server.start(t);
+  const it = await browser(t);
+  const page = await it.newPage();
+  await page.goto(`${server.url}/#token=tsko_wrong`);
+  await page.getByRole('alert').filter({ hasText: 'token: ' }).waitFor();
+  assert.equal(page.url(), `${server.url}/`, 'the token has left the address bar');
+  const signIn = async () => {
+    await page.getByText('With a token').click();
+    await page.locator('form.by-token input').fill(server.token);
+    await page.getByRole('button', { name: 'Sign in with it' }).click();
+    await live(page);
+  };
+  await signIn();
+  await server.process.stop();
+  await page.locator('.stream', { hasText: 'Not live' }).waitFor();
+  await Server.start(t, { data: server.data, http: server.http });
+  // Sessions end with the server; the page finds it and asks to sign in again.
+  await page.getByLabel('Name', { exact: true }).waitFor();
+  await page.reload();
+  await signIn();
+  await page.getByRole('button', { name: 'Sign out' }).click();
+  await page.getByLabel('Name', { exact: true }).waitFor();
+  assert.equal(await page.evaluate(() => fetch('/api/v1/robots').then(({ status }) => status)), 401);
+});
+
+test('a person sees their robots and what they may do with them', async (t) => {
+  const server = await Server.start(t);
+  for (const name of ['atlas', 'borea']) await Puppet.enroll(server, name);
+  await server.ask('POST', '/users', { name: 'alice', roles: ['viewer'], scope: 'atlas', password: 'correct horse battery' });
+  const page = await (await browser(t)).newPage();
+  await page.goto(server.url);
+  const signIn = async (password) => {
+    await page.getByLabel('Name', { exact: true }).fill('alice');
+    await page.getByLabel('Password').fill(password);
+    await page.getByRole('button', { name: 'Sign in', exact: true }).click();
+  };
+  await signIn('wrong');
+  await page.getByRole('alert').filter({ hasText: 'or the password is wrong' }).waitFor();
+  await signIn('correct horse battery');
+  await live(page);
+  await page.locator('.who', { hasText: 'alice' }).waitFor();
+  assert.deepEqual(await page.locator('[data-robot] .name').allInnerTexts(), ['atlas']);
+  assert.deepEqual(await page.locator('[data-robot] .operations button').allInnerTexts(), ['Monitor'], 'what a viewer may do');
+});
+
+test('everything is done by keys', async (t) => {
+  const server = await Server.start(t);
+  for (const name of ['atlas', 'borea', 'corvus']) await Puppet.enroll(server, name);
+  const page = await open(t, server);
+  await until(page, () => document.querySelectorAll('[data-robot]').length === 3);
+  await page.keyboard.press('/');
+  await page.keyboard.type('bore');
+  await until(page, () => document.querySelectorAll('[data-robot]').length === 1);
+  assert.match(page.url(), /q=bore/);
+  await page.keyboard.press('Escape');
+  await until(page, () => document.querySelectorAll('[data-robot]').length === 3);
+  await page.keyboard.press('ArrowDown');
+  const current = () => page.evaluate(() => document.activeElement.querySelector('.name')?.innerText);
+  await eventually('the first row', async () => (await current()) === 'atlas');
+  await page.keyboard.press('ArrowDown');
+  await eventually('the second row', async () => (await current()) === 'borea');
+  await page.keyboard.press('x');
+  await page.getByText('1 selected').waitFor();
+  await page.keyboard.press('Escape');
+  await page.getByText('1 selected').waitFor({ state: 'detached' });
+  await page.keyboard.press('?');
+  await page.getByRole('heading', { name: 'Keys' }).waitFor();
+  await page.keyboard.press('Escape');
+  await page.getByRole('heading', { name: 'Keys' }).waitFor({ state: 'hidden' });
+  await page.keyboard.press('Enter');
+  await page.waitForURL(/#\/robots\/borea/);
+  assertQuiet(page);
+});
+
+test('a question asked right after another was left stays', async (t) => {
+  const server = await Server.start(t);
+  const page = await open(t, server);
+  await page.evaluate(async () => {
+    const { open, close } = await import('/ui/dialog.js');
+    const frame = () => new Promise((resume) => requestAnimationFrame(resume));
+    const ask = (title) => open({ title, body: () => '' });
+    ask('First');
+    await frame();
+    const wasClosed = new Promise((resume) => document.getElementById('dialog').addEventListener('close', resume));
+    close();
+    // In the frame that closes the browser's dialog, after it: what the browser says of that comes later.
+    requestAnimationFrame(() => ask('Second'));
+    await wasClosed;
+    await frame();
+  });
+  await page.getByRole('dialog').getByRole('heading', { name: 'Second' }).waitFor();
+  assert.ok(await page.getByRole('dialog').isVisible());
+  await page.keyboard.press('Escape');
+  await page.getByRole('dialog').waitFor({ state: 'hidden' });
+  assertQuiet(page);
+});
+
+test('every page can be used by everybody, light and dark, wide and narrow', async (t) => {
+  const server = await Server.start(t);
+  const robots = [];
+  for (const [name, site] of [['atlas', 'lab'], ['borea', 'lab'], ['corvus', 'yard']]) robots.push(await Puppet.enroll(server, name, { site }));
+  server.push('talker', '1.0.0', { to: '*' });
+  server.push('talker', '1.1.0');
+  await robots[0].report('running', { host: { disk_free_bytes: 5e9, ros_distros: ['jazzy'] } });
+  await robots[1].report('failed', { each: () => ({ failure: { code: 'build_failed', text: 'colcon build ended with status 1' } }), conditions: [{ code: 'held', text: 'a wheel is being changed' }] });
+  await robots[2].report('fetching', { each: () => ({ progress: { done: 10, total: 40 } }) });
+  const { deployments: [{ id }] } = await server.ask('GET', '/deployments');
+  const places = ['robots', 'robots?state=failed', 'robots/atlas', 'robots/atlas/ros', 'robots/borea/tasks', 'robots/atlas/logs', 'robots/atlas/outputs', 'robots/atlas/control', 'robots/atlas/edit',
+    'packages', 'packages/talker', 'deployments', `deployments/${id}`, 'server', 'settings'];
+  const it = await browser(t);
+  for (const [colorScheme, width] of [['light', 1280], ['dark', 375]]) {
+    const page = await open(t, server, { on: it, colorScheme, viewport: { width, height: 900 } });
+    for (const place of places) {
+      await page.goto(`${server.url}/#/${place}`);
+      await page.locator('main h1').first().waitFor();
+      await settled(page);
+      await assertAccessible(page, `${place} at ${width}, ${colorScheme}`);
+      const [inner, outer] = await page.evaluate(() => [document.documentElement.scrollWidth, document.documentElement.clientWidth]);
+      assert.ok(inner <= outer, `${place} at ${width} is not wider than the window: ${inner} > ${outer}`);
+    }
+    takeComplaints(page);
+  }
+});
+
+test('how machines do comes to the list by itself', async (t) => {
+  const server = await Server.start(t);
+  const atlas = await Puppet.enroll(server, 'atlas');
+  const page = await open(t, server);
+  await page.getByText('Columns').click();
+  for (const column of ['CPU', 'Memory']) await page.getByLabel(column).check();
+  const row = page.locator('[data-robot]', { hasText: 'atlas' });
+  for (const [cpu_percent, said] of [[12, '12 %'], [57.4, '57 %']]) {
+    await atlas.vitals({ at_ms: 1, cpu_percent, memory_used_bytes: 3e9, memory_total_bytes: 8e9 });
+    await row.locator('.cpu', { hasText: said }).waitFor();
+  }
+  await row.locator('.memory', { hasText: '3.0 GB' }).waitFor();
+  assertQuiet(page);
+});
+
+test('what happens comes to the server page by the stream, not by asking', async (t) => {
+  const server = await Server.start(t);
+  const page = await open(t, server, { hash: '#/server' });
+  await page.getByRole('heading', { name: 'Events' }).waitFor();
+  await page.getByText('up ').waitFor();
+  await settled(page);
+  await page.evaluate(() => (window.isSameDocument = true));
+  const asked = [];
+  page.on('request', (request) => asked.push(new URL(request.url()).pathname));
+  for (const name of ['atlas', 'borea']) {
+    await Puppet.enroll(server, name);
+    await page.locator('.feed .entry', { hasText: 'robot enrolled' }).filter({ has: page.getByRole('link', { name }) }).waitFor();
+  }
+  // The figures beside it are asked for again and again: requests would have been seen.
+  await eventually('the figures to be asked for', () => asked.includes('/api/v1/server/status'));
+  assert.deepEqual(asked.filter((path) => path !== '/api/v1/server/status'), [], 'nothing else was asked for');
+  assert.equal(await page.evaluate(() => window.isSameDocument), true, 'the page was never loaded again');
+  assert.match(await page.locator('.feed .entry').first().innerText(), /borea/, 'the newest is first');
+  assertQuiet(page);
+});

@@ -1,0 +1,48 @@
+// The ROS graph of a robot in the page: real nodes are looked at, moved through their lifecycle and given parameters.
+
+import { test } from 'node:test';
+import { agent, assert, assertAccessible, assertQuiet, open, probe, ros, Server } from './harness.mjs';
+
+test('nodes are looked at, changed and given parameters', async (t) => {
+  const server = await Server.start(t);
+  await agent(t, server, 'atlas', await ros(t));
+  const run = '#!/bin/sh\nexec python3 probe.py --node mapper --lifecycle --service /say --topic /ticks --hz 5\n';
+  server.push('mapper', '1.0.0', { files: { 'run.sh': run, 'probe.py': probe }, more: "[ready]\nhold_s = 0\ntimeout_s = 60\nlifecycle = ['/mapper']\n", to: 'atlas' });
+  const page = await open(t, server, { hash: '#/robots/atlas/tasks' });
+  await page.locator('.phase', { hasText: 'running' }).first().waitFor();
+  await page.getByRole('link', { name: 'ROS' }).click();
+  const row = (table, name) => page.getByRole('region', { name: table }).getByRole('row', { name });
+  await row('Table of nodes', '/mapper mapper active').waitFor();
+  await row('Table of topics', '/ticks std_msgs/msg/String /mapper none').waitFor();
+  await page.getByPlaceholder('Filter nodes and topics').fill('tick');
+  await page.getByText('No node is like that.').waitFor();
+  await page.getByPlaceholder('Filter nodes and topics').fill('');
+
+  await page.getByRole('region', { name: 'Table of nodes' }).getByRole('link', { name: '/mapper' }).click();
+  const parameter = page.locator('.parameters li', { hasText: 'resolution' });
+  await parameter.getByText('0.05').waitFor();
+  await page.getByText('Offers').click();
+  await page.getByText('/say std_srvs/srv/Trigger').waitFor();
+  const set = async (value) => {
+    await page.getByLabel('resolution', { exact: true }).fill(value);
+    await page.getByRole('button', { name: 'Set', exact: true }).click();
+  };
+  await page.getByRole('button', { name: 'Change resolution' }).click();
+  await set('coarse');
+  await page.getByText('This is no JSON value.').waitFor();
+  await set('-1');
+  await page.getByText('/mapper does not accept resolution = -1: must be positive').waitFor();
+  await set('2');
+  await parameter.locator('.value', { hasText: /^2(\.0)?$/ }).waitFor();
+  await assertAccessible(page, 'the graph');
+
+  await page.getByRole('button', { name: 'deactivate' }).click();
+  await row('Table of nodes', '/mapper mapper inactive').waitFor();
+  await page.getByRole('link', { name: 'Monitor' }).click();
+  await page.getByText('node inactive').first().waitFor();
+  await page.goBack();
+  await page.getByRole('button', { name: 'activate', exact: true }).click();
+  await row('Table of nodes', '/mapper mapper active').waitFor();
+  assert.match(page.url(), /node=%2Fmapper/);
+  assertQuiet(page);
+});

@@ -1,0 +1,132 @@
+// What is asked before something is done with robots that are chosen.
+
+import { html, nothing } from './vendor/lit-html-3.3.3/lit-html.js';
+import { newKey, order, patch, post } from './api.js';
+import { open } from './dialog.js';
+import { idsOf, selectorOf } from './fleet.js';
+import { number, plural } from './format.js';
+import { tell } from './notice.js';
+
+/** `3 robots`, or the one robot's name. */
+export const whom = (ids, fleet) => (ids.size === 1 ? fleet.robots.get([...ids][0])?.name ?? '1 robot' : plural(ids.size, 'robot'));
+
+/** The names of a few of them, so that nobody acts on others than they think. */
+export function names(ids, fleet) {
+  const some = [...ids].slice(0, 5).map((id) => fleet.robots.get(id)?.name ?? id);
+  const rest = ids.size - some.length;
+  return html`<p class="quiet names">${some.join(', ')}${rest > 0 ? ` and ${number(rest)} more` : ''}</p>`;
+}
+
+/** The tasks that these robots have, each with how many have it. */
+function tasksOf(ids, fleet) {
+  const counts = new Map();
+  for (const id of ids) for (const { task } of fleet.robots.get(id)?.tasks ?? []) counts.set(task, (counts.get(task) ?? 0) + 1);
+  return [...counts].sort();
+}
+
+const VERBS = {
+  start: { title: 'Start', done: 'started' },
+  stop: { title: 'Stop', done: 'stopped' },
+  restart: { title: 'Restart', done: 'restarted' },
+  rollback: { title: 'Roll back', done: 'rolled back' },
+  remove: { title: 'Remove', done: 'removed', isDangerous: true },
+};
+
+/** Orders a task started, stopped, restarted, rolled back or removed on these robots. */
+export function askTask(app, verb, ids, only = null) {
+  const { title, done, isDangerous } = VERBS[verb];
+  const tasks = tasksOf(ids, app.fleet).filter(([task]) => !only || task === only);
+  const chosen = new Set(ids);
+  const key = newKey();
+  let selector;
+  open({
+    title: `${title} ${only ?? 'tasks'} on ${whom(chosen, app.fleet)}`,
+    isDangerous,
+    action: tasks.length ? title : null,
+    body: () => html`${names(chosen, app.fleet)}
+      ${tasks.length
+        ? html`<fieldset><legend>Which task</legend>${tasks.map(([task, count], index) => html`<label class="choice"><input type="checkbox" name="task" value=${task} ?checked=${index === 0 && tasks.length === 1}> ${task} <span class="quiet">on ${plural(count, 'robot')}</span></label>`)}</fieldset>`
+        : html`<p>None of them has a task.</p>`}`,
+    async act({ task = [] }) {
+      const wanted = [task].flat();
+      if (!wanted.length) throw new Error('Choose a task.');
+      // Sent again, it has to be the same order.
+      selector ??= selectorOf(chosen, app);
+      const robots = new Set();
+      const without = new Set();
+      for (const name of wanted) {
+        const answer = await order(`/tasks/${name}/${verb}`, { selector }, `${key}-${name}`);
+        answer.robots.forEach(({ id }) => robots.add(id));
+        answer.without?.forEach(({ id }) => without.add(id));
+      }
+      const rest = without.size ? ` On ${plural(without.size, 'robot')} no earlier package ever ran.` : '';
+      tell(`${wanted.join(', ')}: to be ${done} on ${plural(robots.size, 'robot')}.${rest}`);
+    },
+  });
+}
+
+/** Sets and takes away labels. */
+export function askLabels(app, ids) {
+  const chosen = new Set(ids);
+  // A field must not be called like what a form can do: `remove` would be no function any more.
+  const there = () => [...new Set([...chosen].flatMap((id) => Object.keys(app.fleet.robots.get(id)?.labels ?? {})))].sort();
+  open({
+    title: `Label ${whom(chosen, app.fleet)}`,
+    action: 'Label',
+    body: () => html`${names(chosen, app.fleet)}
+      <label for="labels">Labels to set</label>
+      <input id="labels" name="labels" placeholder="site=lab, floor=2" autocomplete="off" autocapitalize="none" spellcheck="false">
+      ${there().length ? html`<fieldset><legend>Labels to take away</legend>${there().map((label) => html`<label class="choice"><input type="checkbox" name="taken" value=${label}> ${label}</label>`)}</fieldset>` : nothing}`,
+    async act({ labels, taken = [] }) {
+      const [set, remove] = [parseLabels(labels), [taken].flat()];
+      if (!Object.keys(set).length && !remove.length) throw new Error('Say which labels.');
+      const { robots } = await post('/bulk/labels', { selector: selectorOf(chosen, app), set, remove });
+      tell(`${plural(robots.length, 'robot')} labelled.`);
+    },
+  });
+}
+
+/** `site=lab, floor=2` as an object. */
+export function parseLabels(text) {
+  const pairs = text.split(',').map((pair) => pair.trim()).filter(Boolean).map((pair) => {
+    const [label, ...value] = pair.split('=');
+    if (!value.length) throw new Error(`${pair}: a label is written as name=value`);
+    return [label.trim(), value.join('=').trim()];
+  });
+  return Object.fromEntries(pairs);
+}
+
+/** Removes robots for good. */
+export function askDelete(app, ids) {
+  const chosen = new Set(ids);
+  open({
+    title: `Delete ${whom(chosen, app.fleet)}?`,
+    action: 'Delete',
+    isDangerous: true,
+    body: () => html`${names(chosen, app.fleet)}<p>Their tokens end. What runs there goes on running, but nothing new starts. They come back by enrolling again.</p>`,
+    async act() {
+      const { robots } = await post('/bulk/remove', { selector: idsOf(chosen) });
+      tell(`${plural(robots.length, 'robot')} deleted.`);
+    },
+  });
+}
+
+/** Changes a robot's name and labels; the rest of its settings is on its own page. */
+export function askEdit(app, robot) {
+  open({
+    title: `Edit ${robot.name}`,
+    action: 'Save',
+    body: () => html`
+      <label for="name">Name</label>
+      <input id="name" name="name" required .defaultValue=${robot.name} autocomplete="off" autocapitalize="none" spellcheck="false">
+      <label for="labels">Labels</label>
+      <input id="labels" name="labels" .defaultValue=${Object.entries(robot.labels).map(([label, value]) => `${label}=${value}`).join(', ')} placeholder="site=lab, floor=2" autocomplete="off" autocapitalize="none" spellcheck="false">
+      <label for="mac">MAC</label>
+      <input id="mac" class="code" readonly .defaultValue=${robot.mac}>
+      <p class="quiet"><a href=${`#/robots/${encodeURIComponent(robot.name)}/edit`}>Workspace, underlays and limits…</a></p>`,
+    async act({ name, labels }) {
+      await patch(`/robots/${robot.id}`, { name: name.trim(), labels: parseLabels(labels) });
+      tell(`${name.trim()} is changed.`);
+    },
+  });
+}

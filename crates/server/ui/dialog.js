@@ -1,0 +1,80 @@
+// One question at a time, in front of everything else. Whoever asks says what the form holds and what to do with it.
+
+import { html, nothing } from './vendor/lit-html-3.3.3/lit-html.js';
+import { SignedOut } from './api.js';
+import { change } from './frame.js';
+import { complain } from './notice.js';
+
+let current = null;
+/** The question that has the focus. */
+let settled = null;
+/** How often the browser has yet to say that its dialog was closed by us, which it does late: the next question may be open by then. */
+let ownClosings = 0;
+
+/**
+ * Opens a dialog. `question` has a `title`, `body()` (a template, drawn again each frame), the `action`'s words, whether it
+ * `isDangerous`, the words to leave it by if `Cancel` would be unclear (`dismissal`), and `act(fields)`, which gets what the form holds and may throw: the dialog stays open
+ * and says why, unless the error `isSaid` already.
+ * Without an `action` there is only something to read.
+ */
+export function open(question) {
+  change(() => (current = { ...question, problem: null, isBusy: false }));
+}
+
+export function close() {
+  change(() => (current = null));
+}
+
+/** The browser's dialog was closed: by us, or by Escape. */
+function closed() {
+  if (ownClosings > 0) ownClosings -= 1;
+  else close();
+}
+
+export const isOpen = () => current !== null;
+
+async function submit(event) {
+  event.preventDefault();
+  const question = current;
+  if (question.isBusy) return;
+  const form = new FormData(event.currentTarget);
+  const fields = Object.fromEntries([...new Set(form.keys())].map((name) => [name, form.getAll(name).length > 1 ? form.getAll(name) : form.get(name)]));
+  change(() => Object.assign(question, { isBusy: true, problem: null }));
+  try {
+    await question.act(fields);
+    if (current === question) close();
+  } catch (error) {
+    if (error instanceof SignedOut) close();
+    else if (current !== question) complain(error.message);
+    else change(() => Object.assign(question, { isBusy: false, problem: error.isSaid ? null : error.message }));
+  }
+}
+
+export const dialogView = () => html`
+  <dialog id="dialog" aria-labelledby="dialog-title" @close=${closed} @click=${(event) => event.target === event.currentTarget && close()}>
+    ${current ? content(current) : nothing}
+  </dialog>`;
+
+const content = ({ title, body, action, dismissal = 'Cancel', isDangerous, isBusy, problem }) => html`
+  <form @submit=${submit}>
+    <header>
+      <h2 id="dialog-title">${title}</h2>
+      <button type="button" class="plain" aria-label="Close" @click=${close}>✕</button>
+    </header>
+    ${body()}
+    <p class="bad" role="alert">${problem ? `▲ ${problem}` : ''}</p>
+    ${action ? html`<footer><button type="button" class="quiet-button" @click=${close}>${dismissal}</button><button class=${isDangerous ? 'danger' : 'primary'} ?disabled=${isBusy}>${action}</button></footer>` : nothing}
+  </form>`;
+
+/** Opens or closes the browser's own dialog to match; to be called after each drawing. */
+export function settleDialog() {
+  const element = document.getElementById('dialog');
+  if (!element) return;
+  if (current && !element.open) element.showModal();
+  // Not to the button that closes it, which comes first; where there is nothing to fill in, to what does no harm.
+  if (current && current !== settled) element.querySelector('form :is(input, select, textarea):not([readonly]), form :is(footer, .command) button')?.focus();
+  settled = current;
+  if (current || !element.open) return;
+  ownClosings += 1;
+  element.close();
+}

@@ -1,0 +1,217 @@
+// The server and the network: how it does, site by site, who is connected and listens to what, and what has happened lately.
+
+import { html, nothing, svg } from './vendor/lit-html-3.3.3/lit-html.js';
+import { repeat } from './vendor/lit-html-3.3.3/directives/repeat.js';
+import { get } from './api.js';
+import { duration, number, size, words } from './format.js';
+import { change } from './frame.js';
+import { at } from './router.js';
+import { sign, since } from './signs.js';
+
+const ASK_PAUSE_MS = 2_000;
+/** What the small curves hold: five minutes. */
+const KEPT_STATUSES = 150;
+const SESSIONS_A_PAGE = 100;
+const KEPT_ENTRIES = 200;
+
+export class ServerView {
+  #isGone = false;
+  /** The newest last, each with the rates since the one before. */
+  #statuses = [];
+  #sessions = [];
+  #more = null;
+  #total = 0;
+  #entries = [];
+  #problem = null;
+
+  constructor(app) {
+    this.app = app;
+    this.#follow();
+    this.refresh();
+  }
+
+  arrive() {}
+
+  leave() {
+    this.#isGone = true;
+  }
+
+  refresh() {
+    this.#fetchSessions();
+    this.#fetchFeed();
+  }
+
+  hear({ type, entry }) {
+    if (type === 'feed') this.#take([entry]);
+  }
+
+  /** Asks how it does a while after each answer, as long as somebody looks. */
+  async #follow() {
+    while (!this.#isGone) {
+      if (!document.hidden) await this.#ask();
+      await new Promise((resume) => setTimeout(resume, ASK_PAUSE_MS));
+    }
+  }
+
+  async #ask() {
+    try {
+      const status = await get('/server/status');
+      change(() => {
+        this.#problem = null;
+        this.#statuses = [...this.#statuses.slice(1 - KEPT_STATUSES), withRates(status, this.#statuses.at(-1))];
+      });
+    } catch (error) {
+      change(() => (this.#problem = error.message));
+    }
+  }
+
+  async #fetchSessions(after) {
+    const page = await this.app.attempt(() => get('/server/sessions', { limit: SESSIONS_A_PAGE, after }));
+    if (!page) return;
+    change(() => {
+      this.#sessions = after ? [...this.#sessions, ...page.sessions] : page.sessions;
+      this.#more = page.next ?? null;
+      this.#total = page.total;
+    });
+  }
+
+  async #fetchFeed() {
+    const page = await this.app.attempt(() => get('/feed', { limit: KEPT_ENTRIES }));
+    if (page) change(() => this.#take(page.entries));
+  }
+
+  /** Takes entries in, whichever way they come, each once and the newest first. */
+  #take(entries) {
+    const known = new Set(this.#entries.map(({ number: one }) => one));
+    const fresh = entries.filter(({ number: one }) => !known.has(one));
+    this.#entries = [...fresh, ...this.#entries].sort((one, other) => other.number - one.number).slice(0, KEPT_ENTRIES);
+  }
+
+  draw(now) {
+    const status = this.#statuses.at(-1);
+    return html`
+      <header class="bar-of-tools"><h1>Server and network</h1>${status ? html`<p class="quiet">${about(status)}</p>` : nothing}</header>
+      ${this.#problem ? html`<p class="bad" role="alert">▲ ${this.#problem}</p>` : nothing}
+      ${status ? html`<div class="figures">${figures(status).map((figure) => this.#figure(figure))}</div>` : html`<div class="figures waiting"></div>`}
+      <div class="server-body">
+        <div>
+          ${status ? sites(status) : nothing}
+          ${this.#sessionTable(now)}
+        </div>
+        ${this.#feed(now)}
+      </div>`;
+  }
+
+  #figure({ title, value, note, of, isBad }) {
+    return html`
+      <section class="figure">
+        <h2>${title}</h2>
+        <p class="value ${isBad ? 'bad' : ''}">${isBad ? html`<span aria-hidden="true">▲ </span>` : nothing}${value}</p>
+        <p class="quiet">${note}</p>
+        ${of ? curve(this.#statuses.map(of)) : nothing}
+      </section>`;
+  }
+
+  #sessionTable(now) {
+    const row = ({ robot, name, since_ms: then, address, subscriptions, traffic }) => html`
+      <tr data-session=${robot}>
+        <td><a href=${at(['robots', name])}>${name}</a><br><span class="code quiet">${address ?? '–'}</span></td>
+        <td class="code">${subscriptions.map(({ topic_filter: filter, qos }) => html`<div>${filter} <span class="quiet">QoS ${qos}</span></div>`)}</td>
+        <td class="number">${number(traffic.messages_in)} in<br>${number(traffic.messages_out)} out</td>
+        <td class="number">${size(traffic.bytes_in)} in<br>${size(traffic.bytes_out)} out</td>
+        <td>${since(then, now)}</td>
+      </tr>`;
+    return html`
+      <section aria-labelledby="sessions">
+        <header><h2 id="sessions">Subscriptions <span class="count">${number(this.#total)} sessions</span></h2><button class="plain link" @click=${() => this.#fetchSessions()}>Refresh</button></header>
+        ${this.#sessions.length
+          ? html`<div class="scroll" tabindex="0" role="group" aria-labelledby="sessions"><table>
+              <thead><tr><th>Robot</th><th>Topic filters</th><th class="number">Messages</th><th class="number">Bytes</th><th>Connected</th></tr></thead>
+              <tbody>${repeat(this.#sessions, ({ robot }) => robot, row)}</tbody>
+            </table></div>
+            ${this.#more ? html`<p><button class="quiet-button" @click=${() => this.#fetchSessions(this.#more)}>Show more</button></p>` : nothing}`
+          : html`<p class="quiet">No robot is connected over MQTT.</p>`}
+      </section>`;
+  }
+
+  #feed(now) {
+    return html`
+      <section class="feed" aria-labelledby="feed">
+        <header><h2 id="feed">Events</h2></header>
+        ${this.#entries.length
+          ? html`<ol>${repeat(this.#entries, ({ number: one }) => one, (entry) => feedLine(entry, now))}</ol>`
+          : html`<p class="quiet">Nothing has happened since the server started.</p>`}
+      </section>`;
+  }
+}
+
+const LEVELS = { warn: '▲ ', error: '✕ ', fatal: '✕ ' };
+
+const feedLine = ({ at_ms: then, level, kind, text, robot_name: robot, deployment }, now) => html`
+  <li class="entry ${LEVELS[level] ? 'bad' : ''}">
+    <span class="what"><span aria-hidden="true">${LEVELS[level] ?? ''}</span>${words(kind)}</span>
+    ${robot ? html`<a href=${at(['robots', robot])}>${robot}</a>` : nothing}
+    ${deployment ? html`<a class="code" href=${at(['deployments', deployment])}>${deployment}</a>` : nothing}
+    <span class="when">${since(then, now)}</span>
+    <span class="text">${text}</span>
+  </li>`;
+
+/** A status with what went over the wires each second since the one before. */
+function withRates(status, before) {
+  const seconds = before ? (status.now_ms - before.now_ms) / 1000 : 0;
+  const rate = (of) => (seconds > 0 ? Math.max(0, of(status) - of(before)) / seconds : null);
+  const rates = {
+    messages: rate(({ mqtt }) => mqtt.all.messages_in + mqtt.all.messages_out),
+    requests: rate(({ http }) => http.requests),
+    out: rate(({ http, mqtt }) => http.bytes_out + mqtt.all.bytes_out),
+    in: rate(({ http, mqtt }) => http.bytes_in + mqtt.all.bytes_in),
+  };
+  return { ...status, rates };
+}
+
+const about = ({ version, uptime_s: uptime, listeners }) =>
+  [`taskd ${version}`, `up ${duration(uptime * 1000)}`, ...listeners.map(({ kind, address, tls }) => `${kind.toUpperCase()} ${tls ? 'over TLS ' : ''}on ${address}`)].join(' · ');
+
+/** What is shown large, and the curve below it. */
+function figures({ robots, rates, transfers, reports, database, disk, broker, mqtt }) {
+  const each = (value, unit) => (value === null ? '–' : `${value < 10 ? value.toFixed(1) : number(Math.round(value))} ${unit}`);
+  const ms = (value) => (value == null ? '–' : `${value < 10 ? value.toFixed(1) : Math.round(value)} ms`);
+  const bytes = (value) => (value === null ? '–' : `${size(value)}/s`);
+  const free = disk.total_bytes ? disk.free_bytes / disk.total_bytes : 1;
+  return [
+    { title: 'Robots connected', value: `${number(robots.online)} of ${number(robots.known)}`, note: `${number(mqtt.robots_connected)} over MQTT`, of: (one) => one.robots.online },
+    { title: 'MQTT messages', value: each(rates.messages, '/s'), note: `${number(mqtt.messages_refused)} refused, ${number(mqtt.messages_dropped)} dropped`, of: (one) => one.rates.messages },
+    { title: 'Bandwidth', value: bytes(rates.out), note: `out; ${bytes(rates.in)} in, ${each(rates.requests, 'requests/s')}`, of: (one) => one.rates.out },
+    { title: 'Transfers', value: number(transfers.active), note: `${number(transfers.waiting)} waiting, ${size(transfers.bytes_per_s)}/s`, of: (one) => one.transfers.active },
+    { title: 'Report latency', value: ms(reports.latency_ms_p99), note: `p99; half within ${ms(reports.latency_ms_p50)}, ${each(reports.per_s, '/s')}`, of: (one) => one.reports.latency_ms_p99 },
+    { title: 'Database', value: ms(database.latency_ms), note: [database.kind, database.size_bytes != null && size(database.size_bytes)].filter(Boolean).join(', '), of: (one) => one.database.latency_ms },
+    { title: 'Free disk', value: size(disk.free_bytes), note: `of ${size(disk.total_bytes)}; packages and outputs ${size(disk.packages_bytes)}`, isBad: free < 0.05 },
+    { title: 'Broker', value: broker.healthy ? 'Healthy' : 'In trouble', note: `${broker.kind}: ${broker.detail}`, isBad: !broker.healthy },
+  ];
+}
+
+/** A small curve from nothing to the highest value. It is for the eye: the figure above it says the same. */
+function curve(values) {
+  const most = Math.max(...values.map((value) => value ?? 0), 1e-9);
+  const step = 100 / (KEPT_STATUSES - 1);
+  const first = KEPT_STATUSES - values.length;
+  const points = values.map((value, index) => (value == null ? null : `${((first + index) * step).toFixed(2)},${(19 - (18 * value) / most).toFixed(2)}`)).filter(Boolean);
+  return html`<svg class="curve" viewBox="0 0 100 20" preserveAspectRatio="none" aria-hidden="true">${svg`<polyline points=${points.join(' ')}></polyline>`}</svg>`;
+}
+
+const sites = ({ sites: list }) => html`
+  <section aria-labelledby="sites">
+    <header><h2 id="sites">Sites</h2></header>
+    <div class="scroll" tabindex="0" role="group" aria-labelledby="sites"><table>
+      <thead><tr><th>Site</th><th class="number">Robots</th><th>State</th><th class="number">Throughput</th><th class="number">RTT</th></tr></thead>
+      <tbody>${list.map(({ site, robots, online, throughput_bytes_per_s: throughput, rtt_ms: rtt }) => html`
+        <tr>
+          <td>${site ? html`<a href=${at(['robots'], { q: `site=${site}` })}>${site}</a>` : html`<span class="quiet">without the label site</span>`}</td>
+          <td class="number">${number(robots)}</td>
+          <td>${sign(online > 0, `${number(online)} online`)}</td>
+          <td class="number">${throughput == null ? '–' : `${size(throughput)}/s`}</td>
+          <td class="number">${rtt == null ? '–' : `${number(rtt)} ms`}</td>
+        </tr>`)}</tbody>
+    </table></div>
+    <p class="quiet">Throughput and RTT: the median of what transfers to a site’s robots have shown.</p>
+  </section>`;

@@ -1,0 +1,54 @@
+// Signing in: by name and password, with a token, or by the provider there is.
+
+import { html, nothing } from './vendor/lit-html-3.3.3/lit-html.js';
+
+/** Why the provider's way in led nowhere. */
+const PROVIDER_PROBLEMS = {
+  expired: 'Signing in took too long or was begun in another browser. Try again.',
+  refused: 'The provider did not let you in.',
+  no_role: 'You have no role here. Ask an administrator.',
+  no_name: 'The provider has no name for you that can be used here. Ask an administrator.',
+  name_taken: 'Somebody else has your name here. Ask an administrator.',
+  blocked: 'Too many sign-ins failed from your address. Try again in a quarter of an hour.',
+  failed: 'Signing in by the provider failed. The server\u2019s log says why.',
+};
+
+export const problemOfProvider = (code) => PROVIDER_PROBLEMS[code] ?? PROVIDER_PROBLEMS.failed;
+
+/** What a link says, `/#token=…` or `/#problem=…`, which then leaves the address bar and the history. */
+export function ofLink() {
+  const said = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
+  if (said.token || said.problem) history.replaceState(null, '', location.pathname);
+  return said;
+}
+
+/** What a form holds, without the spaces that come with pasting; they belong to a password. */
+function whoOf(event) {
+  event.preventDefault();
+  const fields = Object.fromEntries(new FormData(event.currentTarget));
+  return fields.token ? { token: fields.token.trim() } : { user: fields.user.trim(), password: fields.password };
+}
+
+/** The view. `signIn` gets `{ user, password }` or `{ token }`. */
+export const signInView = ({ provider, problem, isSigningIn }, signIn) => html`
+  <main class="sign-in">
+    <h1>taskd</h1>
+    ${provider ? html`<p><a class="button by-provider" href=${provider.url}>Sign in with ${provider.title}</a></p>` : nothing}
+    <form class="by-password" @submit=${(event) => signIn(whoOf(event))}>
+      <label for="user">Name</label>
+      <input id="user" name="user" required autofocus autocomplete="username" autocapitalize="none" spellcheck="false">
+      <label for="password">Password</label>
+      <input id="password" name="password" type="password" required autocomplete="current-password" aria-describedby="problem">
+      <button class="primary" ?disabled=${isSigningIn}>Sign in</button>
+      <p id="problem" class="bad" role="alert">${problem ?? ''}</p>
+    </form>
+    <details>
+      <summary>With a token</summary>
+      <form class="by-token" @submit=${(event) => signIn(whoOf(event))}>
+        <label for="token">Token</label>
+        <input id="token" name="token" type="password" required autocomplete="off" spellcheck="false" aria-describedby="hint problem">
+        <button class="primary" ?disabled=${isSigningIn}>Sign in with it</button>
+      </form>
+      <p id="hint" class="quiet">It starts with <code>tsko_</code>. The first one lies in the server's data directory, in <code>operator.token</code>.</p>
+    </details>
+  </main>`;

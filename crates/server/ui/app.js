@@ -7,7 +7,7 @@
 
 import { html, nothing, render } from './vendor/lit-html-3.3.3/lit-html.js';
 import * as api from './api.js';
-import { dialogView, isOpen, settleDialog, close as closeDialog } from './dialog.js';
+import { close as closeDialog, dialogView, settleDialog, takesKey as dialogTakes } from './dialog.js';
 import { Fleet, Selection } from './fleet.js';
 import { ago, plural } from './format.js';
 import { change, drawWith } from './frame.js';
@@ -311,7 +311,7 @@ function streamState(now) {
 // Keys
 
 addEventListener('keydown', (event) => {
-  if (page.state !== 'in' || event.ctrlKey || event.metaKey || event.altKey || isOpen()) return;
+  if (page.state !== 'in' || event.ctrlKey || event.metaKey || event.altKey || dialogTakes(event)) return;
   const isTyping = event.target.matches('input, textarea, select, [contenteditable]');
   const search = document.querySelector('input[type=search]');
   if (event.key === '/' && !isTyping && search) {

@@ -21,17 +21,30 @@ export function open(question) {
   change(() => (current = { ...question, problem: null, isBusy: false }));
 }
 
+/** At once: the next key is the view's. */
 export function close() {
   change(() => (current = null));
+  const element = document.getElementById('dialog');
+  if (!element?.open) return;
+  ownClosings += 1;
+  element.close();
 }
 
-/** The browser's dialog was closed: by us, or by Escape. */
+/** The browser's dialog was closed: by us, or by a gesture that is the browser's. */
 function closed() {
   if (ownClosings > 0) ownClosings -= 1;
   else close();
 }
 
-export const isOpen = () => current !== null;
+/** Whether a key is the question's. Of Escape the browser would say late that it closed the dialog, and keys in between would be nobody's. */
+export function takesKey(event) {
+  if (!current) return false;
+  if (event.key === 'Escape') {
+    event.preventDefault();
+    close();
+  }
+  return true;
+}
 
 async function submit(event) {
   event.preventDefault();
@@ -66,7 +79,7 @@ const content = ({ title, body, action, dismissal = 'Cancel', isDangerous, isBus
     ${action ? html`<footer><button type="button" class="quiet-button" @click=${close}>${dismissal}</button><button class=${isDangerous ? 'danger' : 'primary'} ?disabled=${isBusy}>${action}</button></footer>` : nothing}
   </form>`;
 
-/** Opens or closes the browser's own dialog to match; to be called after each drawing. */
+/** Opens the browser's own dialog for a new question; to be called after each drawing. */
 export function settleDialog() {
   const element = document.getElementById('dialog');
   if (!element) return;
@@ -74,7 +87,4 @@ export function settleDialog() {
   // Not to the button that closes it, which comes first; where there is nothing to fill in, to what does no harm.
   if (current && current !== settled) element.querySelector('form :is(input, select, textarea):not([readonly]), form :is(footer, .command) button')?.focus();
   settled = current;
-  if (current || !element.open) return;
-  ownClosings += 1;
-  element.close();
 }

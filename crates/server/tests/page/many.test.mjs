@@ -122,6 +122,20 @@ test('everything is done by keys', async (t) => {
   assertQuiet(page);
 });
 
+test('a key right after a question was left is not lost', async (t) => {
+  const server = await Server.start(t);
+  await Puppet.enroll(server, 'atlas');
+  const page = await open(t, server);
+  await until(page, () => document.querySelectorAll('[data-robot]').length === 1);
+  await page.keyboard.press('ArrowDown');
+  await until(page, () => document.activeElement.matches('[data-robot]'));
+  await page.keyboard.press('?');
+  await until(page, () => document.getElementById('dialog').open);
+  await Promise.all(['Escape', 'Enter'].map((key) => page.keyboard.press(key)));
+  await page.waitForURL(/#\/robots\/atlas/);
+  assertQuiet(page);
+});
+
 test('a question asked right after another was left stays', async (t) => {
   const server = await Server.start(t);
   const page = await open(t, server);

@@ -365,7 +365,8 @@ const capital = (text) => text.charAt(0).toUpperCase() + text.slice(1);
 function note(part, { package: { name } }) {
   const { failure, degraded, progress, phase, released } = part;
   if (failure && tone(phase) !== 'done') return html`<span class=${tone(phase) === 'bad' ? 'bad' : 'quiet'} title=${failure.text}>${words(failure.code)}<span class="quiet">: ${failure.text}</span></span>`;
-  if (progress?.total && tone(phase) === 'busy') return progressBar({ task: name, phase, progress });
+  const bar = progressBar({ task: name, phase, progress });
+  if (bar) return bar;
   if (degraded) return html`<span class="bad" title=${degraded.text}>▲ degraded: ${words(degraded.code)}</span>`;
   if (!released) return html`<span class="quiet">waits for its batch</span>`;
   if (phase === 'assigned' && !part.online) return html`<span class="quiet">begins when the robot is back</span>`;

@@ -8,7 +8,7 @@ import { askDelete, askEdit, askLabels, askTask } from './acts.js';
 import { command } from './copy.js';
 import { Cursor } from './cursor.js';
 import { STANDINGS, labelsOf } from './fleet.js';
-import { number, size, tone, words } from './format.js';
+import { number, size, words } from './format.js';
 import { change } from './frame.js';
 import { askPush } from './push.js';
 import { at, go, restate } from './router.js';
@@ -267,7 +267,8 @@ function known(task, conditions) {
 }
 
 function note(task) {
-  if (task.progress?.total && tone(task.phase) === 'busy') return html`<span class="note">${progressBar(task)}</span>`;
+  const bar = progressBar(task);
+  if (bar) return html`<span class="note">${bar}</span>`;
   if (task.failure && !isNarrow) return failureSign(task);
   const said = remarks(task);
   return said.length ? html`<span class="note quiet">${said.join(' · ')}</span>` : null;

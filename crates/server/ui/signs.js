@@ -20,10 +20,10 @@ export const phaseSign = (phase) => tone(phase) === 'bad'
   ? html`<span class="phase bad"><span aria-hidden="true">✕ </span>${words(phase)}</span>`
   : html`<span class="phase ${tone(phase)}">${words(phase)}</span>`;
 
-/** How far a phase has come; nothing while that is unknown. */
-export const progressBar = ({ task, phase, progress }) => progress?.total
+/** How far a phase that is under way has come; null where there is nothing to measure it by. */
+export const progressBar = ({ task, phase, progress }) => progress?.total && tone(phase) === 'busy'
   ? html`<span class="moving"><progress max=${progress.total} .value=${Math.min(progress.done, progress.total)} aria-label=${`${task} ${words(phase)}`}></progress><span class="quiet bytes">${bytes(progress)}</span></span>`
-  : nothing;
+  : null;
 
 /** What else is worth knowing of a task that has not failed. */
 export function remarks({ active, version, restarts, wanted, phase, degraded }) {

@@ -3,7 +3,7 @@
 import { html, nothing } from '../vendor/lit-html-3.3.3/lit-html.js';
 import { repeat } from '../vendor/lit-html-3.3.3/directives/repeat.js';
 import { askRobot, get, SignedOut } from '../api.js';
-import { ago, clock, duration, moment, number, plural, size, tone, words } from '../format.js';
+import { ago, clock, duration, moment, number, plural, size, words } from '../format.js';
 import { change } from '../frame.js';
 import { at } from '../router.js';
 import { phaseSign, progressBar, remarks, robotState, sign } from '../signs.js';
@@ -197,7 +197,7 @@ export class Monitor {
     return html`
       <article class="task-now" data-task=${task.task}>
         <h3>${task.task}<span class="quiet">@${task.version}</span> ${phaseSign(task.phase)}</h3>
-        ${task.progress?.total && tone(task.phase) === 'busy' ? html`<p class="progress">${progressBar(task)}</p>` : nothing}
+        ${progressBar(task)}
         ${task.failure ? why(task.failure) : nothing}
         ${task.degraded ? why(task.degraded, 'degraded: ') : nothing}
         <p class="quiet">${[`run ${task.run}`, task.active && `process ${task.active.pid}`, ...remarks(task)].filter(Boolean).join(' · ')}${task.delivery ? html` · <span class="delivery">${task.delivery.mechanism}: ${task.delivery.because}</span>` : nothing}</p>

@@ -3,7 +3,7 @@
 import { html, nothing } from '../vendor/lit-html-3.3.3/lit-html.js';
 import { repeat } from '../vendor/lit-html-3.3.3/directives/repeat.js';
 import { get, SignedOut } from '../api.js';
-import { plural, tone } from '../format.js';
+import { plural } from '../format.js';
 import { change } from '../frame.js';
 import { at } from '../router.js';
 import { phaseSign, progressBar, since } from '../signs.js';
@@ -97,7 +97,7 @@ export class Tasks {
         <p class="quiet when">${since(then, now)}</p>
         ${strip(course)}
         ${list(course)}
-        ${assignment.progress?.total && tone(phase) === 'busy' ? html`<p class="progress">${progressBar({ ...assignment, task: name })}</p>` : nothing}
+        ${progressBar({ ...assignment, task: name })}
         ${failure ? why(failure) : nothing}
         <p class="quiet">${[attempts > 1 && plural(attempts, 'attempt'), !assignment.released && 'waits for its batch'].filter(Boolean).map((said) => `${said} · `)}${delivery ? html`${delivery.mechanism}, because ${delivery.because} <span class="rule">(rule: ${delivery.rule})</span>` : 'delivery not decided yet'}</p>
         <p><a href=${at(['deployments', deployment])}>Deployment</a> · <a href=${this.#page.at('logs', { task: name })}>Log</a>${newer ? html` · <a href=${at(['deployments', newer])}>what took its place</a>` : nothing}</p>

@@ -22,7 +22,7 @@ use crate::clock::Clock;
 use crate::collector;
 use crate::conduct::Conduct;
 use crate::config::{Config, TlsSettings};
-use crate::data_directory::{Addresses, DataDirectory, DataError};
+use crate::data_directory::{Addresses, DataDirectory, DataError, room};
 use crate::downlink::Downlink;
 use crate::fan_out::FanOutWorker;
 use crate::feed::{Feed, FeedSource};
@@ -61,6 +61,9 @@ const EXPIRY_INTERVAL: Duration = Duration::from_secs(30);
 const SILENCE_INTERVAL: Duration = Duration::from_secs(5);
 /// How often it looks for robots that misbehave no longer.
 const FORGIVING_INTERVAL: Duration = Duration::from_secs(1);
+/// What robots leave free on the disk: this share of it, but no more than so many bytes.
+const SPARE_SHARE: u64 = 20;
+const MAX_SPARE_BYTES: u64 = 2 << 30;
 /// How often it looks at how busy it is.
 const LOAD_INTERVAL: Duration = Duration::from_secs(1);
 
@@ -393,7 +396,13 @@ fn tls_settings(config: &Config) -> TlsSettings {
 }
 
 fn blob_settings(config: &Config) -> BlobSettings {
-    BlobSettings { reading: config.blob_read, max_blob_bytes: config.max_blob_bytes, ..BlobSettings::default() }
+    BlobSettings {
+        reading: config.blob_read,
+        max_blob_bytes: config.max_blob_bytes,
+        max_robot_bytes: config.max_robot_bytes,
+        spare_bytes: room(&config.data).map_or(0, |(_, total)| MAX_SPARE_BYTES.min(total / SPARE_SHARE)),
+        ..BlobSettings::default()
+    }
 }
 
 fn http_limits(config: &Config) -> listener::Limits {

@@ -45,6 +45,7 @@ fn limits(config: &Config) -> Vec<LimitView> {
         limit("presence_timeout", seconds(config.presence_timeout)),
         limit("robots.bytes_per_s", speed(Some(robots.bytes_per_s))),
         limit("robots.messages_per_s", robots.messages_per_s.to_string()),
+        limit("robots.output_bytes", shown_bytes(config.max_robot_bytes)),
         limit("robots.requests_per_s", robots.requests_per_s.to_string()),
         limit("transfers.max", count(transfers.all.max)),
         limit("transfers.bytes_per_s", speed(transfers.all.bytes_per_s)),

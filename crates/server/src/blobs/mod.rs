@@ -41,11 +41,22 @@ pub struct BlobSettings {
     pub max_uploads: usize,
     /// The most blobs kept open for the next reader.
     pub max_open_blobs: usize,
+    /// The most bytes kept of what one robot brings back.
+    pub max_robot_bytes: u64,
+    /// What robots leave free on the disk, in bytes, for everybody else and for the database.
+    pub spare_bytes: u64,
 }
 
 impl Default for BlobSettings {
     fn default() -> Self {
-        Self { reading: BlobRead::Mmap, max_blob_bytes: 16 << 30, max_uploads: 256, max_open_blobs: 64 }
+        Self {
+            reading: BlobRead::Mmap,
+            max_blob_bytes: 16 << 30,
+            max_uploads: 256,
+            max_open_blobs: 64,
+            max_robot_bytes: 10 << 30,
+            spare_bytes: 0,
+        }
     }
 }
 
@@ -77,6 +88,17 @@ pub enum BlobError {
     TooLarge {
         /// The limit.
         max: u64,
+    },
+    /// More than is kept of what one robot brings back.
+    #[error(
+        "the server keeps {max} bytes of what one robot brings back (robots.output_bytes), and has {kept} of this one; what \
+         is deleted there makes room some time later"
+    )]
+    TooMuchOfRobot {
+        /// The limit.
+        max: u64,
+        /// What is there, uploads that are not finished included.
+        kept: u64,
     },
     /// The bytes hash to something else.
     #[error("the bytes hash to {actual}, not to {expected}")]

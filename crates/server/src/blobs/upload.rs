@@ -7,6 +7,7 @@ use std::io;
 use std::os::unix::fs::FileExt as _;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -14,10 +15,11 @@ use bytes::Bytes;
 use futures_util::{Stream, StreamExt as _};
 use sha2::{Digest as _, Sha256};
 use task_proto::output::owner;
-use task_proto::{Digest, RepositoryName};
+use task_proto::{Digest, RepositoryName, RobotId};
 use tokio::sync::OwnedMutexGuard;
 
 use super::{BlobError, BlobSettings, Blobs, modified_ms, move_into_place, on_disk};
+use crate::data_directory::room;
 
 /// How much of a body is gathered before it is hashed and written in one go.
 const GATHERED_BYTES: usize = 1024 * 1024;
@@ -68,6 +70,7 @@ pub(super) struct Uploads {
 struct Active {
     repository: RepositoryName,
     upload: Arc<tokio::sync::Mutex<Upload>>,
+    bytes: Arc<AtomicU64>,
 }
 
 /// One upload. Whoever holds its lock is the only writer.
@@ -75,6 +78,8 @@ struct Upload {
     path: PathBuf,
     file: File,
     offset: u64,
+    /// The same for those who don't hold the lock.
+    bytes: Arc<AtomicU64>,
     hasher: Sha256,
     /// Finished or cancelled by whoever had the lock before.
     ended: bool,
@@ -83,7 +88,7 @@ struct Upload {
 impl Upload {
     fn create(path: PathBuf) -> io::Result<Self> {
         let file = File::create_new(&path)?;
-        Ok(Self { path, file, offset: 0, hasher: Sha256::new(), ended: false })
+        Ok(Self { path, file, offset: 0, bytes: Arc::default(), hasher: Sha256::new(), ended: false })
     }
 
     /// Takes all of `chunks` or, on an error, nothing: bytes beyond the offset are overwritten by the next try.
@@ -97,6 +102,7 @@ impl Upload {
             self.hasher.update(chunk);
         }
         self.offset = offset;
+        self.bytes.store(offset, Ordering::Relaxed);
         Ok(())
     }
 
@@ -165,6 +171,21 @@ impl Uploads {
         all.insert(id, active);
         Ok(())
     }
+
+    /// Whether there is room for so many bytes more of a robot of which `kept` are kept already.
+    fn check_room_of(&self, robot: &RobotId, bytes: u64, kept: u64) -> Result<(), BlobError> {
+        let is_robots = |active: &&Active| owner(&active.repository).is_some_and(|(owner, _)| owner == *robot);
+        let unfinished: u64 = self.active().values().filter(is_robots).map(|a| a.bytes.load(Ordering::Relaxed)).sum();
+        let (max, kept) = (self.settings.max_robot_bytes, kept.saturating_add(unfinished));
+        if kept.saturating_add(bytes) > max {
+            return Err(BlobError::TooMuchOfRobot { max, kept });
+        }
+        // Where the disk can't be asked, it is full when it says so.
+        match room(&self.directory) {
+            Some((free, _)) if free < self.settings.spare_bytes.saturating_add(bytes) => Err(BlobError::DiskFull),
+            _ => Ok(()),
+        }
+    }
 }
 
 impl Blobs {
@@ -173,7 +194,9 @@ impl Blobs {
         let id = UploadId::random();
         let path = self.shared.uploads.directory.join(id.as_str());
         let created = Upload::create(path.clone()).map_err(BlobError::disk("create", &path))?;
-        let active = Active { repository: repository.clone(), upload: Arc::new(tokio::sync::Mutex::new(created)) };
+        let bytes = Arc::clone(&created.bytes);
+        let active =
+            Active { repository: repository.clone(), upload: Arc::new(tokio::sync::Mutex::new(created)), bytes };
         if let Err(refused) = self.shared.uploads.insert(id.clone(), active) {
             // Best effort: what stays is removed at the next start.
             let _ = fs::remove_file(&path);
@@ -187,15 +210,25 @@ impl Blobs {
         Ok(self.lock_upload(repository, id)?.offset)
     }
 
+    /// Whether so many bytes more would be taken. `kept` is what is kept of the robot whose repository this is.
+    pub fn check_room(&self, repository: &RepositoryName, bytes: u64, kept: u64) -> Result<(), BlobError> {
+        let max = self.shared.settings.max_blob_bytes;
+        if bytes > max {
+            return Err(BlobError::TooLarge { max });
+        }
+        owner(repository).map_or(Ok(()), |(robot, _)| self.shared.uploads.check_room_of(&robot, bytes, kept))
+    }
+
     /// Appends a body that begins at byte `start` (wherever the upload stands, if absent). What came before an error or
-    /// before the caller gave up is kept, and the next chunk begins there; only a full disk ends the upload. Returns the
-    /// new offset.
+    /// before the caller gave up is kept, and the next chunk begins there; only where there is no room for it the upload
+    /// ends. `kept` is as in [`Self::check_room`]. Returns the new offset.
     pub async fn append<S, E>(
         &self,
         repository: &RepositoryName,
         id: &UploadId,
         start: Option<u64>,
         body: S,
+        kept: u64,
     ) -> Result<u64, BlobError>
     where
         S: Stream<Item = Result<Bytes, E>> + Send,
@@ -215,17 +248,18 @@ impl Blobs {
                 return Err(BlobError::TooLarge { max });
             }
             if length > 0 {
+                let room = self.check_room(repository, length as u64, kept);
                 // The lock travels with the work: if the caller is dropped here, the bytes still count as one piece.
                 let written = on_disk(move || {
-                    let written = upload.write(&chunks);
-                    if matches!(written, Err(BlobError::DiskFull)) {
+                    let written = room.and_then(|()| upload.write(&chunks));
+                    if matches!(written, Err(BlobError::DiskFull | BlobError::TooMuchOfRobot { .. })) {
                         // What is here already would keep the disk full, for the database as well. Best effort.
                         let _ = upload.cancel();
                     }
                     written.map(|()| upload)
                 });
                 let written = written.await;
-                if matches!(written, Err(BlobError::DiskFull)) {
+                if matches!(written, Err(BlobError::DiskFull | BlobError::TooMuchOfRobot { .. })) {
                     self.shared.uploads.active().remove(id);
                 }
                 upload = written?;
@@ -332,14 +366,30 @@ mod tests {
         let repository: RepositoryName = "talker".parse().expect("a name");
         let body = |bytes: &'static [u8]| futures_util::stream::iter([Ok::<_, io::Error>(Bytes::from_static(bytes))]);
         let id = blobs.begin_upload(&repository).await.expect("begins");
-        blobs.append(&repository, &id, None, body(b"some")).await.expect("there is room");
+        blobs.append(&repository, &id, None, body(b"some"), 0).await.expect("there is room");
         let full = File::options().write(true).open("/dev/full").expect("Linux has it");
         blobs.lock_upload(&repository, &id).expect("nobody writes").file = full;
-        let refused = blobs.append(&repository, &id, None, body(b"more")).await;
+        let refused = blobs.append(&repository, &id, None, body(b"more"), 0).await;
         assert!(matches!(refused, Err(BlobError::DiskFull)), "{refused:?}");
         let gone = blobs.upload_offset(&repository, &id).await;
         assert!(matches!(gone, Err(BlobError::UploadUnknown)), "{gone:?}");
         assert_eq!(fs::read_dir(&blobs.shared.uploads.directory).expect("there").count(), 0);
+    }
+
+    #[tokio::test]
+    async fn robots_leave_some_of_the_disk_to_everybody_else() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let settings = BlobSettings { spare_bytes: u64::MAX, ..BlobSettings::default() };
+        let blobs = Blobs::open(directory.path(), settings).expect("opens");
+        let push = async |repository: &str| {
+            let repository: RepositoryName = repository.parse().expect("a name");
+            let id = blobs.begin_upload(&repository).await.expect("begins");
+            let body = futures_util::stream::iter([Ok::<_, io::Error>(Bytes::from_static(b"some"))]);
+            blobs.append(&repository, &id, None, body, 0).await
+        };
+        let refused = push("outputs/r00000000000000a1/mapping").await;
+        assert!(matches!(refused, Err(BlobError::DiskFull)), "{refused:?}");
+        assert_eq!(push("talker").await.expect("there is room"), 4);
     }
 
     #[tokio::test]

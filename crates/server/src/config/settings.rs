@@ -349,6 +349,12 @@ pub(super) const SETTINGS: &[Setting] = &[
         set: |config, text| count(text, 1_000_000).map(|n| config.robots.requests_per_s = n),
     },
     Setting {
+        name: "robots-output-bytes",
+        value_name: "SIZE",
+        help: "The most that is kept of what one robot brings back [default: 10 GB]",
+        set: |config, text| size_within(text, 1 << 20, 1 << 50).map(|bytes| config.max_robot_bytes = bytes),
+    },
+    Setting {
         name: "robots-patience",
         value_name: "TIME",
         help: "How long a robot is slowed before it is cut off [default: 30s]",

@@ -3,7 +3,8 @@
 use futures_util::TryStreamExt as _;
 use sqlx::Row as _;
 use task_proto::api::OutputView;
-use task_proto::output::OutputSet;
+use task_proto::desired::BlobRef;
+use task_proto::output::{OutputSet, owner};
 use task_proto::{Digest, RepositoryName, RobotId, TaskName};
 
 use super::{Store, StoreError, Write, rows};
@@ -13,6 +14,8 @@ use crate::person::Scope;
 const KEPT: usize = 10;
 /// The newest runs kept of one robot: the names of tasks are in its own hands.
 const KEPT_OF_ROBOT: usize = 200;
+/// What the smallest file counts: there is more to keeping it than its bytes.
+const LEAST_BYTES: u64 = 64 * 1024;
 /// The most outputs listed.
 const MAX_LISTED: usize = 1000;
 /// The most bytes of JSON listed: an output of many files with long names takes a lot of room.
@@ -62,7 +65,38 @@ impl Store {
     }
 }
 
+impl Store {
+    /// Counts a manifest or a blob among what its robot takes, if the repository is a robot's.
+    pub async fn count_blob(&self, repository: &RepositoryName, blob: &BlobRef) -> Result<(), StoreError> {
+        let mut write = self.begin().await?;
+        write.count_blob(repository, blob).await?;
+        write.commit().await
+    }
+
+    /// Bytes that are kept of what a robot has brought, small files counted as [`LEAST_BYTES`] each.
+    pub async fn bytes_of_robot(&self, robot: &RobotId) -> Result<u64, StoreError> {
+        let sum: i64 =
+            sqlx::query_scalar("SELECT CAST(COALESCE(SUM(bytes), 0) AS BIGINT) FROM robot_blobs WHERE robot_id = $1")
+                .bind(robot.as_str())
+                .fetch_one(&self.reads)
+                .await?;
+        Ok(rows::number(sum))
+    }
+}
+
 impl Write {
+    /// As [`Store::count_blob`]. What is counted once stays so until the blob is collected.
+    pub(super) async fn count_blob(&mut self, repository: &RepositoryName, blob: &BlobRef) -> Result<(), StoreError> {
+        let Some((robot, _)) = owner(repository) else { return Ok(()) };
+        sqlx::query("INSERT INTO robot_blobs (robot_id, digest, bytes) VALUES ($1, $2, $3) ON CONFLICT DO NOTHING")
+            .bind(robot.as_str())
+            .bind(blob.digest.to_string())
+            .bind(rows::stored(blob.size.max(LEAST_BYTES)))
+            .execute(self.connection())
+            .await?;
+        Ok(())
+    }
+
     /// Notes an output, which takes the place of an earlier one of the same run. Gives the manifests of the robot's
     /// repositories that are too many now.
     pub(super) async fn insert_output(

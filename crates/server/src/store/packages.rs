@@ -209,13 +209,14 @@ impl Store {
     }
 
     /// Makes a blob part of a repository.
-    pub async fn link_blob(&self, repository: &RepositoryName, digest: &Digest) -> Result<(), StoreError> {
+    pub async fn link_blob(&self, repository: &RepositoryName, blob: &BlobRef) -> Result<(), StoreError> {
         let mut write = self.begin().await?;
         sqlx::query("INSERT INTO repository_blobs (repository, digest) VALUES ($1, $2) ON CONFLICT DO NOTHING")
             .bind(repository.as_str())
-            .bind(digest.to_string())
+            .bind(blob.digest.to_string())
             .execute(write.connection())
             .await?;
+        write.count_blob(repository, blob).await?;
         write.commit().await
     }
 
@@ -296,8 +297,9 @@ impl Store {
         let unneeded: Vec<Digest> = candidates.into_iter().filter(|digest| !needed.contains(digest)).collect();
         let mut write = self.begin().await?;
         for digest in &unneeded {
-            let query = sqlx::query("DELETE FROM repository_blobs WHERE digest = $1").bind(digest.to_string());
-            query.execute(write.connection()).await?;
+            for sql in ["DELETE FROM repository_blobs WHERE digest = $1", "DELETE FROM robot_blobs WHERE digest = $1"] {
+                sqlx::query(sql).bind(digest.to_string()).execute(write.connection()).await?;
+            }
         }
         write.commit().await?;
         Ok(unneeded)

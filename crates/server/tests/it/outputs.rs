@@ -1,13 +1,16 @@
 //! Files that come back from robots: pushed by the robot into its own repository, listed and read by operators.
 
-use reqwest::{Method, StatusCode};
+use reqwest::{Body, Method, StatusCode};
 use task_proto::api::OutputList;
 use task_proto::desired::BlobRef;
 use task_proto::oci::MANIFEST_TYPE;
 use task_proto::output::{OutputFile, OutputSet};
 use task_proto::{Digest, RobotId};
+use taskd::blobs::BlobSettings;
 
+use crate::database::{TestDatabase, on_both_databases};
 use crate::harness::{TestRobot, TestServer, refusal};
+use crate::registry::{GRACE, NOW_MS, TestRegistry, image, operator};
 
 /// A push in the robot's name, blob by blob.
 pub struct Push {
@@ -163,4 +166,105 @@ async fn a_robot_pushes_nothing_else_and_nowhere_else() {
     assert!(list.outputs.is_empty(), "{list:?}");
     let unknown = refusal(server.request(Method::GET, "/api/v1/outputs?robot=nobody")).await;
     assert_eq!(unknown, (404, "not_found".to_owned()));
+}
+
+async fn what_one_robot_brings_is_bounded_in_bytes(database: TestDatabase) {
+    const KB: u64 = 1024;
+    let data = tempfile::tempdir().expect("a directory");
+    let settings = BlobSettings { max_robot_bytes: 1024 * KB, ..BlobSettings::default() };
+    let registry = TestRegistry::start_on(database.store.clone(), data, settings, Some(operator())).await;
+    let [first, second, other] =
+        ["a1/mapping", "a1/survey", "a2/mapping"].map(|of| format!("outputs/r00000000000000{of}"));
+    let push = async |repository: &str, byte: u8, bytes: u64| {
+        let bytes = vec![byte; usize::try_from(bytes).expect("small")];
+        let path = format!("/v2/{repository}/blobs/uploads/?digest={}", Digest::of(&bytes));
+        let pieces = bytes.chunks(1000).map(|piece| Ok::<_, std::io::Error>(piece.to_vec())).collect::<Vec<_>>();
+        let [announced, streamed] = [bytes.into(), Body::wrap_stream(futures_util::stream::iter(pieces))];
+        // What is not announced is found out on the way.
+        for body in [streamed, announced] {
+            let answer = registry.ask(Method::POST, &path).body(body).send().await.expect("an answer");
+            if answer.status() == StatusCode::CREATED {
+                return answer.status();
+            }
+            assert_eq!(answer.status(), StatusCode::PAYLOAD_TOO_LARGE);
+            let text = answer.text().await.expect("a text");
+            assert!(text.contains("robots.output_bytes"), "{text}");
+        }
+        StatusCode::PAYLOAD_TOO_LARGE
+    };
+    let full = StatusCode::PAYLOAD_TOO_LARGE;
+    assert_eq!(push(&first, 1, 500 * KB).await, StatusCode::CREATED);
+    assert_eq!(push(&first, 1, 500 * KB).await, StatusCode::CREATED);
+    assert_eq!(push(&second, 2, 400 * KB).await, StatusCode::CREATED, "what came twice counts once");
+    assert_eq!(push(&first, 3, 125 * KB).await, full, "all its tasks count together");
+    assert_eq!(push(&other, 3, 900 * KB).await, StatusCode::CREATED, "another robot's has room");
+    assert_eq!(push("talker", 4, 2000 * KB).await, StatusCode::CREATED, "and so has a package");
+
+    // What is on its way counts as well, and what there is no room for is not kept.
+    let upload = registry.begin(&first).await;
+    let sent = registry.ask(Method::PATCH, &upload).body(vec![5; 100 * 1024]).send().await.expect("an answer");
+    assert_eq!(sent.status(), StatusCode::ACCEPTED);
+    assert_eq!(push(&second, 6, 64 * KB).await, full);
+    assert_eq!(registry.status(Method::DELETE, &upload).await, StatusCode::NO_CONTENT);
+    for byte in [7, 8] {
+        assert_eq!(push(&second, byte, 1).await, StatusCode::CREATED);
+    }
+    assert_eq!(push(&second, 9, 1).await, full, "a small file counts 64 KB");
+
+    // Only what is on the disk no more makes room.
+    let kept: u64 =
+        registry.registry.store.bytes_of_robot(&"r00000000000000a1".parse().expect("valid")).await.expect("a sum");
+    assert_eq!(kept, (500 + 400 + 2 * 64) * KB);
+    let grace_ms = u64::try_from(GRACE.as_millis()).expect("small");
+    registry.collect(NOW_MS + 2 * grace_ms).await;
+    assert_eq!(push(&first, 3, 125 * KB).await, StatusCode::CREATED);
+}
+
+on_both_databases!(what_one_robot_brings_is_bounded_in_bytes);
+
+/// Manifests are on the disk as well, those that were refused too.
+#[tokio::test]
+async fn a_robots_manifests_count() {
+    let settings = BlobSettings { max_robot_bytes: 256 * 1024, ..BlobSettings::default() };
+    let registry = TestRegistry::start_with(settings, Some(operator())).await;
+    let repository = "outputs/r00000000000000a1/mapping";
+    let nowhere = BlobRef { digest: Digest::of(b"never pushed"), size: 1 };
+    let mut statuses = Vec::new();
+    for number in 0..6 {
+        let mut manifest = serde_json::to_value(image(nowhere, nowhere)).expect("json");
+        manifest["annotations"] = serde_json::json!({ "number": number.to_string() });
+        let path = format!("/v2/{repository}/manifests/{number}");
+        statuses.push(registry.put_manifest(&path, MANIFEST_TYPE, &manifest).await.status().as_u16());
+    }
+    assert_eq!(statuses, [400, 400, 400, 400, 400, 413]);
+}
+
+/// What a robot sends in many requests at once is not more than what it sends in one.
+#[tokio::test]
+async fn a_file_that_was_let_in_before_another_came_is_counted_with_it() {
+    const MB: usize = 1024 * 1024;
+    let settings = BlobSettings { max_robot_bytes: 10 * MB as u64, ..BlobSettings::default() };
+    let registry = TestRegistry::start_with(settings, Some(operator())).await;
+    let repository = "outputs/r00000000000000a1/mapping";
+    let (slow, quick) = (vec![1; 6 * MB], vec![2; 6 * MB]);
+    let path = format!("/v2/{repository}/blobs/uploads/?digest={}", Digest::of(&slow));
+    let (pieces, sent) = tokio::sync::mpsc::channel::<Vec<u8>>(1);
+    let body = futures_util::stream::unfold(sent, async |mut sent| {
+        let piece = sent.recv().await?;
+        Some((Ok::<_, std::io::Error>(piece), sent))
+    });
+    let answer = registry.ask(Method::POST, &path).body(Body::wrap_stream(body)).send();
+    let meanwhile = async {
+        let uploads = registry.data.path().join("uploads");
+        while std::fs::read_dir(&uploads).expect("a directory").count() == 0 {
+            tokio::task::yield_now().await;
+        }
+        registry.push_blob(repository, &quick).await;
+        pieces.send(slow).await.expect("it is read");
+        drop(pieces);
+    };
+    let (answer, ()) = futures_util::future::join(answer, meanwhile).await;
+    assert_eq!(answer.expect("an answer").status(), StatusCode::PAYLOAD_TOO_LARGE);
+    let uploads = std::fs::read_dir(registry.data.path().join("uploads")).expect("a directory");
+    assert_eq!(uploads.count(), 0, "nothing of it is left");
 }

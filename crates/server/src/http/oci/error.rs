@@ -157,7 +157,7 @@ impl From<BlobError> for OciError {
             BlobError::OutOfOrder { .. } => {
                 Self::new(StatusCode::RANGE_NOT_SATISFIABLE, "BLOB_UPLOAD_INVALID", message)
             }
-            BlobError::TooLarge { .. } => Self::too_large(message),
+            BlobError::TooLarge { .. } | BlobError::TooMuchOfRobot { .. } => Self::too_large(message),
             BlobError::WrongDigest { .. } => Self::digest_invalid(message),
             BlobError::Interrupted(_) => Self::upload_invalid(message),
             BlobError::DiskFull => Self::new(StatusCode::INSUFFICIENT_STORAGE, "DENIED", message),

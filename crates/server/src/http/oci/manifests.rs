@@ -16,6 +16,7 @@ use task_proto::{Digest, RepositoryName, Tag};
 
 use super::blobs::serve;
 use super::parsed::Parsed;
+use super::uploads::kept;
 use super::{Answer, OciError, Registry, empty, signed};
 use crate::blobs::Blob;
 use crate::changes::Change;
@@ -106,8 +107,10 @@ pub(super) async fn push(
         return Err(OciError::denied("a robot may only tag an output with its own run"));
     }
     let now_ms = registry.clock.now_ms();
+    registry.blobs.check_room(repository, 0, kept(registry, repository).await?)?;
     registry.blobs.put(bytes).await?;
     registry.blobs.touch(digest, now_ms).await?;
+    registry.store.count_blob(repository, &manifest).await?;
     let new = NewManifest {
         manifest: StoredManifest { digest, size: manifest.size, media_type: parsed.media_type },
         artifact_type: parsed.artifact_type,

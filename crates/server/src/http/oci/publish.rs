@@ -50,7 +50,7 @@ where
         return Ok(());
     }
     let upload = begun(registry, repository).await?;
-    if let Err(error) = registry.blobs.append(repository, &upload.id, Some(0), bytes).await {
+    if let Err(error) = registry.blobs.append(repository, &upload.id, Some(0), bytes, 0).await {
         // Best effort, for the collector would find it; what the caller has to know is the error.
         let _ = upload.cancel().await;
         return Err(error.into());

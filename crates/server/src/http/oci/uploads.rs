@@ -6,6 +6,8 @@ use http::header::{CONTENT_LENGTH, CONTENT_RANGE};
 use http::request::Parts;
 use http::{HeaderMap, StatusCode};
 use serde::Deserialize;
+use task_proto::desired::BlobRef;
+use task_proto::output::owner;
 use task_proto::{Digest, RepositoryName};
 
 use super::blobs::decimal;
@@ -46,9 +48,10 @@ pub(super) async fn begin(
         }
     } else if let Some(digest) = &query.digest {
         let digest = parse_digest(digest)?;
-        check_length(registry, &parts.headers)?;
+        let kept = kept(registry, repository).await?;
+        check_length(registry, repository, &parts.headers, kept)?;
         let upload = begun(registry, repository).await?;
-        let appended = registry.blobs.append(repository, &upload.id, Some(0), body.into_data_stream()).await;
+        let appended = registry.blobs.append(repository, &upload.id, Some(0), body.into_data_stream(), kept).await;
         if let Err(error) = appended {
             // Best effort, for the collector would find it; what the caller has to know is the error.
             let _ = upload.cancel().await;
@@ -101,10 +104,11 @@ impl Upload<'_> {
 
     async fn take_chunk(&self, parts: &Parts, body: Body) -> Result<u64, OciError> {
         let range = content_range(parts)?;
-        check_length(self.registry, &parts.headers)?;
+        let kept = kept(self.registry, self.repository).await?;
+        check_length(self.registry, self.repository, &parts.headers, kept)?;
         let start = range.as_ref().map(|range| range.start);
         let body = body.into_data_stream();
-        let offset = self.registry.blobs.append(self.repository, &self.id, start, body).await?;
+        let offset = self.registry.blobs.append(self.repository, &self.id, start, body, kept).await?;
         match range {
             Some(range) if range.end != offset => Err(OciError::size_invalid(format!(
                 "the Content-Range ends before byte {}, the body before byte {offset}",
@@ -118,9 +122,14 @@ impl Upload<'_> {
     pub(super) async fn complete(&self, digest: Digest) -> Answer {
         let Self { registry, repository, id } = self;
         let _hold = registry.blobs.hold_collection().await;
-        registry.blobs.finish_upload(repository, id, digest).await?;
+        // Others of the robot's may have been finished meanwhile.
+        if let Err(full) = registry.blobs.check_room(repository, 0, kept(registry, repository).await?) {
+            registry.blobs.cancel_upload(repository, id).await?;
+            return Err(full.into());
+        }
+        let size = registry.blobs.finish_upload(repository, id, digest).await?;
         registry.blobs.touch(digest, registry.clock.now_ms()).await?;
-        registry.store.link_blob(repository, &digest).await?;
+        registry.store.link_blob(repository, &BlobRef { digest, size }).await?;
         created(repository, &digest)
     }
 
@@ -145,21 +154,30 @@ async fn mount(
 ) -> Result<bool, OciError> {
     let from = from.map(str::parse::<RepositoryName>).transpose().map_err(|error| OciError::name_invalid(&error))?;
     let _hold = registry.blobs.hold_collection().await;
-    let is_there = registry.store.has_blob(from.as_ref(), &digest).await?
-        && registry.blobs.touch(digest, registry.clock.now_ms()).await?;
-    if is_there {
-        registry.store.link_blob(repository, &digest).await?;
+    if !registry.store.has_blob(from.as_ref(), &digest).await?
+        || !registry.blobs.touch(digest, registry.clock.now_ms()).await?
+    {
+        return Ok(false);
     }
-    Ok(is_there)
+    let Some(blob) = registry.blobs.get(digest).await? else { return Ok(false) };
+    registry.store.link_blob(repository, &BlobRef { digest, size: blob.size() }).await?;
+    Ok(true)
+}
+
+/// How many bytes are kept of the robot whose repository this is, if it is one's.
+pub(super) async fn kept(registry: &Registry, repository: &RepositoryName) -> Result<u64, OciError> {
+    let Some((robot, _)) = owner(repository) else { return Ok(0) };
+    Ok(registry.store.bytes_of_robot(&robot).await?)
 }
 
 /// Refuses what is announced as too large before any of it is read.
-fn check_length(registry: &Registry, headers: &HeaderMap) -> Result<(), OciError> {
-    let max = registry.blobs.settings().max_blob_bytes;
-    match announced_length(headers) {
-        Some(length) if length > max => Err(crate::blobs::BlobError::TooLarge { max }.into()),
-        _ => Ok(()),
-    }
+fn check_length(
+    registry: &Registry,
+    repository: &RepositoryName,
+    headers: &HeaderMap,
+    kept: u64,
+) -> Result<(), OciError> {
+    Ok(registry.blobs.check_room(repository, announced_length(headers).unwrap_or(0), kept)?)
 }
 
 fn announced_length(headers: &HeaderMap) -> Option<u64> {

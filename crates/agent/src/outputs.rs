@@ -81,10 +81,12 @@ pub enum OutputError {
     #[error("the server can't be reached")]
     Unreachable(#[source] reqwest::Error),
     /// The server is overloaded, restarting or broken.
-    #[error("the server answers {status}")]
+    #[error("the server answers {status} {text}")]
     Busy {
         /// The HTTP status.
         status: u16,
+        /// What it said.
+        text: String,
         /// When it wants to be asked again.
         retry_after: Option<Duration>,
     },

@@ -4,6 +4,7 @@
 
 use std::time::Duration;
 
+use task_proto::Digest;
 use tokio_util::sync::CancellationToken;
 
 use crate::blobs::{BlobError, Blobs};
@@ -14,6 +15,9 @@ use crate::store::{Store, StoreError};
 const MAX_AT_ONCE: usize = 256;
 /// The shortest and longest time between two collections.
 const INTERVAL: [Duration; 2] = [Duration::from_secs(1), Duration::from_secs(600)];
+
+/// How long what a robot has dropped is left alone, if the grace is not shorter: it brings back more.
+const DROPPED_GRACE: Duration = Duration::from_secs(3600);
 
 /// What one collection removed.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -58,10 +62,19 @@ pub async fn run(store: Store, blobs: Blobs, clock: Clock, grace: Duration, stop
 
 /// Removes what has not been needed for `grace`.
 pub async fn collect(store: &Store, blobs: &Blobs, now_ms: u64, grace: Duration) -> Result<Collected, CollectError> {
-    let before_ms = now_ms.saturating_sub(u64::try_from(grace.as_millis()).unwrap_or(u64::MAX));
-    let mut collected = Collected { uploads: blobs.drop_idle_uploads(before_ms).await?, blobs: 0 };
-    let old = blobs.untouched_since(before_ms).await?;
-    for candidates in old.chunks(MAX_AT_ONCE) {
+    let before = |grace: Duration| now_ms.saturating_sub(u64::try_from(grace.as_millis()).unwrap_or(u64::MAX));
+    let uploads = blobs.drop_idle_uploads(before(grace)).await?;
+    let old = blobs.untouched_since(before(grace)).await?;
+    let dropped = store.blobs_dropped_by_robots().await?;
+    let removed = remove(store, blobs, &old, before(grace)).await?
+        + remove(store, blobs, &dropped, before(grace.min(DROPPED_GRACE))).await?;
+    Ok(Collected { uploads, blobs: removed })
+}
+
+/// Removes those of `candidates` that nobody needs, or has asked for since `before_ms`; says how many.
+async fn remove(store: &Store, blobs: &Blobs, candidates: &[Digest], before_ms: u64) -> Result<usize, CollectError> {
+    let mut removed = 0;
+    for candidates in candidates.chunks(MAX_AT_ONCE) {
         let collection = blobs.begin_collection().await;
         let mut untouched = Vec::with_capacity(candidates.len());
         for &digest in candidates {
@@ -72,8 +85,8 @@ pub async fn collect(store: &Store, blobs: &Blobs, now_ms: u64, grace: Duration)
         }
         for digest in store.forget_unneeded(untouched).await? {
             blobs.delete(digest, &collection).await?;
-            collected.blobs += 1;
+            removed += 1;
         }
     }
-    Ok(collected)
+    Ok(removed)
 }

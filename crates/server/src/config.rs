@@ -279,7 +279,7 @@ impl Config {
             oidc: OidcSettings::default(),
             max_blob_bytes: 16 << 30,
             max_upload_bytes: 4 << 30,
-            max_robot_bytes: 10 << 30,
+            max_robot_bytes: 40 << 30,
             delivery: DeliverySettings::default(),
             transfers: TransferLimits::default(),
             robots: ConductLimits::default(),

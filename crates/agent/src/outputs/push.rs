@@ -1,6 +1,7 @@
 //! Pushes an output through the OCI distribution API: blobs in chunks that go on where they broke off, then the config,
 //! then the manifest.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::io::{Read as _, Seek as _, SeekFrom};
 use std::path::Path;
@@ -230,10 +231,7 @@ async fn refusal(what: &str, mut response: Response) -> OutputError {
     let status = response.status();
     let is_passing = status.is_server_error()
         || matches!(status, StatusCode::TOO_MANY_REQUESTS | StatusCode::REQUEST_TIMEOUT | StatusCode::UNAUTHORIZED);
-    if is_passing {
-        let seconds = response.headers().get(RETRY_AFTER).and_then(|value| value.to_str().ok()?.parse().ok());
-        return OutputError::Busy { status: status.as_u16(), retry_after: seconds.map(Duration::from_secs) };
-    }
+    let seconds = response.headers().get(RETRY_AFTER).and_then(|value| value.to_str().ok()?.parse().ok());
     let mut body = Vec::new();
     while let Ok(Some(chunk)) = response.chunk().await {
         body.extend_from_slice(&chunk);
@@ -241,6 +239,32 @@ async fn refusal(what: &str, mut response: Response) -> OutputError {
             break;
         }
     }
-    let text = String::from_utf8_lossy(&body[..body.len().min(MAX_ERROR_BYTES)]).replace(char::is_control, " ");
-    OutputError::Refused { what: what.to_owned(), status: status.as_u16(), text }
+    body.truncate(MAX_ERROR_BYTES);
+    let (status, text) = (status.as_u16(), said(&body));
+    if is_passing {
+        return OutputError::Busy { status, text, retry_after: seconds.map(Duration::from_secs) };
+    }
+    OutputError::Refused { what: what.to_owned(), status, text }
+}
+
+/// The words of a registry's error body; all of what is none.
+fn said(body: &[u8]) -> String {
+    let parsed: Option<serde_json::Value> = serde_json::from_slice(body).ok();
+    let message = parsed.as_ref().and_then(|errors| errors["errors"][0]["message"].as_str());
+    message.map_or_else(|| String::from_utf8_lossy(body), Cow::Borrowed).replace(char::is_control, " ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::said;
+
+    #[test]
+    fn a_refusal_is_told_in_the_servers_words() {
+        let error = br#"{"errors":[{"code":"SIZE_INVALID","message":"the output\nhas 9 bytes","detail":{}}]}"#;
+        assert_eq!(said(error), "the output has 9 bytes");
+        for other in ["<h1>Forbidden</h1>", r#"{"errors":[]}"#, r#"{"error":{"code":"x"}}"#] {
+            assert_eq!(said(other.as_bytes()), other);
+        }
+        assert_eq!(said(b"\xff\x1b[2J"), "\u{fffd} [2J");
+    }
 }

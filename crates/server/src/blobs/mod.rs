@@ -41,7 +41,7 @@ pub struct BlobSettings {
     pub max_uploads: usize,
     /// The most blobs kept open for the next reader.
     pub max_open_blobs: usize,
-    /// The most bytes kept of what one robot brings back.
+    /// The most bytes kept of what one robot brings back. While older ones go, it may have twice as many on the disk.
     pub max_robot_bytes: u64,
     /// What robots leave free on the disk, in bytes, for everybody else and for the database.
     pub spare_bytes: u64,
@@ -54,7 +54,7 @@ impl Default for BlobSettings {
             max_blob_bytes: 16 << 30,
             max_uploads: 256,
             max_open_blobs: 64,
-            max_robot_bytes: 10 << 30,
+            max_robot_bytes: 40 << 30,
             spare_bytes: 0,
         }
     }
@@ -89,10 +89,9 @@ pub enum BlobError {
         /// The limit.
         max: u64,
     },
-    /// More than is kept of what one robot brings back.
+    /// More at a time than one robot may bring back.
     #[error(
-        "the server keeps {max} bytes of what one robot brings back (robots.output_bytes), and has {kept} of this one; what \
-         is deleted there makes room some time later"
+        "{kept} bytes of what this robot brought back are on the disk, {max} may be: they go by and by (robots.output_bytes)"
     )]
     TooMuchOfRobot {
         /// The limit.
@@ -127,6 +126,11 @@ pub enum BlobError {
 }
 
 impl BlobError {
+    /// Whether the bytes are more than there is room for.
+    fn is_want_of_room(&self) -> bool {
+        matches!(self, Self::DiskFull | Self::TooMuchOfRobot { .. } | Self::TooLarge { .. })
+    }
+
     fn disk(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Self {
         let path = path.to_owned();
         move |source| match source.kind() {

@@ -176,7 +176,7 @@ impl Uploads {
     fn check_room_of(&self, robot: &RobotId, bytes: u64, kept: u64) -> Result<(), BlobError> {
         let is_robots = |active: &&Active| owner(&active.repository).is_some_and(|(owner, _)| owner == *robot);
         let unfinished: u64 = self.active().values().filter(is_robots).map(|a| a.bytes.load(Ordering::Relaxed)).sum();
-        let (max, kept) = (self.settings.max_robot_bytes, kept.saturating_add(unfinished));
+        let (max, kept) = (self.settings.max_robot_bytes.saturating_mul(2), kept.saturating_add(unfinished));
         if kept.saturating_add(bytes) > max {
             return Err(BlobError::TooMuchOfRobot { max, kept });
         }
@@ -212,11 +212,17 @@ impl Blobs {
 
     /// Whether so many bytes more would be taken. `kept` is what is kept of the robot whose repository this is.
     pub fn check_room(&self, repository: &RepositoryName, bytes: u64, kept: u64) -> Result<(), BlobError> {
-        let max = self.shared.settings.max_blob_bytes;
+        let max = self.max_bytes_in(repository);
         if bytes > max {
             return Err(BlobError::TooLarge { max });
         }
         owner(repository).map_or(Ok(()), |(robot, _)| self.shared.uploads.check_room_of(&robot, bytes, kept))
+    }
+
+    /// The largest blob that a repository takes.
+    fn max_bytes_in(&self, repository: &RepositoryName) -> u64 {
+        let BlobSettings { max_blob_bytes, max_robot_bytes, .. } = self.shared.settings;
+        if owner(repository).is_some() { max_blob_bytes.min(max_robot_bytes) } else { max_blob_bytes }
     }
 
     /// Appends a body that begins at byte `start` (wherever the upload stands, if absent). What came before an error or
@@ -239,27 +245,29 @@ impl Blobs {
         if let Some(given) = start.filter(|&given| given != offset) {
             return Err(BlobError::OutOfOrder { given, offset });
         }
-        let max = self.shared.settings.max_blob_bytes;
+        let max = self.max_bytes_in(repository);
         let mut body = std::pin::pin!(body);
         loop {
             let (chunks, ended) = gather(&mut body).await;
             let length: usize = chunks.iter().map(Bytes::len).sum();
-            if upload.offset + length as u64 > max {
-                return Err(BlobError::TooLarge { max });
-            }
             if length > 0 {
-                let room = self.check_room(repository, length as u64, kept);
+                let is_too_large = upload.offset + length as u64 > max;
+                let room = if is_too_large {
+                    Err(BlobError::TooLarge { max })
+                } else {
+                    self.check_room(repository, length as u64, kept)
+                };
                 // The lock travels with the work: if the caller is dropped here, the bytes still count as one piece.
                 let written = on_disk(move || {
                     let written = room.and_then(|()| upload.write(&chunks));
-                    if matches!(written, Err(BlobError::DiskFull | BlobError::TooMuchOfRobot { .. })) {
+                    if written.as_ref().is_err_and(BlobError::is_want_of_room) {
                         // What is here already would keep the disk full, for the database as well. Best effort.
                         let _ = upload.cancel();
                     }
                     written.map(|()| upload)
                 });
                 let written = written.await;
-                if matches!(written, Err(BlobError::DiskFull | BlobError::TooMuchOfRobot { .. })) {
+                if written.as_ref().is_err_and(BlobError::is_want_of_room) {
                     self.shared.uploads.active().remove(id);
                 }
                 upload = written?;

@@ -21,6 +21,15 @@ const MAX_LISTED: usize = 1000;
 /// The most bytes of JSON listed: an output of many files with long names takes a lot of room.
 const MAX_LISTED_BYTES: usize = 16 * 1024 * 1024;
 
+/// An output to be stored.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct NewOutput {
+    /// What it says.
+    pub set: OutputSet,
+    /// How many bytes of its robot's outputs stay.
+    pub max_bytes: u64,
+}
+
 impl Store {
     /// The newest outputs first, of one robot or of all in a scope, of one task or of all; at most 1,000, and fewer if they
     /// are large.
@@ -68,6 +77,9 @@ impl Store {
 impl Store {
     /// Counts a manifest or a blob among what its robot takes, if the repository is a robot's.
     pub async fn count_blob(&self, repository: &RepositoryName, blob: &BlobRef) -> Result<(), StoreError> {
+        if owner(repository).is_none() {
+            return Ok(());
+        }
         let mut write = self.begin().await?;
         write.count_blob(repository, blob).await?;
         write.commit().await
@@ -82,34 +94,63 @@ impl Store {
                 .await?;
         Ok(rows::number(sum))
     }
+
+    /// Blobs of manifests that some robot had and has no more. Others may need them.
+    pub async fn blobs_dropped_by_robots(&self) -> Result<Vec<Digest>, StoreError> {
+        let texts: Vec<String> = sqlx::query_scalar("SELECT DISTINCT digest FROM robot_blobs WHERE dropped = 1")
+            .fetch_all(&self.reads)
+            .await?;
+        texts.iter().map(|text| rows::id("robot_blobs.digest", text)).collect()
+    }
 }
 
 impl Write {
+    /// Notes that a manifest of these parts is no more, if the repository is a robot's.
+    pub(super) async fn drop_of_robot(
+        &mut self,
+        repository: &RepositoryName,
+        manifest: &Digest,
+        parts: &[String],
+    ) -> Result<(), StoreError> {
+        let Some((robot, _)) = owner(repository) else { return Ok(()) };
+        for digest in parts.iter().chain([&manifest.to_string()]) {
+            sqlx::query("UPDATE robot_blobs SET dropped = 1 WHERE robot_id = $1 AND digest = $2")
+                .bind(robot.as_str())
+                .bind(digest)
+                .execute(self.connection())
+                .await?;
+        }
+        Ok(())
+    }
+
     /// As [`Store::count_blob`]. What is counted once stays so until the blob is collected.
     pub(super) async fn count_blob(&mut self, repository: &RepositoryName, blob: &BlobRef) -> Result<(), StoreError> {
         let Some((robot, _)) = owner(repository) else { return Ok(()) };
-        sqlx::query("INSERT INTO robot_blobs (robot_id, digest, bytes) VALUES ($1, $2, $3) ON CONFLICT DO NOTHING")
-            .bind(robot.as_str())
-            .bind(blob.digest.to_string())
-            .bind(rows::stored(blob.size.max(LEAST_BYTES)))
-            .execute(self.connection())
-            .await?;
+        sqlx::query(
+            "INSERT INTO robot_blobs (robot_id, digest, bytes) VALUES ($1, $2, $3)
+             ON CONFLICT (robot_id, digest) DO UPDATE SET dropped = 0",
+        )
+        .bind(robot.as_str())
+        .bind(blob.digest.to_string())
+        .bind(rows::stored(blob.size.max(LEAST_BYTES)))
+        .execute(self.connection())
+        .await?;
         Ok(())
     }
 
     /// Notes an output, which takes the place of an earlier one of the same run. Gives the manifests of the robot's
-    /// repositories that are too many now.
+    /// repositories that are too many now, or have too many bytes.
     pub(super) async fn insert_output(
         &mut self,
         repository: &RepositoryName,
         manifest: &Digest,
-        output: &OutputSet,
+        NewOutput { set: output, max_bytes }: &NewOutput,
         now_ms: u64,
     ) -> Result<Vec<(RepositoryName, Digest)>, StoreError> {
         let tag = format!("{}-{}", output.deployment, output.run);
         sqlx::query(
-            "INSERT INTO outputs (repository, manifest, robot_id, task, tag, output, pushed_at_ms)
-             VALUES ($1, $2, $3, $4, $5, $6, $7)
+            "INSERT INTO outputs (repository, manifest, robot_id, task, tag, output, pushed_at_ms, bytes)
+             VALUES ($1, $2, $3, $4, $5, $6, $7, $8)
              ON CONFLICT (repository, manifest) DO UPDATE SET pushed_at_ms = excluded.pushed_at_ms",
         )
         .bind(repository.as_str())
@@ -119,10 +160,11 @@ impl Write {
         .bind(&tag)
         .bind(rows::json(output))
         .bind(rows::stored(now_ms))
+        .bind(rows::stored(output.bytes()))
         .execute(self.connection())
         .await?;
         let others = sqlx::query(
-            "SELECT repository, manifest, tag FROM outputs
+            "SELECT repository, manifest, tag, bytes FROM outputs
              WHERE robot_id = $1 AND NOT (repository = $2 AND manifest = $3)
              ORDER BY pushed_at_ms DESC, manifest",
         )
@@ -131,15 +173,17 @@ impl Write {
         .bind(manifest.to_string())
         .fetch_all(self.connection())
         .await?;
-        let (mut surplus, mut kept, mut kept_here) = (Vec::new(), 1, 1);
+        let (mut surplus, mut kept, mut kept_here, mut kept_bytes) = (Vec::new(), 1, 1, output.bytes());
         for row in &others {
             let is_here = row.try_get::<&str, _>("repository")? == repository.as_str();
             let is_replaced = is_here && row.try_get::<&str, _>("tag")? == tag;
-            if is_replaced || kept >= KEPT_OF_ROBOT || (is_here && kept_here >= KEPT) {
+            let bytes = kept_bytes.saturating_add(rows::number(row.try_get("bytes")?));
+            if is_replaced || kept >= KEPT_OF_ROBOT || (is_here && kept_here >= KEPT) || bytes > *max_bytes {
                 let repository = rows::id("outputs.repository", row.try_get("repository")?)?;
                 surplus.push((repository, rows::id("outputs.manifest", row.try_get("manifest")?)?));
             } else {
                 kept += 1;
+                kept_bytes = bytes;
                 kept_here += usize::from(is_here);
             }
         }

@@ -9,10 +9,9 @@ use task_proto::api::PackageView;
 use task_proto::desired::{BlobRef, PackageRef};
 use task_proto::manifest::TaskManifest;
 use task_proto::oci::Descriptor;
-use task_proto::output::OutputSet;
 use task_proto::{Digest, RepositoryName, Tag, TaskName};
 
-use super::{Deed, SignedDocument, Store, StoreError, Write, rows};
+use super::{Deed, NewOutput, SignedDocument, Store, StoreError, Write, rows};
 
 /// A manifest's name inside its repository.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -52,7 +51,7 @@ pub struct NewManifest {
     /// What it says if it is a task package.
     pub package: Option<(PackageRef, TaskManifest)>,
     /// What it says if it is the output of a run.
-    pub output: Option<OutputSet>,
+    pub output: Option<NewOutput>,
     /// What it brings if it is something that publishers have signed.
     pub document: Option<SignedDocument>,
 }
@@ -318,6 +317,7 @@ impl Write {
                 .bind(digest.to_string())
                 .fetch_all(self.connection())
                 .await?;
+        self.drop_of_robot(repository, digest, &parts).await?;
         self.delete_document(repository, digest).await?;
         let mut deleted = 0;
         for sql in [

@@ -139,6 +139,7 @@ async fn limits_are_told_and_held() {
     let pieces = futures_util::stream::iter((0..11).map(|_| Ok::<_, std::io::Error>(vec![0_u8; 100])));
     let streamed = registry.ask(Method::PATCH, &upload).body(reqwest::Body::wrap_stream(pieces));
     assert_eq!(refusal(streamed.send().await.expect("an answer")).await, refused(413, "SIZE_INVALID"));
+    assert_eq!(registry.status(Method::GET, &upload).await, StatusCode::NOT_FOUND, "nothing of it is kept");
 
     let large = registry.ask(Method::PUT, "/v2/a/manifests/x").body(vec![b' '; 4 * 1024 * 1024 + 1]);
     assert_eq!(refusal(large.send().await.expect("an answer")).await, refused(413, "SIZE_INVALID"));

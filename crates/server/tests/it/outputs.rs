@@ -1,12 +1,17 @@
 //! Files that come back from robots: pushed by the robot into its own repository, listed and read by operators.
 
+use std::time::Duration;
+
 use reqwest::{Body, Method, StatusCode};
+use serde_json::{Value, json};
 use task_proto::api::OutputList;
 use task_proto::desired::BlobRef;
 use task_proto::oci::MANIFEST_TYPE;
 use task_proto::output::{OutputFile, OutputSet};
 use task_proto::{Digest, RobotId};
 use taskd::blobs::BlobSettings;
+use taskd::collector;
+use taskd::http::oci::Registry;
 
 use crate::database::{TestDatabase, on_both_databases};
 use crate::harness::{TestRobot, TestServer, refusal};
@@ -171,7 +176,7 @@ async fn a_robot_pushes_nothing_else_and_nowhere_else() {
 async fn what_one_robot_brings_is_bounded_in_bytes(database: TestDatabase) {
     const KB: u64 = 1024;
     let data = tempfile::tempdir().expect("a directory");
-    let settings = BlobSettings { max_robot_bytes: 1024 * KB, ..BlobSettings::default() };
+    let settings = BlobSettings { max_robot_bytes: 512 * KB, ..BlobSettings::default() };
     let registry = TestRegistry::start_on(database.store.clone(), data, settings, Some(operator())).await;
     let [first, second, other] =
         ["a1/mapping", "a1/survey", "a2/mapping"].map(|of| format!("outputs/r00000000000000{of}"));
@@ -180,24 +185,28 @@ async fn what_one_robot_brings_is_bounded_in_bytes(database: TestDatabase) {
         let path = format!("/v2/{repository}/blobs/uploads/?digest={}", Digest::of(&bytes));
         let pieces = bytes.chunks(1000).map(|piece| Ok::<_, std::io::Error>(piece.to_vec())).collect::<Vec<_>>();
         let [announced, streamed] = [bytes.into(), Body::wrap_stream(futures_util::stream::iter(pieces))];
+        let mut statuses = Vec::new();
         // What is not announced is found out on the way.
         for body in [streamed, announced] {
             let answer = registry.ask(Method::POST, &path).body(body).send().await.expect("an answer");
+            statuses.push(answer.status());
             if answer.status() == StatusCode::CREATED {
-                return answer.status();
+                break;
             }
-            assert_eq!(answer.status(), StatusCode::PAYLOAD_TOO_LARGE);
-            let text = answer.text().await.expect("a text");
-            assert!(text.contains("robots.output_bytes"), "{text}");
+            let waits = answer.headers().contains_key("retry-after");
+            assert_eq!(waits, answer.status() == StatusCode::TOO_MANY_REQUESTS, "robots wait for what passes only");
         }
-        StatusCode::PAYLOAD_TOO_LARGE
+        statuses.dedup();
+        let [status] = statuses[..] else { panic!("{statuses:?}") };
+        status
     };
-    let full = StatusCode::PAYLOAD_TOO_LARGE;
+    let full = StatusCode::TOO_MANY_REQUESTS;
+    assert_eq!(push(&first, 1, 513 * KB).await, StatusCode::PAYLOAD_TOO_LARGE, "it could never be kept");
     assert_eq!(push(&first, 1, 500 * KB).await, StatusCode::CREATED);
     assert_eq!(push(&first, 1, 500 * KB).await, StatusCode::CREATED);
     assert_eq!(push(&second, 2, 400 * KB).await, StatusCode::CREATED, "what came twice counts once");
     assert_eq!(push(&first, 3, 125 * KB).await, full, "all its tasks count together");
-    assert_eq!(push(&other, 3, 900 * KB).await, StatusCode::CREATED, "another robot's has room");
+    assert_eq!(push(&other, 3, 500 * KB).await, StatusCode::CREATED, "another robot's has room");
     assert_eq!(push("talker", 4, 2000 * KB).await, StatusCode::CREATED, "and so has a package");
 
     // What is on its way counts as well, and what there is no room for is not kept.
@@ -212,40 +221,86 @@ async fn what_one_robot_brings_is_bounded_in_bytes(database: TestDatabase) {
     assert_eq!(push(&second, 9, 1).await, full, "a small file counts 64 KB");
 
     // Only what is on the disk no more makes room.
-    let kept: u64 =
-        registry.registry.store.bytes_of_robot(&"r00000000000000a1".parse().expect("valid")).await.expect("a sum");
+    let robot = "r00000000000000a1".parse().expect("valid");
+    let kept = registry.registry.store.bytes_of_robot(&robot).await.expect("a sum");
     assert_eq!(kept, (500 + 400 + 2 * 64) * KB);
     let grace_ms = u64::try_from(GRACE.as_millis()).expect("small");
     registry.collect(NOW_MS + 2 * grace_ms).await;
     assert_eq!(push(&first, 3, 125 * KB).await, StatusCode::CREATED);
 }
 
-on_both_databases!(what_one_robot_brings_is_bounded_in_bytes);
+async fn beyond_so_many_bytes_the_oldest_output_goes_and_soon_is_off_the_disk(database: TestDatabase) {
+    const HOUR_MS: u64 = 3_600_000;
+    let data = tempfile::tempdir().expect("a directory");
+    let settings = BlobSettings { max_robot_bytes: 2048 * 1024, ..BlobSettings::default() };
+    let registry = TestRegistry::start_on(database.store.clone(), data, settings, Some(operator())).await;
+    let robot = RobotId::random();
+    let repository = format!("/v2/outputs/{robot}/mapping");
+    let push =
+        Push { client: registry.client.clone(), url: format!("{}{repository}", registry.base), token: String::new() };
+    let mut statuses = Vec::new();
+    let mut maps = Vec::new();
+    for run in 1..=3 {
+        registry.registry.clock.advance_ms(1000);
+        let map = push.blob(&vec![run; 800 * 1024]).await;
+        statuses.push(push.output(&output(&robot, run.into(), vec![file("map.pgm", map)])).await.as_u16());
+        maps.push(map);
+    }
+    assert_eq!(statuses, [201; 3]);
+    let tags: Value = registry.get(&format!("{repository}/tags/list")).await.json().await.expect("JSON");
+    assert_eq!(tags["tags"], json!(["d00000000000000b2-2", "d00000000000000b2-3"]), "three have 2.4 MB");
+
+    // Far sooner than what somebody may be about to push.
+    let collect = async |now_ms: u64| {
+        let Registry { store, blobs, .. } = &registry.registry;
+        collector::collect(store, blobs, now_ms, Duration::from_hours(24)).await.expect("collected").blobs
+    };
+    let now_ms = registry.registry.clock.now_ms();
+    assert_eq!(collect(now_ms + HOUR_MS / 2).await, 0);
+    assert_eq!(collect(now_ms + HOUR_MS + 1).await, 3, "the map, the config and the manifest");
+    let mut there = Vec::new();
+    for map in &maps {
+        there.push(registry.status(Method::HEAD, &format!("{repository}/blobs/{}", map.digest)).await.as_u16());
+    }
+    assert_eq!(there, [404, 200, 200]);
+
+    let mut files = Vec::new();
+    for (byte, path) in [(4, "a"), (5, "b"), (6, "c")] {
+        files.push(file(path, push.blob(&vec![byte; 690 * 1024]).await));
+    }
+    assert_eq!(push.output(&output(&robot, 4, files)).await, StatusCode::PAYLOAD_TOO_LARGE, "not even alone");
+}
+
+on_both_databases!(
+    what_one_robot_brings_is_bounded_in_bytes,
+    beyond_so_many_bytes_the_oldest_output_goes_and_soon_is_off_the_disk,
+);
 
 /// Manifests are on the disk as well, those that were refused too.
 #[tokio::test]
 async fn a_robots_manifests_count() {
-    let settings = BlobSettings { max_robot_bytes: 256 * 1024, ..BlobSettings::default() };
+    let settings = BlobSettings { max_robot_bytes: 128 * 1024, ..BlobSettings::default() };
     let registry = TestRegistry::start_with(settings, Some(operator())).await;
     let repository = "outputs/r00000000000000a1/mapping";
     let nowhere = BlobRef { digest: Digest::of(b"never pushed"), size: 1 };
     let mut statuses = Vec::new();
     for number in 0..6 {
         let mut manifest = serde_json::to_value(image(nowhere, nowhere)).expect("json");
-        manifest["annotations"] = serde_json::json!({ "number": number.to_string() });
+        manifest["annotations"] = json!({ "number": number.to_string() });
         let path = format!("/v2/{repository}/manifests/{number}");
         statuses.push(registry.put_manifest(&path, MANIFEST_TYPE, &manifest).await.status().as_u16());
     }
-    assert_eq!(statuses, [400, 400, 400, 400, 400, 413]);
+    assert_eq!(statuses, [400, 400, 400, 400, 400, 429]);
 }
 
 /// What a robot sends in many requests at once is not more than what it sends in one.
 #[tokio::test]
 async fn a_file_that_was_let_in_before_another_came_is_counted_with_it() {
     const MB: usize = 1024 * 1024;
-    let settings = BlobSettings { max_robot_bytes: 10 * MB as u64, ..BlobSettings::default() };
+    let settings = BlobSettings { max_robot_bytes: 6 * MB as u64, ..BlobSettings::default() };
     let registry = TestRegistry::start_with(settings, Some(operator())).await;
     let repository = "outputs/r00000000000000a1/mapping";
+    registry.push_blob(repository, &vec![0; MB]).await;
     let (slow, quick) = (vec![1; 6 * MB], vec![2; 6 * MB]);
     let path = format!("/v2/{repository}/blobs/uploads/?digest={}", Digest::of(&slow));
     let (pieces, sent) = tokio::sync::mpsc::channel::<Vec<u8>>(1);
@@ -264,7 +319,7 @@ async fn a_file_that_was_let_in_before_another_came_is_counted_with_it() {
         drop(pieces);
     };
     let (answer, ()) = futures_util::future::join(answer, meanwhile).await;
-    assert_eq!(answer.expect("an answer").status(), StatusCode::PAYLOAD_TOO_LARGE);
+    assert_eq!(answer.expect("an answer").status(), StatusCode::TOO_MANY_REQUESTS);
     let uploads = std::fs::read_dir(registry.data.path().join("uploads")).expect("a directory");
     assert_eq!(uploads.count(), 0, "nothing of it is left");
 }

@@ -13,6 +13,9 @@ use crate::blobs::BlobError;
 use crate::store::StoreError;
 use crate::transfers::NotYet;
 
+/// When it is of use to ask again where something has to be collected first, in seconds.
+const COLLECTION_S: u64 = 300;
+
 /// An answer that is not the one hoped for.
 #[derive(Debug)]
 pub struct OciError {
@@ -157,7 +160,11 @@ impl From<BlobError> for OciError {
             BlobError::OutOfOrder { .. } => {
                 Self::new(StatusCode::RANGE_NOT_SATISFIABLE, "BLOB_UPLOAD_INVALID", message)
             }
-            BlobError::TooLarge { .. } | BlobError::TooMuchOfRobot { .. } => Self::too_large(message),
+            BlobError::TooLarge { .. } => Self::too_large(message),
+            BlobError::TooMuchOfRobot { .. } => {
+                let error = Self::new(StatusCode::TOO_MANY_REQUESTS, "TOOMANYREQUESTS", message);
+                Self { retry_after_s: Some(COLLECTION_S), ..error }
+            }
             BlobError::WrongDigest { .. } => Self::digest_invalid(message),
             BlobError::Interrupted(_) => Self::upload_invalid(message),
             BlobError::DiskFull => Self::new(StatusCode::INSUFFICIENT_STORAGE, "DENIED", message),

@@ -16,12 +16,12 @@ use task_proto::{Digest, RepositoryName, Tag};
 
 use super::blobs::serve;
 use super::parsed::Parsed;
-use super::uploads::kept;
+use super::uploads::kept_bytes;
 use super::{Answer, OciError, Registry, empty, signed};
 use crate::blobs::Blob;
 use crate::changes::Change;
 use crate::person::Person;
-use crate::store::{Act, Deed, NewManifest, PutManifest, Reference, StoredManifest};
+use crate::store::{Act, Deed, NewManifest, NewOutput, PutManifest, Reference, StoredManifest};
 
 /// The largest manifest; the specification asks for at least this.
 const MAX_MANIFEST_BYTES: usize = 4 * 1024 * 1024;
@@ -98,16 +98,20 @@ pub(super) async fn push(
         None => None,
     };
     let output = match &parsed.output {
-        Some(image) => Some(check_output(registry, repository, image).await?),
+        Some(image) => {
+            let max_bytes = registry.blobs.settings().max_robot_bytes;
+            Some(NewOutput { set: check_output(registry, repository, image, max_bytes).await?, max_bytes })
+        }
         None => None,
     };
     let document = signed::check(registry, repository, &parsed, &tags).await?;
-    if only.is_some() && output.as_ref().is_some_and(|output| tags.iter().any(|tag| output.tag().as_ref() != Some(tag)))
+    if only.is_some()
+        && output.as_ref().is_some_and(|output| tags.iter().any(|tag| output.set.tag().as_ref() != Some(tag)))
     {
         return Err(OciError::denied("a robot may only tag an output with its own run"));
     }
     let now_ms = registry.clock.now_ms();
-    registry.blobs.check_room(repository, 0, kept(registry, repository).await?)?;
+    registry.blobs.check_room(repository, 0, kept_bytes(registry, repository).await?)?;
     registry.blobs.put(bytes).await?;
     registry.blobs.touch(digest, now_ms).await?;
     registry.store.count_blob(repository, &manifest).await?;
@@ -203,6 +207,7 @@ async fn check_output(
     registry: &Registry,
     repository: &RepositoryName,
     image: &ImageManifest,
+    max_bytes: u64,
 ) -> Result<OutputSet, OciError> {
     let config = image.config.blob();
     let output: OutputSet = serde_json::from_slice(&read_config(registry, repository, config).await?)
@@ -215,6 +220,12 @@ async fn check_output(
         let message =
             format!("the manifest is not that of the output in its config, or it has more than {MAX_FILES} files");
         return Err(OciError::manifest_invalid(message));
+    }
+    let bytes = output.bytes();
+    if bytes > max_bytes {
+        let message =
+            format!("the output has {bytes} bytes, and {max_bytes} are kept of one robot (robots.output_bytes)");
+        return Err(OciError::too_large(message));
     }
     for file in &output.files {
         check_blob(registry, repository, file.blob).await?;

@@ -48,7 +48,7 @@ pub(super) async fn begin(
         }
     } else if let Some(digest) = &query.digest {
         let digest = parse_digest(digest)?;
-        let kept = kept(registry, repository).await?;
+        let kept = kept_bytes(registry, repository).await?;
         check_length(registry, repository, &parts.headers, kept)?;
         let upload = begun(registry, repository).await?;
         let appended = registry.blobs.append(repository, &upload.id, Some(0), body.into_data_stream(), kept).await;
@@ -104,7 +104,7 @@ impl Upload<'_> {
 
     async fn take_chunk(&self, parts: &Parts, body: Body) -> Result<u64, OciError> {
         let range = content_range(parts)?;
-        let kept = kept(self.registry, self.repository).await?;
+        let kept = kept_bytes(self.registry, self.repository).await?;
         check_length(self.registry, self.repository, &parts.headers, kept)?;
         let start = range.as_ref().map(|range| range.start);
         let body = body.into_data_stream();
@@ -123,7 +123,7 @@ impl Upload<'_> {
         let Self { registry, repository, id } = self;
         let _hold = registry.blobs.hold_collection().await;
         // Others of the robot's may have been finished meanwhile.
-        if let Err(full) = registry.blobs.check_room(repository, 0, kept(registry, repository).await?) {
+        if let Err(full) = registry.blobs.check_room(repository, 0, kept_bytes(registry, repository).await?) {
             registry.blobs.cancel_upload(repository, id).await?;
             return Err(full.into());
         }
@@ -165,7 +165,7 @@ async fn mount(
 }
 
 /// How many bytes are kept of the robot whose repository this is, if it is one's.
-pub(super) async fn kept(registry: &Registry, repository: &RepositoryName) -> Result<u64, OciError> {
+pub(super) async fn kept_bytes(registry: &Registry, repository: &RepositoryName) -> Result<u64, OciError> {
     let Some((robot, _)) = owner(repository) else { return Ok(0) };
     Ok(registry.store.bytes_of_robot(&robot).await?)
 }

@@ -91,7 +91,7 @@ pub enum BlobError {
     },
     /// More at a time than one robot may bring back.
     #[error(
-        "{kept} bytes of what this robot brought back are on the disk, {max} may be: they go by and by (robots.output_bytes)"
+        "{kept} bytes of what this robot brought back are on the disk, {max} may be: older ones leave it within hours (robots.output_bytes)"
     )]
     TooMuchOfRobot {
         /// The limit.

@@ -97,6 +97,8 @@ pub enum OutputError {
         what: String,
         /// The HTTP status.
         status: u16,
+        /// The registry's code of the error, if it gave one.
+        code: String,
         /// What it said.
         text: String,
     },

@@ -57,11 +57,6 @@ impl OutputSet {
         format!("{}-{}", self.deployment, self.run).parse().ok()
     }
 
-    /// What its files take together, in bytes.
-    pub fn bytes(&self) -> u64 {
-        self.files.iter().fold(0, |sum, file| sum.saturating_add(file.blob.size))
-    }
-
     /// Its manifest, once `config` is its own JSON as a blob.
     pub fn manifest(&self, config: BlobRef) -> ImageManifest {
         let layer = |file: &OutputFile| {

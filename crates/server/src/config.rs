@@ -75,8 +75,8 @@ pub struct Config {
     pub max_blob_bytes: u64,
     /// The most bytes that are unpacked of a package that comes as a directory.
     pub max_upload_bytes: u64,
-    /// The most bytes that are kept of what one robot brings back.
-    pub max_robot_bytes: u64,
+    /// The most bytes that are kept of what one robot brings back; absent: 40 GB, or less on a small disk.
+    pub max_robot_bytes: Option<u64>,
     /// How packages travel to robots.
     pub delivery: DeliverySettings,
     /// What bounds the transfers of packages over HTTP.
@@ -279,7 +279,7 @@ impl Config {
             oidc: OidcSettings::default(),
             max_blob_bytes: 16 << 30,
             max_upload_bytes: 4 << 30,
-            max_robot_bytes: 40 << 30,
+            max_robot_bytes: None,
             delivery: DeliverySettings::default(),
             transfers: TransferLimits::default(),
             robots: ConductLimits::default(),

@@ -64,6 +64,8 @@ const FORGIVING_INTERVAL: Duration = Duration::from_secs(1);
 /// What robots leave free on the disk: this share of it, but no more than so many bytes.
 const SPARE_SHARE: u64 = 20;
 const MAX_SPARE_BYTES: u64 = 2 << 30;
+/// What is kept of one robot is at most this share of the disk, unless somebody wants more.
+const ROBOT_SHARE: u64 = 8;
 /// How often it looks at how busy it is.
 const LOAD_INTERVAL: Duration = Duration::from_secs(1);
 
@@ -143,8 +145,8 @@ impl Server {
         let has_provider = !config.oidc.issuer.is_empty();
         let provider = has_provider.then(|| Provider::new(config.oidc.clone())).transpose()?.map(Arc::new);
         let transfers = Transfers::new(&config.transfers, config.delivery.site_label.clone());
-        let (stop, tasks, http_traffic) =
-            (CancellationToken::new(), TaskTracker::new(), Arc::new(HttpTotals::default()));
+        let (stop, tasks, http_traffic) = (CancellationToken::new(), TaskTracker::new(), Arc::<HttpTotals>::default());
+        let facts = Arc::new(ServerFacts::new(&config, &blobs, listeners(http_address, &broker, tls.is_some())));
         let app = App::new(AppParts {
             feed: Feed::new(clock.now_ms()),
             clock,
@@ -165,7 +167,7 @@ impl Server {
             conduct,
             provider,
             attempts: Arc::default(),
-            facts: Arc::new(ServerFacts::new(&config, listeners(http_address, &broker, tls.is_some()))),
+            facts,
             slow_figures: Arc::default(),
             events: EventFeed::new(),
             key: public_key,
@@ -396,12 +398,14 @@ fn tls_settings(config: &Config) -> TlsSettings {
 }
 
 fn blob_settings(config: &Config) -> BlobSettings {
+    let defaults = BlobSettings::default();
+    let disk_bytes = room(&config.data).map_or(u64::MAX, |(_, total)| total);
     BlobSettings {
         reading: config.blob_read,
         max_blob_bytes: config.max_blob_bytes,
-        max_robot_bytes: config.max_robot_bytes,
-        spare_bytes: room(&config.data).map_or(0, |(_, total)| MAX_SPARE_BYTES.min(total / SPARE_SHARE)),
-        ..BlobSettings::default()
+        max_robot_bytes: config.max_robot_bytes.unwrap_or(defaults.max_robot_bytes.min(disk_bytes / ROBOT_SHARE)),
+        spare_bytes: MAX_SPARE_BYTES.min(disk_bytes / SPARE_SHARE),
+        ..defaults
     }
 }
 

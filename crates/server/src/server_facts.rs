@@ -6,6 +6,7 @@ use std::time::Duration;
 use task_proto::api::{LimitView, ListenerView, ServerRules};
 use tokio::time::Instant;
 
+use crate::blobs::{BlobSettings, Blobs};
 use crate::config::Config;
 use crate::delivery::shown_bytes;
 
@@ -22,13 +23,17 @@ pub struct ServerFacts {
 
 impl ServerFacts {
     /// Of a server with this configuration that listens there.
-    pub fn new(config: &Config, listeners: Vec<ListenerView>) -> Self {
+    pub fn new(config: &Config, blobs: &Blobs, listeners: Vec<ListenerView>) -> Self {
         let rules = config.delivery.rules().views();
-        Self { began: Instant::now(), listeners, rules: ServerRules { rules, limits: limits(config) } }
+        Self {
+            began: Instant::now(),
+            listeners,
+            rules: ServerRules { rules, limits: limits(config, blobs.settings()) },
+        }
     }
 }
 
-fn limits(config: &Config) -> Vec<LimitView> {
+fn limits(config: &Config, blobs: BlobSettings) -> Vec<LimitView> {
     let limit = |key: &str, value: String| LimitView { key: key.to_owned(), value };
     let count = |most: Option<u64>| most.map_or("none".to_owned(), |most| most.to_string());
     let speed = |most: Option<u64>| most.map_or("none".to_owned(), |most| format!("{}/s", shown_bytes(most)));
@@ -39,13 +44,13 @@ fn limits(config: &Config) -> Vec<LimitView> {
         limit("delivery.inline_bytes", shown_bytes(delivery.inline_bytes.into())),
         limit("delivery.part_bytes", shown_bytes(delivery.part_bytes.into())),
         limit("desired_lifetime", seconds(config.desired_lifetime)),
-        limit("max_blob_bytes", shown_bytes(config.max_blob_bytes)),
+        limit("max_blob_bytes", shown_bytes(blobs.max_blob_bytes)),
         limit("max_http_connections", config.max_http_connections.to_string()),
         limit("max_mqtt_connections", config.max_mqtt_connections.to_string()),
         limit("presence_timeout", seconds(config.presence_timeout)),
         limit("robots.bytes_per_s", speed(Some(robots.bytes_per_s))),
         limit("robots.messages_per_s", robots.messages_per_s.to_string()),
-        limit("robots.output_bytes", shown_bytes(config.max_robot_bytes)),
+        limit("robots.output_bytes", shown_bytes(blobs.max_robot_bytes)),
         limit("robots.requests_per_s", robots.requests_per_s.to_string()),
         limit("transfers.max", count(transfers.all.max)),
         limit("transfers.bytes_per_s", speed(transfers.all.bytes_per_s)),

@@ -2,7 +2,7 @@
 
 // Rows drawn beyond the edges, so that the next ones are there when the wheel turns.
 const SPARE_ROWS = 6;
-const narrow = matchMedia('(max-width: 1199px)');
+const narrow = matchMedia('(max-width: 1219px)');
 /** As in style.css: where a row has two forms. Kept, because every row of a long list asks. */
 export let isNarrow = narrow.matches;
 narrow.addEventListener('change', ({ matches }) => (isNarrow = matches));

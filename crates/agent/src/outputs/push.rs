@@ -5,6 +5,7 @@ use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::io::{Read as _, Seek as _, SeekFrom};
 use std::path::Path;
+use std::sync::Arc;
 use std::time::Duration;
 
 use http::header::{CONTENT_RANGE, CONTENT_TYPE, LOCATION, RANGE, RETRY_AFTER};
@@ -14,7 +15,7 @@ use task_proto::desired::BlobRef;
 use task_proto::oci::MANIFEST_TYPE;
 use task_proto::output::OutputSet;
 use task_proto::report::Progress;
-use tokio::sync::watch;
+use tokio::sync::{Semaphore, watch};
 
 use super::{OutputError, OutputOrder};
 use crate::credential::Credential;
@@ -23,6 +24,8 @@ use crate::{durable, foreign_file};
 
 /// Bytes sent in one request: what a bad link loses at most.
 const CHUNK_BYTES: u64 = 1024 * 1024;
+/// The registry's word for a manifest whose files are not all there.
+const FILES_MISSING: &str = "MANIFEST_BLOB_UNKNOWN";
 /// How long one request may take.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(180);
 /// How often an upload that the server has forgotten is begun again in one go.
@@ -36,6 +39,8 @@ pub struct Registry {
     client: reqwest::Client,
     base: Url,
     token: Credential,
+    /// Whose turn it is to push: the server keeps so much of a robot that is not listed yet, and two would share that.
+    turn: Arc<Semaphore>,
 }
 
 /// Uploads under way, by the digest of what they bring.
@@ -44,7 +49,7 @@ type Notes = BTreeMap<Digest, String>;
 impl Registry {
     /// The registry of the server at `base`.
     pub fn new(client: reqwest::Client, base: Url, token: impl Into<Credential>) -> Self {
-        Self { client, base, token: token.into() }
+        Self { client, base, token: token.into(), turn: Arc::new(Semaphore::new(1)) }
     }
 
     fn request(&self, method: Method, path: &str) -> RequestBuilder {
@@ -72,6 +77,8 @@ pub(super) async fn push(
     let (repository, tag) = output.repository().zip(output.tag()).ok_or_else(refused)?;
     let total = output.files.iter().map(|file| file.blob.size).sum();
     progress.send_replace(Progress { done: 0, total });
+    // It is never closed.
+    let _turn = registry.turn.acquire().await;
     let mut push = Push {
         registry,
         base: format!("/v2/{repository}"),
@@ -81,19 +88,32 @@ pub(super) async fn push(
         done: 0,
         progress,
     };
-    for file in &output.files {
-        push.file(&order.directory.join(file.path.as_str()), file.blob).await?;
-        push.done += file.blob.size;
-        progress.send_modify(|progress| progress.done = push.done);
-    }
     let config = serde_json::to_vec(output).map_err(|error| note_error(&order.notes, error.into()))?;
     let config_ref = BlobRef { digest: Digest::of(&config), size: config.len() as u64 };
     push.small(config_ref.digest, config).await?;
     let manifest =
         serde_json::to_vec(&output.manifest(config_ref)).map_err(|error| note_error(&order.notes, error.into()))?;
-    let put = registry.request(Method::PUT, &format!("{}/manifests/{tag}", push.base));
-    registry.send("the output", put.header(CONTENT_TYPE, MANIFEST_TYPE).body(manifest)).await?;
-    Ok(())
+    let list = async || {
+        let put = registry.request(Method::PUT, &format!("/v2/{repository}/manifests/{tag}"));
+        registry.send("the output", put.header(CONTENT_TYPE, MANIFEST_TYPE).body(manifest.clone())).await
+    };
+    // What the server would not list need not travel.
+    match list().await {
+        Err(OutputError::Refused { code, .. }) if code == FILES_MISSING => {}
+        listed => return listed.map(drop),
+    }
+    for file in &output.files {
+        push.file(&order.directory.join(file.path.as_str()), file.blob).await?;
+        push.done += file.blob.size;
+        progress.send_modify(|progress| progress.done = push.done);
+    }
+    match list().await {
+        // It was there when this began, and has been collected meanwhile.
+        Err(OutputError::Refused { status, code, text, .. }) if code == FILES_MISSING => {
+            Err(OutputError::Busy { status, text, retry_after: None })
+        }
+        listed => listed.map(drop),
+    }
 }
 
 struct Push<'a> {
@@ -223,6 +243,7 @@ fn location(response: &Response) -> Result<String, OutputError> {
     path.map(str::to_owned).ok_or_else(|| OutputError::Refused {
         what: "an upload".to_owned(),
         status: response.status().as_u16(),
+        code: String::new(),
         text: "its answer does not say where to go on".to_owned(),
     })
 }
@@ -230,7 +251,13 @@ fn location(response: &Response) -> Result<String, OutputError> {
 async fn refusal(what: &str, mut response: Response) -> OutputError {
     let status = response.status();
     let is_passing = status.is_server_error()
-        || matches!(status, StatusCode::TOO_MANY_REQUESTS | StatusCode::REQUEST_TIMEOUT | StatusCode::UNAUTHORIZED);
+        || matches!(
+            status,
+            StatusCode::TOO_MANY_REQUESTS
+                | StatusCode::REQUEST_TIMEOUT
+                | StatusCode::UNAUTHORIZED
+                | StatusCode::CONFLICT
+        );
     let seconds = response.headers().get(RETRY_AFTER).and_then(|value| value.to_str().ok()?.parse().ok());
     let mut body = Vec::new();
     while let Ok(Some(chunk)) = response.chunk().await {
@@ -240,18 +267,20 @@ async fn refusal(what: &str, mut response: Response) -> OutputError {
         }
     }
     body.truncate(MAX_ERROR_BYTES);
-    let (status, text) = (status.as_u16(), said(&body));
+    let (code, text) = said(&body);
+    let status = status.as_u16();
     if is_passing {
         return OutputError::Busy { status, text, retry_after: seconds.map(Duration::from_secs) };
     }
-    OutputError::Refused { what: what.to_owned(), status, text }
+    OutputError::Refused { what: what.to_owned(), status, code, text }
 }
 
-/// The words of a registry's error body; all of what is none.
-fn said(body: &[u8]) -> String {
-    let parsed: Option<serde_json::Value> = serde_json::from_slice(body).ok();
-    let message = parsed.as_ref().and_then(|errors| errors["errors"][0]["message"].as_str());
-    message.map_or_else(|| String::from_utf8_lossy(body), Cow::Borrowed).replace(char::is_control, " ")
+/// The code and the words of a registry's error body; all of what is none.
+fn said(body: &[u8]) -> (String, String) {
+    let parsed: serde_json::Value = serde_json::from_slice(body).unwrap_or_default();
+    let [code, message] = ["code", "message"].map(|key| parsed["errors"][0][key].as_str());
+    let text = message.map_or_else(|| String::from_utf8_lossy(body), Cow::Borrowed).replace(char::is_control, " ");
+    (code.unwrap_or_default().to_owned(), text)
 }
 
 #[cfg(test)]
@@ -261,10 +290,10 @@ mod tests {
     #[test]
     fn a_refusal_is_told_in_the_servers_words() {
         let error = br#"{"errors":[{"code":"SIZE_INVALID","message":"the output\nhas 9 bytes","detail":{}}]}"#;
-        assert_eq!(said(error), "the output has 9 bytes");
-        for other in ["<h1>Forbidden</h1>", r#"{"errors":[]}"#, r#"{"error":{"code":"x"}}"#] {
-            assert_eq!(said(other.as_bytes()), other);
+        assert_eq!(said(error), ("SIZE_INVALID".to_owned(), "the output has 9 bytes".to_owned()));
+        for other in ["<h1>Forbidden</h1>", r#"{"errors":[]}"#, r#"{"error":{"code":"x"}}"#, "[]"] {
+            assert_eq!(said(other.as_bytes()), (String::new(), other.to_owned()));
         }
-        assert_eq!(said(b"\xff\x1b[2J"), "\u{fffd} [2J");
+        assert_eq!(said(b"\xff\x1b[2J").1, "\u{fffd} [2J");
     }
 }

@@ -14,6 +14,7 @@ mod hostile;
 mod load;
 mod logs;
 mod orders;
+mod outputs;
 mod proxy;
 mod questions;
 mod registry;

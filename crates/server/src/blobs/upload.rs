@@ -182,7 +182,9 @@ impl Uploads {
         }
         // Where the disk can't be asked, it is full when it says so.
         match room(&self.directory) {
-            Some((free, _)) if free < self.settings.spare_bytes.saturating_add(bytes) => Err(BlobError::DiskFull),
+            Some((free, _)) if bytes > 0 && free < self.settings.spare_bytes.saturating_add(bytes) => {
+                Err(BlobError::DiskFull)
+            }
             _ => Ok(()),
         }
     }
@@ -317,9 +319,13 @@ impl Blobs {
             // Someone writes to it this moment: not idle, whatever the file's time says.
             let Ok(mut upload) = active.upload.try_lock_owned() else { continue };
             let is_dropped = on_disk(move || {
+                // Whoever ended it hung up before it was forgotten.
+                if upload.ended {
+                    return Ok(true);
+                }
                 let metadata = upload.file.metadata().map_err(BlobError::disk("look at", &upload.path))?;
                 let modified_ms = modified_ms(&metadata).map_err(BlobError::disk("look at", &upload.path))?;
-                if upload.ended || modified_ms >= before_ms { Ok(false) } else { upload.cancel().map(|()| true) }
+                if modified_ms >= before_ms { Ok(false) } else { upload.cancel().map(|()| true) }
             });
             if is_dropped.await? {
                 self.shared.uploads.active().remove(&id);

@@ -351,8 +351,9 @@ pub(super) const SETTINGS: &[Setting] = &[
     Setting {
         name: "robots-output-bytes",
         value_name: "SIZE",
-        help: "The most that is kept of what one robot brings back: beyond it the oldest goes [default: 40 GB]",
-        set: |config, text| size_within(text, 1 << 20, 1 << 50).map(|bytes| config.max_robot_bytes = bytes),
+        help: "The most that is kept of what one robot brings back: beyond it the oldest goes [default: 40 GB, an eighth of the disk \
+               at most]",
+        set: |config, text| size_within(text, 64 << 20, 1 << 50).map(|bytes| config.max_robot_bytes = Some(bytes)),
     },
     Setting {
         name: "robots-patience",

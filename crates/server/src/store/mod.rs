@@ -42,7 +42,7 @@ pub use deployments::{DeploymentPage, NewDeployment};
 pub use earlier::{EarlierPackage, Unsuccessful};
 use first_use::FirstUses;
 pub use orders::PastOrder;
-pub use outputs::NewOutput;
+pub use outputs::{NewOutput, bytes_taken};
 pub use package_use::{DeletePackage, PackageUsers};
 pub use packages::{NewManifest, PutManifest, Reference, StoredManifest};
 pub use publishers::SignedDocument;

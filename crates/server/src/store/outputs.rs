@@ -1,5 +1,7 @@
 //! Outputs of runs: which files came back from which robot. The bytes lie in the blob store, under the robot's repository.
 
+use std::collections::BTreeMap;
+
 use futures_util::TryStreamExt as _;
 use sqlx::Row as _;
 use task_proto::api::OutputView;
@@ -20,6 +22,12 @@ const LEAST_BYTES: u64 = 64 * 1024;
 const MAX_LISTED: usize = 1000;
 /// The most bytes of JSON listed: an output of many files with long names takes a lot of room.
 const MAX_LISTED_BYTES: usize = 16 * 1024 * 1024;
+
+/// What one takes on the disk with its manifest and config, small files counted as [`LEAST_BYTES`] each, in bytes.
+pub fn bytes_taken(output: &OutputSet) -> u64 {
+    let blobs: BTreeMap<Digest, u64> = output.files.iter().map(|file| (file.blob.digest, file.blob.size)).collect();
+    blobs.values().fold(2 * LEAST_BYTES, |sum, size| sum.saturating_add((*size).max(LEAST_BYTES)))
+}
 
 /// An output to be stored.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -87,52 +95,103 @@ impl Store {
 
     /// Bytes that are kept of what a robot has brought, small files counted as [`LEAST_BYTES`] each.
     pub async fn bytes_of_robot(&self, robot: &RobotId) -> Result<u64, StoreError> {
-        let sum: i64 =
-            sqlx::query_scalar("SELECT CAST(COALESCE(SUM(bytes), 0) AS BIGINT) FROM robot_blobs WHERE robot_id = $1")
-                .bind(robot.as_str())
-                .fetch_one(&self.reads)
-                .await?;
-        Ok(rows::number(sum))
+        let bytes: Option<i64> = sqlx::query_scalar("SELECT bytes FROM robot_bytes WHERE robot_id = $1")
+            .bind(robot.as_str())
+            .fetch_optional(&self.reads)
+            .await?;
+        Ok(rows::number(bytes.unwrap_or(0)))
     }
 
-    /// Blobs of manifests that some robot had and has no more. Others may need them.
+    /// Blobs of manifests that robots had and have no more, and that nobody is known to be about to list. Others' manifests
+    /// may need them.
     pub async fn blobs_dropped_by_robots(&self) -> Result<Vec<Digest>, StoreError> {
-        let texts: Vec<String> = sqlx::query_scalar("SELECT DISTINCT digest FROM robot_blobs WHERE dropped = 1")
-            .fetch_all(&self.reads)
-            .await?;
+        let texts: Vec<String> = sqlx::query_scalar(
+            "SELECT DISTINCT digest FROM robot_blobs AS dropped WHERE dropped.dropped = 1
+             AND NOT EXISTS (SELECT 1 FROM robot_blobs AS b WHERE b.digest = dropped.digest AND b.dropped = 0)
+             AND NOT EXISTS (SELECT 1 FROM repository_blobs AS r
+                             WHERE r.digest = dropped.digest AND r.repository NOT LIKE 'outputs/%')",
+        )
+        .fetch_all(&self.reads)
+        .await?;
         texts.iter().map(|text| rows::id("robot_blobs.digest", text)).collect()
     }
 }
 
 impl Write {
-    /// Notes that a manifest of these parts is no more, if the repository is a robot's.
+    /// Notes that a manifest is about to be no more, if the repository is a robot's.
     pub(super) async fn drop_of_robot(
         &mut self,
         repository: &RepositoryName,
         manifest: &Digest,
-        parts: &[String],
     ) -> Result<(), StoreError> {
         let Some((robot, _)) = owner(repository) else { return Ok(()) };
-        for digest in parts.iter().chain([&manifest.to_string()]) {
-            sqlx::query("UPDATE robot_blobs SET dropped = 1 WHERE robot_id = $1 AND digest = $2")
-                .bind(robot.as_str())
-                .bind(digest)
-                .execute(self.connection())
+        sqlx::query(
+            "UPDATE robot_blobs SET dropped = 1 WHERE robot_id = $1 AND (digest = $2 OR digest IN
+                 (SELECT digest FROM manifest_parts WHERE repository = $3 AND manifest = $2))",
+        )
+        .bind(robot.as_str())
+        .bind(manifest.to_string())
+        .bind(repository.as_str())
+        .execute(self.connection())
+        .await?;
+        Ok(())
+    }
+
+    /// As [`Store::count_blob`]. What is counted once stays so until the blob is collected: whether it was already.
+    pub(super) async fn count_blob(&mut self, repository: &RepositoryName, blob: &BlobRef) -> Result<bool, StoreError> {
+        let Some((robot, _)) = owner(repository) else { return Ok(false) };
+        let known = sqlx::query("UPDATE robot_blobs SET dropped = 0 WHERE robot_id = $1 AND digest = $2")
+            .bind(robot.as_str())
+            .bind(blob.digest.to_string())
+            .execute(self.connection())
+            .await?;
+        if known.rows_affected() > 0 {
+            return Ok(true);
+        }
+        let bytes = rows::stored(blob.size.max(LEAST_BYTES));
+        sqlx::query("INSERT INTO robot_blobs (robot_id, digest, bytes) VALUES ($1, $2, $3)")
+            .bind(robot.as_str())
+            .bind(blob.digest.to_string())
+            .bind(bytes)
+            .execute(self.connection())
+            .await?;
+        self.add_to_robot(robot.as_str(), bytes).await?;
+        Ok(false)
+    }
+
+    /// Counts that a repository of a robot's got a blob that another of its has.
+    pub(super) async fn count_link(&mut self, repository: &RepositoryName, blob: &BlobRef) -> Result<(), StoreError> {
+        let Some((robot, _)) = owner(repository) else { return Ok(()) };
+        let bytes = rows::stored(LEAST_BYTES);
+        sqlx::query("UPDATE robot_blobs SET bytes = bytes + $1 WHERE robot_id = $2 AND digest = $3")
+            .bind(bytes)
+            .bind(robot.as_str())
+            .bind(blob.digest.to_string())
+            .execute(self.connection())
+            .await?;
+        self.add_to_robot(robot.as_str(), bytes).await
+    }
+
+    /// Counts a blob no more, for it is collected.
+    pub(super) async fn uncount_blob(&mut self, digest: &Digest) -> Result<(), StoreError> {
+        let counted: Vec<(String, i64)> =
+            sqlx::query_as("DELETE FROM robot_blobs WHERE digest = $1 RETURNING robot_id, bytes")
+                .bind(digest.to_string())
+                .fetch_all(self.connection())
                 .await?;
+        for (robot, bytes) in counted {
+            self.add_to_robot(&robot, -bytes).await?;
         }
         Ok(())
     }
 
-    /// As [`Store::count_blob`]. What is counted once stays so until the blob is collected.
-    pub(super) async fn count_blob(&mut self, repository: &RepositoryName, blob: &BlobRef) -> Result<(), StoreError> {
-        let Some((robot, _)) = owner(repository) else { return Ok(()) };
+    async fn add_to_robot(&mut self, robot: &str, bytes: i64) -> Result<(), StoreError> {
         sqlx::query(
-            "INSERT INTO robot_blobs (robot_id, digest, bytes) VALUES ($1, $2, $3)
-             ON CONFLICT (robot_id, digest) DO UPDATE SET dropped = 0",
+            "INSERT INTO robot_bytes (robot_id, bytes) VALUES ($1, $2)
+             ON CONFLICT (robot_id) DO UPDATE SET bytes = robot_bytes.bytes + excluded.bytes",
         )
-        .bind(robot.as_str())
-        .bind(blob.digest.to_string())
-        .bind(rows::stored(blob.size.max(LEAST_BYTES)))
+        .bind(robot)
+        .bind(bytes)
         .execute(self.connection())
         .await?;
         Ok(())
@@ -151,7 +210,8 @@ impl Write {
         sqlx::query(
             "INSERT INTO outputs (repository, manifest, robot_id, task, tag, output, pushed_at_ms, bytes)
              VALUES ($1, $2, $3, $4, $5, $6, $7, $8)
-             ON CONFLICT (repository, manifest) DO UPDATE SET pushed_at_ms = excluded.pushed_at_ms",
+             ON CONFLICT (repository, manifest)
+             DO UPDATE SET pushed_at_ms = excluded.pushed_at_ms, bytes = excluded.bytes",
         )
         .bind(repository.as_str())
         .bind(manifest.to_string())
@@ -160,7 +220,7 @@ impl Write {
         .bind(&tag)
         .bind(rows::json(output))
         .bind(rows::stored(now_ms))
-        .bind(rows::stored(output.bytes()))
+        .bind(rows::stored(bytes_taken(output)))
         .execute(self.connection())
         .await?;
         let others = sqlx::query(
@@ -173,17 +233,20 @@ impl Write {
         .bind(manifest.to_string())
         .fetch_all(self.connection())
         .await?;
-        let (mut surplus, mut kept, mut kept_here, mut kept_bytes) = (Vec::new(), 1, 1, output.bytes());
+        let (mut surplus, mut kept, mut kept_here, mut kept_bytes) = (Vec::new(), 1, 1, bytes_taken(output));
         for row in &others {
             let is_here = row.try_get::<&str, _>("repository")? == repository.as_str();
             let is_replaced = is_here && row.try_get::<&str, _>("tag")? == tag;
-            let bytes = kept_bytes.saturating_add(rows::number(row.try_get("bytes")?));
-            if is_replaced || kept >= KEPT_OF_ROBOT || (is_here && kept_here >= KEPT) || bytes > *max_bytes {
+            let is_outlived = is_replaced || (is_here && kept_here >= KEPT);
+            if !is_outlived {
+                kept += 1;
+                kept_bytes = kept_bytes.saturating_add(rows::number(row.try_get("bytes")?));
+            }
+            // Where one has no room, no older one has.
+            if is_outlived || kept > KEPT_OF_ROBOT || kept_bytes > *max_bytes {
                 let repository = rows::id("outputs.repository", row.try_get("repository")?)?;
                 surplus.push((repository, rows::id("outputs.manifest", row.try_get("manifest")?)?));
             } else {
-                kept += 1;
-                kept_bytes = bytes;
                 kept_here += usize::from(is_here);
             }
         }

@@ -210,12 +210,16 @@ impl Store {
     /// Makes a blob part of a repository.
     pub async fn link_blob(&self, repository: &RepositoryName, blob: &BlobRef) -> Result<(), StoreError> {
         let mut write = self.begin().await?;
-        sqlx::query("INSERT INTO repository_blobs (repository, digest) VALUES ($1, $2) ON CONFLICT DO NOTHING")
-            .bind(repository.as_str())
-            .bind(blob.digest.to_string())
-            .execute(write.connection())
-            .await?;
-        write.count_blob(repository, blob).await?;
+        let is_known = write.count_blob(repository, blob).await?;
+        let linked =
+            sqlx::query("INSERT INTO repository_blobs (repository, digest) VALUES ($1, $2) ON CONFLICT DO NOTHING")
+                .bind(repository.as_str())
+                .bind(blob.digest.to_string())
+                .execute(write.connection())
+                .await?;
+        if is_known && linked.rows_affected() > 0 {
+            write.count_link(repository, blob).await?;
+        }
         write.commit().await
     }
 
@@ -296,9 +300,9 @@ impl Store {
         let unneeded: Vec<Digest> = candidates.into_iter().filter(|digest| !needed.contains(digest)).collect();
         let mut write = self.begin().await?;
         for digest in &unneeded {
-            for sql in ["DELETE FROM repository_blobs WHERE digest = $1", "DELETE FROM robot_blobs WHERE digest = $1"] {
-                sqlx::query(sql).bind(digest.to_string()).execute(write.connection()).await?;
-            }
+            let query = sqlx::query("DELETE FROM repository_blobs WHERE digest = $1").bind(digest.to_string());
+            query.execute(write.connection()).await?;
+            write.uncount_blob(digest).await?;
         }
         write.commit().await?;
         Ok(unneeded)
@@ -311,13 +315,13 @@ impl Write {
         repository: &RepositoryName,
         digest: &Digest,
     ) -> Result<Option<Vec<Digest>>, StoreError> {
+        self.drop_of_robot(repository, digest).await?;
         let parts: Vec<String> =
             sqlx::query_scalar("DELETE FROM manifest_parts WHERE repository = $1 AND manifest = $2 RETURNING digest")
                 .bind(repository.as_str())
                 .bind(digest.to_string())
                 .fetch_all(self.connection())
                 .await?;
-        self.drop_of_robot(repository, digest, &parts).await?;
         self.delete_document(repository, digest).await?;
         let mut deleted = 0;
         for sql in [

@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use task_proto::api::OutputList;
 use task_proto::desired::BlobRef;
 use task_proto::oci::MANIFEST_TYPE;
-use task_proto::output::{OutputFile, OutputSet};
+use task_proto::output::{OUTPUT_TYPE, OutputFile, OutputSet};
 use task_proto::{Digest, RobotId};
 use taskd::blobs::BlobSettings;
 use taskd::collector;
@@ -150,6 +150,12 @@ async fn a_robot_pushes_nothing_else_and_nowhere_else() {
     let put =
         own.ask(Method::PUT, "manifests/latest").header("content-type", MANIFEST_TYPE).json(&set.manifest(config));
     assert_eq!(put.send().await.expect("an answer").status(), StatusCode::FORBIDDEN, "another tag than the run's");
+    // Who says no type of its own has its config's.
+    let mut disguised = serde_json::to_value(set.manifest(config)).expect("json");
+    disguised.as_object_mut().expect("an object").remove("artifactType");
+    disguised["config"]["mediaType"] = json!(OUTPUT_TYPE);
+    let put = own.ask(Method::PUT, "manifests/latest").header("content-type", MANIFEST_TYPE).json(&disguised);
+    assert_eq!(put.send().await.expect("an answer").status(), StatusCode::FORBIDDEN, "what looks like one");
     let lie = OutputSet { robot_id: other.id.clone(), ..output(&robot.id, 1, vec![file("a", map)]) };
     assert_eq!(own.output(&lie).await, StatusCode::BAD_REQUEST, "another robot's");
     let larger = BlobRef { size: 2, ..map };
@@ -232,6 +238,7 @@ async fn what_one_robot_brings_is_bounded_in_bytes(database: TestDatabase) {
 async fn beyond_so_many_bytes_the_oldest_output_goes_and_soon_is_off_the_disk(database: TestDatabase) {
     const HOUR_MS: u64 = 3_600_000;
     let data = tempfile::tempdir().expect("a directory");
+    // A run takes twice 400 KB and twice 64 KB.
     let settings = BlobSettings { max_robot_bytes: 2048 * 1024, ..BlobSettings::default() };
     let registry = TestRegistry::start_on(database.store.clone(), data, settings, Some(operator())).await;
     let robot = RobotId::random();
@@ -242,15 +249,18 @@ async fn beyond_so_many_bytes_the_oldest_output_goes_and_soon_is_off_the_disk(da
     let mut maps = Vec::new();
     for run in 1..=3 {
         registry.registry.clock.advance_ms(1000);
-        let map = push.blob(&vec![run; 800 * 1024]).await;
-        statuses.push(push.output(&output(&robot, run.into(), vec![file("map.pgm", map)])).await.as_u16());
-        maps.push(map);
+        let map = push.blob(&vec![run; 400 * 1024]).await;
+        let picture = push.blob(&vec![10 * run; 400 * 1024]).await;
+        let files = vec![file("map.pgm", map), file("map.png", picture)];
+        statuses.push(push.output(&output(&robot, run.into(), files)).await.as_u16());
+        maps.extend([map, picture]);
     }
     assert_eq!(statuses, [201; 3]);
     let tags: Value = registry.get(&format!("{repository}/tags/list")).await.json().await.expect("JSON");
-    assert_eq!(tags["tags"], json!(["d00000000000000b2-2", "d00000000000000b2-3"]), "three have 2.4 MB");
+    assert_eq!(tags["tags"], json!(["d00000000000000b2-2", "d00000000000000b2-3"]), "three are too many");
 
-    // Far sooner than what somebody may be about to push.
+    // Far sooner than what somebody may be about to list.
+    registry.push_blob("talker", &vec![10; 400 * 1024]).await;
     let collect = async |now_ms: u64| {
         let Registry { store, blobs, .. } = &registry.registry;
         collector::collect(store, blobs, now_ms, Duration::from_hours(24)).await.expect("collected").blobs
@@ -262,11 +272,12 @@ async fn beyond_so_many_bytes_the_oldest_output_goes_and_soon_is_off_the_disk(da
     for map in &maps {
         there.push(registry.status(Method::HEAD, &format!("{repository}/blobs/{}", map.digest)).await.as_u16());
     }
-    assert_eq!(there, [404, 200, 200]);
+    assert_eq!(there, [404, 200, 200, 200, 200, 200], "the first picture is part of a package that is being pushed");
 
+    assert_eq!(collect(now_ms + 25 * HOUR_MS).await, 1, "but nobody listed it");
     let mut files = Vec::new();
     for (byte, path) in [(4, "a"), (5, "b"), (6, "c")] {
-        files.push(file(path, push.blob(&vec![byte; 690 * 1024]).await));
+        files.push(file(path, push.blob(&vec![byte; 660 * 1024]).await));
     }
     assert_eq!(push.output(&output(&robot, 4, files)).await, StatusCode::PAYLOAD_TOO_LARGE, "not even alone");
 }
@@ -276,21 +287,32 @@ on_both_databases!(
     beyond_so_many_bytes_the_oldest_output_goes_and_soon_is_off_the_disk,
 );
 
-/// Manifests are on the disk as well, those that were refused too.
+/// They are on the disk as well.
 #[tokio::test]
-async fn a_robots_manifests_count() {
-    let settings = BlobSettings { max_robot_bytes: 128 * 1024, ..BlobSettings::default() };
+async fn a_robots_manifests_and_links_count() {
+    let settings = BlobSettings { max_robot_bytes: 320 * 1024, ..BlobSettings::default() };
     let registry = TestRegistry::start_with(settings, Some(operator())).await;
-    let repository = "outputs/r00000000000000a1/mapping";
-    let nowhere = BlobRef { digest: Digest::of(b"never pushed"), size: 1 };
+    let robot: RobotId = "r00000000000000a1".parse().expect("valid");
+    let kept = async || registry.registry.store.bytes_of_robot(&robot).await.expect("a sum") / 1024;
+    let repository = format!("outputs/{robot}/mapping");
+    let blob = registry.push_blob(&repository, b"{}").await;
+    assert_eq!(kept().await, 64);
     let mut statuses = Vec::new();
-    for number in 0..6 {
-        let mut manifest = serde_json::to_value(image(nowhere, nowhere)).expect("json");
+    for number in 0..4 {
+        let mut manifest = image(blob, blob);
         manifest["annotations"] = json!({ "number": number.to_string() });
-        let path = format!("/v2/{repository}/manifests/{number}");
+        let path = format!("/v2/{repository}/manifests/same");
         statuses.push(registry.put_manifest(&path, MANIFEST_TYPE, &manifest).await.status().as_u16());
     }
-    assert_eq!(statuses, [400, 400, 400, 400, 400, 429]);
+    assert_eq!((statuses, kept().await), (vec![201; 4], 5 * 64));
+    // One blob in many repositories is one on the disk, and many rows.
+    let mut statuses = Vec::new();
+    for number in 0..7 {
+        let path = format!("/v2/outputs/{robot}/task{number}/blobs/uploads/?digest={}", blob.digest);
+        let answer = registry.ask(Method::POST, &path).body("{}").send().await.expect("an answer");
+        statuses.push(answer.status().as_u16());
+    }
+    assert_eq!((statuses, kept().await), (vec![201, 201, 201, 201, 201, 429, 429], 10 * 64));
 }
 
 /// What a robot sends in many requests at once is not more than what it sends in one.

@@ -166,7 +166,7 @@ impl From<BlobError> for OciError {
                 Self { retry_after_s: Some(COLLECTION_S), ..error }
             }
             BlobError::WrongDigest { .. } => Self::digest_invalid(message),
-            BlobError::Interrupted(_) => Self::upload_invalid(message),
+            BlobError::Interrupted(_) => Self::new(StatusCode::REQUEST_TIMEOUT, "BLOB_UPLOAD_INVALID", message),
             BlobError::DiskFull => Self::new(StatusCode::INSUFFICIENT_STORAGE, "DENIED", message),
             BlobError::Disk { .. } => Self::internal(&error),
         }

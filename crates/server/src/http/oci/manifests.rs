@@ -21,7 +21,7 @@ use super::{Answer, OciError, Registry, empty, signed};
 use crate::blobs::Blob;
 use crate::changes::Change;
 use crate::person::Person;
-use crate::store::{Act, Deed, NewManifest, NewOutput, PutManifest, Reference, StoredManifest};
+use crate::store::{Act, Deed, NewManifest, NewOutput, PutManifest, Reference, StoredManifest, bytes_taken};
 
 /// The largest manifest; the specification asks for at least this.
 const MAX_MANIFEST_BYTES: usize = 4 * 1024 * 1024;
@@ -105,6 +105,9 @@ pub(super) async fn push(
         None => None,
     };
     let document = signed::check(registry, repository, &parsed, &tags).await?;
+    if only.is_some() && output.is_none() {
+        return Err(OciError::denied("a robot may only push outputs"));
+    }
     if only.is_some()
         && output.as_ref().is_some_and(|output| tags.iter().any(|tag| output.set.tag().as_ref() != Some(tag)))
     {
@@ -112,9 +115,10 @@ pub(super) async fn push(
     }
     let now_ms = registry.clock.now_ms();
     registry.blobs.check_room(repository, 0, kept_bytes(registry, repository).await?)?;
+    // First, for whoever hangs up in the middle has it counted as well.
+    registry.store.count_blob(repository, &manifest).await?;
     registry.blobs.put(bytes).await?;
     registry.blobs.touch(digest, now_ms).await?;
-    registry.store.count_blob(repository, &manifest).await?;
     let new = NewManifest {
         manifest: StoredManifest { digest, size: manifest.size, media_type: parsed.media_type },
         artifact_type: parsed.artifact_type,
@@ -221,10 +225,10 @@ async fn check_output(
             format!("the manifest is not that of the output in its config, or it has more than {MAX_FILES} files");
         return Err(OciError::manifest_invalid(message));
     }
-    let bytes = output.bytes();
+    let bytes = bytes_taken(&output);
     if bytes > max_bytes {
         let message =
-            format!("the output has {bytes} bytes, and {max_bytes} are kept of one robot (robots.output_bytes)");
+            format!("the output takes {bytes} bytes, and {max_bytes} are kept of one robot (robots.output_bytes)");
         return Err(OciError::too_large(message));
     }
     for file in &output.files {

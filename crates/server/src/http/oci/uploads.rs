@@ -118,19 +118,23 @@ impl Upload<'_> {
         }
     }
 
-    /// Makes the upload a blob of the repository, in one go as the collector sees it.
+    /// Makes the upload a blob of the repository, in one go as the collector sees it, also if whoever asked has hung up.
     pub(super) async fn complete(&self, digest: Digest) -> Answer {
-        let Self { registry, repository, id } = self;
-        let _hold = registry.blobs.hold_collection().await;
-        // Others of the robot's may have been finished meanwhile.
-        if let Err(full) = registry.blobs.check_room(repository, 0, kept_bytes(registry, repository).await?) {
-            registry.blobs.cancel_upload(repository, id).await?;
-            return Err(full.into());
-        }
-        let size = registry.blobs.finish_upload(repository, id, digest).await?;
-        registry.blobs.touch(digest, registry.clock.now_ms()).await?;
-        registry.store.link_blob(repository, &BlobRef { digest, size }).await?;
-        created(repository, &digest)
+        let (registry, repository, id) = (self.registry.clone(), self.repository.clone(), self.id.clone());
+        let completed = tokio::spawn(async move {
+            let _hold = registry.blobs.hold_collection().await;
+            // Others of the robot's may have been finished meanwhile.
+            if let Err(full) = registry.blobs.check_room(&repository, 0, kept_bytes(&registry, &repository).await?) {
+                registry.blobs.cancel_upload(&repository, &id).await?;
+                return Err(full.into());
+            }
+            let size = registry.blobs.finish_upload(&repository, &id, digest).await?;
+            registry.blobs.touch(digest, registry.clock.now_ms()).await?;
+            registry.store.link_blob(&repository, &BlobRef { digest, size }).await?;
+            Ok::<_, OciError>(())
+        });
+        completed.await.map_err(|error| OciError::internal(&error))??;
+        created(self.repository, &digest)
     }
 
     fn accepted(&self, status: StatusCode, offset: u64) -> Answer {

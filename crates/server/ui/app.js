@@ -312,7 +312,7 @@ function streamState(now) {
 
 addEventListener('keydown', (event) => {
   if (page.state !== 'in' || event.ctrlKey || event.metaKey || event.altKey || dialogTakes(event)) return;
-  const isTyping = event.target.matches('input, textarea, select, [contenteditable]');
+  const isTyping = event.target.matches('input:not([type=checkbox]), textarea, select, [contenteditable]');
   const search = document.querySelector('input[type=search]');
   if (event.key === '/' && !isTyping && search) {
     event.preventDefault();

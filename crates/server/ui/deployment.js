@@ -259,7 +259,7 @@ export class DeploymentView {
     const isOpen = robot === this.#place.robot;
     const toggle = () => this.#look({ robot: isOpen ? '' : robot });
     return html`
-      <div class="row ${isOpen ? 'is-open' : ''}" role="row" tabindex=${this.#cursor.tabindex(robot, index)} aria-rowindex=${index + 2} data-key=${robot} data-part=${name} @focus=${() => (this.#cursor.current = robot)}>
+      <div class="row ${isOpen ? 'is-open' : ''}" role="row" tabindex=${this.#cursor.tabindex(robot, index)} aria-rowindex=${index + 2} data-key=${robot} data-part=${name} @focusin=${() => (this.#cursor.current = robot)}>
         <span class="cell name" role="gridcell"><a href=${at(['robots', name])}>${name}</a></span>
         <span class="cell state" role="gridcell">${robotState(part)}</span>
         <span class="cell phase-cell" role="gridcell">${phaseSign(part.phase)}</span>

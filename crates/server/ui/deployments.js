@@ -102,7 +102,7 @@ export class DeploymentsView {
   #row(deployment, index, fleet, now) {
     const { id, package: { name, version }, selector, counts, created_at_ms: created } = deployment;
     return html`
-      <div class="row" role="row" tabindex=${this.#cursor.tabindex(id, index)} aria-rowindex=${index + 2} data-key=${id} data-deployment=${id} @focus=${() => (this.#cursor.current = id)}>
+      <div class="row" role="row" tabindex=${this.#cursor.tabindex(id, index)} aria-rowindex=${index + 2} data-key=${id} data-deployment=${id} @focusin=${() => (this.#cursor.current = id)}>
         <span class="cell state" role="gridcell">${deploymentState(deployment)}</span>
         <span class="cell package" role="gridcell"><a href=${at(['deployments', id])} title=${id}>${name}<span class="quiet">@${version}</span></a></span>
         <span class="cell selector quiet" role="gridcell" title=${selector ?? nothing}>${wordsOf(deployment, fleet)}</span>

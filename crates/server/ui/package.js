@@ -218,7 +218,7 @@ export class PackageView {
     const isDirectory = kind === 'directory';
     const isUnfolded = tree.isUnfolded(path);
     return html`
-      <div class="row depth-${Math.min(depth, 12)}" role="row" tabindex=${this.#cursor.tabindex(path, index)} aria-level=${depth + 1} aria-expanded=${isDirectory ? isUnfolded : nothing} aria-rowindex=${index + 1} data-key=${path} @focus=${() => (this.#cursor.current = path)}>
+      <div class="row depth-${Math.min(depth, 12)}" role="row" tabindex=${this.#cursor.tabindex(path, index)} aria-level=${depth + 1} aria-expanded=${isDirectory ? isUnfolded : nothing} aria-rowindex=${index + 1} data-key=${path} @focusin=${() => (this.#cursor.current = path)}>
         <span class="cell file code" role="gridcell" title=${path}>${isDirectory
           ? html`<button class="plain" tabindex="-1" @click=${() => this.#toggle(path)}><span class="fold-sign" aria-hidden="true">${isUnfolded ? '▾' : '▸'}</span>${name}/</button>`
           : html`<span class="fold-sign"></span>${name}${target ? html` <span class="quiet">→ ${target}</span>` : nothing}`}</span>
@@ -256,7 +256,7 @@ export class PackageView {
   #changed({ path, kind, sign, from, to, by }, index) {
     const hasMode = from && to && from.mode !== to.mode;
     return html`
-      <div class="row ${kind}" role="row" tabindex=${this.#cursor.tabindex(path, index)} aria-rowindex=${index + 1} data-key=${path} @focus=${() => (this.#cursor.current = path)}>
+      <div class="row ${kind}" role="row" tabindex=${this.#cursor.tabindex(path, index)} aria-rowindex=${index + 1} data-key=${path} @focusin=${() => (this.#cursor.current = path)}>
         <span class="cell what" role="gridcell"><span aria-hidden="true">${sign}</span> ${kind}</span>
         <span class="cell file code" role="gridcell" title=${path}>${path}</span>
         <span class="cell mode code quiet" role="gridcell">${hasMode ? `${modeWords(from.mode)} → ${modeWords(to.mode)}` : ''}</span>

@@ -159,7 +159,7 @@ export class PackagesView {
     const count = this.uses.of(one.package).length;
     const isUnfolded = this.#search.unfolded.has(name);
     return html`
-      <div class="row ${isOlder ? 'is-older' : ''}" role="row" tabindex=${this.#cursor.tabindex(key, index)} aria-rowindex=${index + 2} data-key=${key} data-package=${`${name}@${version}`} @focus=${() => (this.#cursor.current = key)}>
+      <div class="row ${isOlder ? 'is-older' : ''}" role="row" tabindex=${this.#cursor.tabindex(key, index)} aria-rowindex=${index + 2} data-key=${key} data-package=${`${name}@${version}`} @focusin=${() => (this.#cursor.current = key)}>
         <span class="cell name" role="gridcell"><a href=${at(['packages', name], { version: word })}>${isOlder ? html`<span class="unseen">${name}</span>` : name}</a></span>
         <span class="cell version" role="gridcell"><a href=${at(['packages', name], { version: word })}>${version}</a>
           ${older ? html`<button class="plain quiet fold" aria-expanded=${isUnfolded} @click=${() => this.#toggle(name)}><span aria-hidden="true">${isUnfolded ? '▾' : '▸'}</span> ${number(older)} older</button>` : nothing}</span>

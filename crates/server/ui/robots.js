@@ -151,7 +151,7 @@ export class RobotsView {
     const tabindex = this.#cursor.tabindex(robot.id, index);
     const wrong = isNarrow ? troubles(robot) : [];
     return guard([robot, index, isChosen, tabindex, isNarrow, this.#columns, operations.length, Math.floor(now / 1000)], () => html`
-      <div class="row" role="row" tabindex=${tabindex} aria-rowindex=${index + 2} aria-selected=${isChosen} data-key=${robot.id} data-robot=${robot.id} @focus=${() => (this.#cursor.current = robot.id)}>
+      <div class="row" role="row" tabindex=${tabindex} aria-rowindex=${index + 2} aria-selected=${isChosen} data-key=${robot.id} data-robot=${robot.id} @focusin=${() => (this.#cursor.current = robot.id)}>
         <span class="choose" role="gridcell"><input type="checkbox" aria-label=${`Select ${robot.name}`} .checked=${isChosen} @click=${(event) => change(() => selection.toggle(robot.id, fleet.shown, event.shiftKey))}></span>
         ${wrong.length ? html`<span class="cell trouble" role="gridcell">${wrong}</span>` : nothing}
         ${this.#columns.map(({ id, look, cell }) => html`<span class="cell ${id} ${look ?? ''}" role="gridcell">${cell(robot, now)}</span>`)}

@@ -136,6 +136,37 @@ test('a key right after a question was left is not lost', async (t) => {
   assertQuiet(page);
 });
 
+test('robots are chosen one by one, as a range, and all that match', async (t) => {
+  const server = await Server.start(t);
+  for (const name of ['atlas', 'borea', 'corvus', 'delphin', 'echo']) await Puppet.enroll(server, name);
+  const page = await open(t, server);
+  await until(page, () => document.querySelectorAll('[data-robot]').length === 5);
+  const chosen = async (...names) => {
+    await page.getByText(`${names.length} selected`).waitFor();
+    assert.deepEqual(await page.locator('[data-robot][aria-selected=true] .name').allInnerTexts(), names);
+  };
+  const box = (name) => page.getByRole('checkbox', { name: `Select ${name}`, exact: true });
+  await box('borea').click();
+  await box('delphin').click({ modifiers: ['Shift'] });
+  await chosen('borea', 'corvus', 'delphin');
+  await box('corvus').click();
+  await chosen('borea', 'delphin');
+  await page.keyboard.press('Escape');
+  await page.getByText('2 selected').waitFor({ state: 'detached' });
+  for (const key of ['ArrowUp', 'x', 'ArrowDown', 'ArrowDown', 'Shift+X']) await page.keyboard.press(key);
+  await chosen('borea', 'corvus', 'delphin');
+  await page.getByRole('button', { name: 'Select all 5 that match' }).click();
+  await chosen('atlas', 'borea', 'corvus', 'delphin', 'echo');
+  await page.keyboard.press('Escape');
+  await page.keyboard.press('/');
+  await page.keyboard.type('or');
+  await until(page, () => document.querySelectorAll('[data-robot]').length === 2);
+  await box('corvus').click();
+  await page.getByRole('button', { name: 'Select all 2 that match' }).click();
+  await chosen('borea', 'corvus');
+  assertQuiet(page);
+});
+
 test('a question asked right after another was left stays', async (t) => {
   const server = await Server.start(t);
   const page = await open(t, server);

@@ -166,26 +166,13 @@ impl Robot {
 
     fn snapshot(&self, phase: Phase) -> Report {
         let task = |task: &DesiredTask| TaskReport {
-            task: task.task.clone(),
-            deployment: task.deployment.clone(),
-            package: task.package.clone(),
-            wanted: task.wanted,
-            run: task.run,
-            kind: None,
-            phase,
-            phase_ms: 0,
-            progress: None,
-            missing_parts: None,
-            attempts: 1,
-            restarts: 0,
-            failure: None,
-            degraded: None,
             active: (phase == Phase::Running).then(|| ActiveVersion {
                 deployment: task.deployment.clone(),
                 version: task.package.version.clone(),
                 manifest: Some(task.package.manifest.digest),
                 pid: 1,
             }),
+            ..TaskReport::of(task, phase)
         };
         Report {
             robot_id: self.identity.enrolled.robot_id.clone(),

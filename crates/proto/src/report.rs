@@ -6,7 +6,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::desired::{PackageRef, Wanted};
+use crate::desired::{DesiredTask, PackageRef, Wanted};
 use crate::manifest::TaskKind;
 use crate::part::PartRange;
 use crate::settings::{EffectiveSettings, tolerant};
@@ -179,6 +179,29 @@ pub struct TaskReport {
     /// The version whose process lives, which need not be the one ordered.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub active: Option<ActiveVersion>,
+}
+
+impl TaskReport {
+    /// Of a desired task that has just come into a phase and has nothing else to say.
+    pub fn of(task: &DesiredTask, phase: Phase) -> Self {
+        Self {
+            task: task.task.clone(),
+            deployment: task.deployment.clone(),
+            package: task.package.clone(),
+            wanted: task.wanted,
+            run: task.run,
+            kind: None,
+            phase,
+            phase_ms: 0,
+            progress: None,
+            missing_parts: None,
+            attempts: 1,
+            restarts: 0,
+            failure: None,
+            degraded: None,
+            active: None,
+        }
+    }
 }
 
 /// The version of a task that is running.

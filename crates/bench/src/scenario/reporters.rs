@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context as _, bail};
 use futures_util::{StreamExt as _, TryStreamExt as _};
 use task_proto::api::{CreateDeployment, DeliveryChoice, EnrollResponse};
-use task_proto::desired::{BlobRef, PackageRef, Wanted};
+use task_proto::desired::{BlobRef, Delivery, DesiredTask, PackageRef, Wanted};
 use task_proto::report::{HostFacts, Phase, Progress, Report, TaskReport};
 use task_proto::topic::{RobotTopic, Topic};
 use task_proto::{DeploymentId, Digest, Generation, InstanceId};
@@ -57,22 +57,14 @@ pub async fn connect(taskd: &Taskd, count: usize) -> anyhow::Result<Vec<Reporter
 fn report(robot: &EnrollResponse, deployment: &DeploymentId) -> anyhow::Result<Report> {
     let blob = BlobRef { digest: Digest::of(b""), size: 0 };
     let (name, version) = ("status".parse()?, "1".parse()?);
-    let task = TaskReport {
+    let task = DesiredTask {
         task: "status".parse()?,
         deployment: deployment.clone(),
         package: PackageRef { name, version, manifest: blob, config: blob, content: blob },
         wanted: Wanted::Running,
         run: 1,
-        kind: None,
-        phase: Phase::Fetching,
-        phase_ms: 0,
-        progress: Some(Progress { done: 0, total: 0 }),
-        missing_parts: None,
-        attempts: 1,
-        restarts: 0,
-        failure: None,
-        degraded: None,
-        active: None,
+        delivery: Delivery::Poll,
+        priority: 0,
     };
     Ok(Report {
         robot_id: robot.robot_id.clone(),
@@ -90,7 +82,10 @@ fn report(robot: &EnrollResponse, deployment: &DeploymentId) -> anyhow::Result<R
         },
         conditions: Vec::new(),
         link: None,
-        tasks: vec![task],
+        tasks: vec![TaskReport {
+            progress: Some(Progress { done: 0, total: 0 }),
+            ..TaskReport::of(&task, Phase::Fetching)
+        }],
     })
 }
 

@@ -158,7 +158,7 @@ impl Robot {
 
     pub fn accept(&mut self, desired: &DesiredState, phase: Phase) {
         self.observed = desired.generation;
-        let entry = |task: &DesiredTask| (task.task.to_string(), task_report(task, phase));
+        let entry = |task: &DesiredTask| (task.task.to_string(), TaskReport::of(task, phase));
         self.tasks = desired.tasks.iter().map(entry).collect();
     }
 
@@ -177,26 +177,6 @@ impl Robot {
             link: self.link,
             tasks: self.tasks.values().cloned().collect(),
         }
-    }
-}
-
-pub fn task_report(task: &DesiredTask, phase: Phase) -> TaskReport {
-    TaskReport {
-        task: task.task.clone(),
-        deployment: task.deployment.clone(),
-        package: task.package.clone(),
-        wanted: task.wanted,
-        run: task.run,
-        kind: None,
-        phase,
-        phase_ms: 0,
-        progress: None,
-        missing_parts: None,
-        attempts: 1,
-        restarts: 0,
-        failure: None,
-        degraded: None,
-        active: None,
     }
 }
 

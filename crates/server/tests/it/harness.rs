@@ -222,23 +222,7 @@ pub async fn opened(server: &TestServer, envelope: &Envelope) -> DesiredState {
 }
 
 fn in_phase(task: &DesiredTask, phase: Phase) -> TaskReport {
-    TaskReport {
-        task: task.task.clone(),
-        deployment: task.deployment.clone(),
-        package: task.package.clone(),
-        wanted: task.wanted,
-        run: task.run,
-        kind: Some(TaskKind::Service),
-        phase,
-        phase_ms: 10,
-        progress: None,
-        missing_parts: None,
-        attempts: 1,
-        restarts: 0,
-        failure: None,
-        degraded: None,
-        active: None,
-    }
+    TaskReport { kind: Some(TaskKind::Service), phase_ms: 10, ..TaskReport::of(task, phase) }
 }
 
 /// Sends it and reads a success's JSON.

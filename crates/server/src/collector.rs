@@ -1,6 +1,7 @@
 //! Collects what nobody needs any more: uploads that were given up, blobs that nothing refers to. Blobs of a package that
 //! a robot should have, or may get back, are kept whatever happened to their manifest. A blob is left alone for a grace
-//! time after a pusher last asked for it, so that a push in progress finds what it found before.
+//! time after a pusher last asked for it, so that a push in progress finds what it found before; for a shorter one if robots
+//! have dropped it.
 
 use std::time::Duration;
 

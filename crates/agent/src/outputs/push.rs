@@ -1,5 +1,5 @@
-//! Pushes an output through the OCI distribution API: blobs in chunks that go on where they broke off, then the config,
-//! then the manifest.
+//! Pushes an output through the OCI distribution API: the config and the manifest, to hear whether it would be kept, then
+//! blobs in chunks that go on where they broke off, then the manifest once more.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;

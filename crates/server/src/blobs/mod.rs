@@ -1,6 +1,6 @@
 //! The blob store: bytes on disk under the digest they hash to, in `blobs/sha256/<hex>`. A blob is renamed into place
-//! when it is whole, verified and synced, and never modified afterwards. It knows no repositories and no references: what
-//! may be deleted is [`crate::collector`]'s decision. A blob's modification time is when it was last asked for by someone
+//! when it is whole, verified and synced, and never modified afterwards. It knows no references: what may be deleted is
+//! [`crate::collector`]'s decision. A blob's modification time is when it was last asked for by someone
 //! who pushes; its content is never judged by it.
 
 mod body;

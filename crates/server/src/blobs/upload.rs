@@ -1,5 +1,5 @@
 //! Unfinished uploads: `uploads/<id>` holds the bytes that came, memory holds their running hash; a restart ends them all.
-//! It never lets bytes become a blob before they hash to what was announced.
+//! It never lets bytes become a blob before they hash to what was announced, nor robots take more than is theirs.
 
 use std::collections::HashMap;
 use std::fs::{self, File};

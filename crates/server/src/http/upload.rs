@@ -15,6 +15,7 @@ use task_archive::{Compression, Limits, Refusal, UnpackError, unpack_unannounced
 use task_proto::api::PackageView;
 use tempfile::TempDir;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio::time::timeout;
 
 use super::App;
 use super::error::ApiError;
@@ -27,14 +28,21 @@ use crate::person::Person;
 const AT_ONCE: usize = 2;
 /// How many look into packages at the same time.
 const READERS: usize = 2;
-/// How long an archive may take to arrive and be packed.
-const DEADLINE: Duration = Duration::from_secs(60 * 60);
-/// How long a sender may be silent.
-const SILENCE: Duration = Duration::from_secs(60);
+/// With whoever has a place.
+const PATIENCE: Patience = Patience { silence: Duration::from_secs(60), whole: Duration::from_secs(60 * 60) };
 /// Pieces of a body that wait to be unpacked.
 const WAITING: usize = 16;
 /// What an archive may have beside what is in it.
 const OVERHEAD_BYTES: u64 = 1 << 20;
+
+/// How long a sender may take.
+#[derive(Debug, Clone, Copy)]
+struct Patience {
+    /// For the next piece.
+    silence: Duration,
+    /// For all of it.
+    whole: Duration,
+}
 
 /// Where archives are unpacked, and who may read some.
 pub struct UploadSpace {
@@ -86,17 +94,11 @@ pub(super) async fn package(
     let place = app.uploads.places.clone().try_acquire_owned().map_err(|_| {
         ApiError::too_many(format!("{AT_ONCE} packages are being uploaded already; try again in a moment"))
     })?;
-    let working = async {
-        let (packed, _place) = receive(&app, place, compression, request.into_body()).await?;
-        Ok(oci::publish(&Registry::from_ref(&app), &by, &packed).await?)
-    };
-    match tokio::time::timeout(DEADLINE, working).await {
-        Ok(published) => published.map(Created),
-        Err(_) => Err(timeout("the upload took longer than an hour")),
-    }
+    let (packed, _place) = receive(&app, place, compression, request.into_body()).await?;
+    Ok(Created(oci::publish(&Registry::from_ref(&app), &by, &packed).await?))
 }
 
-fn timeout(message: &str) -> ApiError {
+fn too_slow(message: &str) -> ApiError {
     ApiError::new(StatusCode::REQUEST_TIMEOUT, "timeout", message)
 }
 
@@ -121,10 +123,11 @@ async fn receive(
 ) -> Result<(Packed, OwnedSemaphorePermit), ApiError> {
     let (sender, receiver) = mpsc::channel(WAITING);
     let (directory, limits) = (app.uploads.directory.clone(), app.uploads.limits);
+    let most = limits.bytes.saturating_add(OVERHEAD_BYTES);
     let work = tokio::task::spawn_blocking(move || {
         packed(Arriving { receiver, current: Bytes::new() }, compression, &limits, &directory).map(|it| (it, place))
     });
-    let (fed, worked) = tokio::join!(feed(body, sender, limits.bytes.saturating_add(OVERHEAD_BYTES)), work);
+    let (fed, worked) = tokio::join!(feed(body, sender, most, PATIENCE), work);
     // Where the body did not come whole, the archive in it was not whole either.
     fed?;
     match worked {
@@ -134,23 +137,27 @@ async fn receive(
 }
 
 /// Hands the body on, until it ends or nobody takes any more of it.
-async fn feed(body: Body, sender: mpsc::Sender<Bytes>, most: u64) -> Result<(), ApiError> {
+async fn feed(body: Body, sender: mpsc::Sender<Bytes>, most: u64, patience: Patience) -> Result<(), ApiError> {
     let (mut chunks, mut taken) = (body.into_data_stream(), 0);
-    loop {
-        let chunk = match tokio::time::timeout(SILENCE, chunks.next()).await {
-            Ok(Some(Ok(chunk))) => chunk,
-            Ok(Some(Err(_))) => return Err(ApiError::invalid("the body broke off")),
-            Ok(None) => return Ok(()),
-            Err(_) => return Err(timeout("the upload stopped for a minute")),
-        };
-        taken += chunk.len() as u64;
-        if taken > most {
-            return Err(too_large(format!("the archive has more than {most} bytes, the most that this server takes")));
+    let handing_on = async {
+        loop {
+            let chunk = match timeout(patience.silence, chunks.next()).await {
+                Ok(Some(Ok(chunk))) => chunk,
+                Ok(Some(Err(_))) => return Err(ApiError::invalid("the body broke off")),
+                Ok(None) => return Ok(()),
+                Err(_) => return Err(too_slow("the upload stopped for a minute")),
+            };
+            taken += chunk.len() as u64;
+            if taken > most {
+                let message = format!("the archive has more than {most} bytes, the most that this server takes");
+                return Err(too_large(message));
+            }
+            if sender.send(chunk).await.is_err() {
+                return Ok(());
+            }
         }
-        if sender.send(chunk).await.is_err() {
-            return Ok(());
-        }
-    }
+    };
+    timeout(patience.whole, handing_on).await.unwrap_or_else(|_| Err(too_slow("the upload took longer than an hour")))
 }
 
 /// A body as a thread reads it. It ends where the sender is gone.
@@ -218,4 +225,40 @@ fn refused(error: UploadError) -> ApiError {
 
 fn too_large(message: String) -> ApiError {
     ApiError::new(StatusCode::PAYLOAD_TOO_LARGE, "too_large", message)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::convert::Infallible;
+
+    use futures_util::stream;
+
+    use super::*;
+
+    const LONG: Duration = Duration::from_secs(60);
+    const SHORT: Duration = Duration::from_millis(20);
+
+    /// What a sender is told whose body is taken as it comes.
+    async fn told(body: Body, patience: Patience) -> String {
+        let (sender, mut receiver) = mpsc::channel(WAITING);
+        let fed = async {
+            tokio::join!(feed(body, sender, 1 << 20, patience), async { while receiver.recv().await.is_some() {} }).0
+        };
+        let error = timeout(LONG, fed).await.expect("an end").expect_err("let go");
+        assert_eq!(error.status, StatusCode::REQUEST_TIMEOUT);
+        error.message
+    }
+
+    #[tokio::test]
+    async fn who_is_silent_or_never_ends_is_let_go() {
+        let silent = Body::from_stream(stream::pending::<Result<Bytes, Infallible>>());
+        let said = told(silent, Patience { silence: SHORT, whole: 2 * LONG }).await;
+        assert!(said.contains("stopped for a minute"), "{said}");
+        let endless = stream::unfold((), |()| async {
+            tokio::task::yield_now().await;
+            Some((Ok::<_, Infallible>(Bytes::new()), ()))
+        });
+        let said = told(Body::from_stream(endless), Patience { silence: 2 * LONG, whole: SHORT }).await;
+        assert!(said.contains("longer than an hour"), "{said}");
+    }
 }

@@ -156,6 +156,31 @@ async fn refused_bytes(server: &TestServer, header: &str, rest: &[u8]) -> String
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn two_upload_at_a_time_and_who_goes_away_leaves_a_place() {
+    let server = TestServer::start().await;
+    let upload = |body: reqwest::Body| {
+        server.request(Method::POST, "/api/v1/packages").header("content-type", "application/x-tar").body(body)
+    };
+    let body = || reqwest::Body::wrap_stream(futures_util::stream::pending::<Result<Vec<u8>, std::io::Error>>());
+    // Whoever finds the place taken by what asks below asks again.
+    let endless = async || while refusal(upload(body())).await.0 == 429 {};
+    let until = async |status: u16| while refusal(upload("hello".into())).await.0 != status {};
+    tokio::select! {
+        _ = async { tokio::join!(endless(), endless()) } => panic!("an upload without an end had one"),
+        refused = timeout(PATIENCE, until(429)) => refused.expect("no third place"),
+    }
+    timeout(PATIENCE, until(422)).await.expect("places again");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_bomb_is_refused_before_it_is_unpacked_whole() {
+    let server = TestServer::start().await;
+    let bomb = zstd::encode_all(&lone("zeros", 0o644, &vec![0; 65 << 20])[..], 3).expect("compressed");
+    assert_eq!(refusal(server.upload("application/zstd", bomb)).await, (413, "too_large".to_owned()));
+    assert!(server.is_clean());
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_refusal_reaches_who_sends_everything_before_reading() {
     let server = TestServer::start().await;
     let answer = refused_bytes(&server, "", &vec![0; REFUSED_BYTES]).await;

@@ -8,7 +8,6 @@ use task_proto::api::TokenOrigin;
 use task_proto::id::Labels;
 use task_proto::person::{Permission, Role, Roles};
 use task_proto::selector::Selector;
-use task_proto::token::Token;
 use task_proto::{RobotId, RobotName, TokenId, UserName};
 
 /// The name that stands for whoever holds the first token, the one in the data directory. No user has it.
@@ -33,8 +32,7 @@ pub struct Person {
 
 impl Person {
     /// Whoever holds `token`, the first one: an administrator of everything.
-    pub fn first(token: &Token) -> Self {
-        let token = token.id().parse().expect("a token's id has its form");
+    pub fn first(token: TokenId) -> Self {
         let (roles, scope, origin) = (Roles::one(Role::Admin), Scope::everything(), TokenOrigin::First);
         Self { name: first_name(), roles, scope, token, origin, address: None }
     }
@@ -106,8 +104,6 @@ impl fmt::Display for Scope {
 
 #[cfg(test)]
 mod tests {
-    use task_proto::token::TokenKind;
-
     use super::*;
 
     fn selector(text: &str) -> Selector {
@@ -116,7 +112,7 @@ mod tests {
 
     #[test]
     fn what_concerns_everybody_is_not_for_who_is_limited() {
-        let mut person = Person::first(&Token::random(TokenKind::Operator));
+        let mut person = Person::first("0123456789ab".parse().expect("an id"));
         assert!(person.is_first() && Permission::ALL.into_iter().all(|permission| person.may(permission)));
         person.scope = Scope::of([selector("site=lab")]);
         assert!(person.may(Permission::Maintain) && !person.may(Permission::Administer));

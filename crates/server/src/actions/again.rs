@@ -67,7 +67,12 @@ impl Actions {
             ..CreateDeployment::new(package.package.name.clone(), package.package.manifest.digest, selector)
         };
         self.check_fits(&order, &package)?;
-        let expires_at_ms = now_ms + past.expires_at_ms.saturating_sub(past.created_at_ms).max(1);
+        // What was taken over from robots after the database was put back never had a time of its own.
+        let lifetime_ms = match past.expires_at_ms.saturating_sub(past.created_at_ms) {
+            0 => self.settings.assignment_lifetime_ms,
+            lifetime_ms => lifetime_ms,
+        };
+        let expires_at_ms = now_ms + lifetime_ms;
         let kind = package.manifest.run.kind;
         let placed = Placed { package: &package.package, kind, order: &order, robots: &robots, expires_at_ms };
         let (new, touched) = placed.place(&mut write, now_ms).await?;

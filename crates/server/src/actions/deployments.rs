@@ -179,7 +179,7 @@ impl Placed<'_> {
         let id = DeploymentId::random();
         let new = NewDeployment { id: &id, package, kind, order, expires_at_ms };
         write.insert_deployment(&new, now_ms).await?;
-        let mut touched = write.assign(&id, &package.name, robots, expires_at_ms, now_ms).await?;
+        let mut touched = write.assign(&id, &package.name, robots, now_ms).await?;
         touched.insert(id.clone());
         Ok((id, touched))
     }

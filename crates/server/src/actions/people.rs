@@ -65,8 +65,8 @@ impl Actions {
         if before.is_administrator() && !user.is_administrator() {
             check_not_last(&mut write, Some(name)).await?;
         }
-        write.put_user(&user).await?;
         write.audit(&Deed::by(by, Act::UserEdit, name).described(&user), self.clock.now_ms()).await?;
+        write.put_user(&user).await?;
         write.commit().await?;
         self.changes.announce_rights();
         Ok(user.view())
@@ -78,8 +78,8 @@ impl Actions {
         if known_user(&mut write, name).await?.is_administrator() {
             check_not_last(&mut write, Some(name)).await?;
         }
-        write.remove_user(name).await?;
         write.audit(&Deed::by(by, Act::UserRemove, name), self.clock.now_ms()).await?;
+        write.remove_user(name).await?;
         write.commit().await?;
         self.changes.announce_rights();
         Ok(())
@@ -127,8 +127,8 @@ impl Actions {
         }
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
-        write.revoke_person_token(&by.token, now_ms).await?;
         write.audit(&Deed::by(by, Act::SignOut, &by.name), now_ms).await?;
+        write.revoke_person_token(&by.token, now_ms).await?;
         write.commit().await?;
         self.changes.announce_rights();
         Ok(())
@@ -214,8 +214,8 @@ impl Actions {
         if token.origin == TokenOrigin::First {
             check_not_last(&mut write, None).await?;
         }
-        write.revoke_person_token(id, now_ms).await?;
         write.audit(&Deed::by(by, Act::TokenRevoke, id).with("user", &token.user), now_ms).await?;
+        write.revoke_person_token(id, now_ms).await?;
         write.commit().await?;
         self.changes.announce_rights();
         Ok(token.user)

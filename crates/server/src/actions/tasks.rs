@@ -40,7 +40,7 @@ impl Actions {
             touched.insert(deployment);
             consequences.rings.insert(robot);
         }
-        if order == TaskOrder::Remove {
+        if matches!(order, TaskOrder::Stop | TaskOrder::Remove) {
             touched.extend(write.drop_waiting(Some(task), &ids, now_ms).await?);
         }
         consequences.deployments.extend(touched.iter().cloned());
@@ -86,8 +86,9 @@ pub(super) async fn meant(
     now_ms: u64,
 ) -> Result<Vec<KnownRobot>, ActionError> {
     let mut robots = write.matching_robots(selector).await?;
-    let ids: Vec<RobotId> = robots.iter().map(|robot| robot.id.clone()).collect();
-    write.adopt_diverged(&ids, now_ms).await?;
+    let own = robots.iter().filter(|robot| by.scope.covers(&robot.id, &robot.name, &robot.labels));
+    let own: Vec<RobotId> = own.map(|robot| robot.id.clone()).collect();
+    write.adopt_diverged(&own, now_ms).await?;
     keep_those_with_task(&mut robots, write.robots_with_task(task).await?, selector)?;
     check_scope(by, &robots, || quoted(selector))?;
     Ok(robots)

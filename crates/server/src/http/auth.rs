@@ -4,17 +4,20 @@
 use std::net::SocketAddr;
 use std::time::Duration;
 
+use axum::body::Body;
 use axum::extract::rejection::RawPathParamsRejection;
 use axum::extract::{ConnectInfo, FromRequestParts, RawPathParams, Request, State};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
+use futures_util::{StreamExt as _, stream};
 use http::request::Parts;
 use http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use task_proto::RobotId;
 use task_proto::person::Permission;
 use task_proto::token::Token;
+use tokio::time::{Instant, timeout_at};
 
 use super::App;
 use super::conduct::hold_up;
@@ -140,11 +143,41 @@ pub(super) async fn guard(
         Err(error) if is_oci => return error.into_oci_response(),
         Err(error) => return error.into_response(),
     }
-    let Some(deadline) = gate.deadline else { return next.run(request).await };
-    tokio::time::timeout(deadline, next.run(request)).await.unwrap_or_else(|_| {
+    match gate.deadline {
+        Some(deadline) => tokio::time::timeout(deadline, answered(request, next, Some(deadline))).await,
+        None => Ok(answered(request, next, None).await),
+    }
+    .unwrap_or_else(|_| {
         let message = "the request took too long to arrive or to be answered";
         ApiError::new(StatusCode::REQUEST_TIMEOUT, "timeout", message).into_response()
     })
+}
+
+/// The handler's answer. What changes something goes on to its end even if nobody waits for it any more: what is done after a
+/// commit, like cutting off whoever has lost their rights, belongs to it. Only its body has to have come by then.
+async fn answered(request: Request, next: Next, deadline: Option<Duration>) -> Response {
+    if request.method().is_safe() {
+        return next.run(request).await;
+    }
+    let request = match deadline {
+        Some(deadline) => request.map(|body| arriving_within(deadline, body)),
+        None => request,
+    };
+    match tokio::spawn(next.run(request)).await {
+        Ok(response) => response,
+        Err(panic) => std::panic::resume_unwind(panic.into_panic()),
+    }
+}
+
+/// A body that breaks off where it takes longer.
+fn arriving_within(deadline: Duration, body: Body) -> Body {
+    let end = Instant::now() + deadline;
+    Body::from_stream(stream::unfold(body.into_data_stream(), move |mut chunks| async move {
+        match timeout_at(end, chunks.next()).await {
+            Ok(chunk) => chunk.map(|chunk| (chunk, chunks)),
+            Err(late) => Some((Err(axum::Error::new(late)), chunks)),
+        }
+    }))
 }
 
 /// What a request shows of who sent it.

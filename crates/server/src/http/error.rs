@@ -139,14 +139,18 @@ impl From<BlobError> for ApiError {
 
 impl From<StoreError> for ApiError {
     fn from(error: StoreError) -> Self {
-        Self::internal(&error)
+        match error {
+            StoreError::RightsEnded => Self::unauthorized(error.to_string()),
+            _ => Self::internal(&error),
+        }
     }
 }
 
 impl From<ActionError> for ApiError {
     fn from(error: ActionError) -> Self {
         let status = match error {
-            ActionError::Store(_) | ActionError::PasswordFailed => return Self::internal(&error),
+            ActionError::Store(error) => return error.into(),
+            ActionError::PasswordFailed => return Self::internal(&error),
             ActionError::Invalid { .. } | ActionError::InvalidIdempotencyKey => StatusCode::BAD_REQUEST,
             ActionError::TokenRefused | ActionError::SignInRefused => StatusCode::UNAUTHORIZED,
             ActionError::TokenForOther { .. }

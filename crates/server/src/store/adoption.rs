@@ -73,7 +73,8 @@ impl Write {
     }
 
     async fn adopt_task(&mut self, robot: &RobotId, task: &TaskReport, now_ms: u64) -> Result<(), StoreError> {
-        let number = stored(self.turn());
+        // Older than what is ordered in this write: it can be rolled back to.
+        let number = stored(self.turn().saturating_sub(1));
         // The order itself may be lost as well; then the robot's word is all there is of it.
         sqlx::query(
             "INSERT INTO deployments (id, number, task, version, package, kind, selector, delivery, created_at_ms,

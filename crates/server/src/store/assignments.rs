@@ -4,7 +4,7 @@
 
 use std::collections::BTreeSet;
 
-use sqlx::{AssertSqlSafe, Row as _};
+use sqlx::AssertSqlSafe;
 use task_proto::report::Phase;
 use task_proto::{DeploymentId, RobotId, TaskName};
 
@@ -34,21 +34,6 @@ pub struct Released {
     pub superseded: BTreeSet<DeploymentId>,
 }
 
-/// An assignment that is to be taken back.
-#[derive(Debug, Clone)]
-pub struct Revocable {
-    /// The deployment.
-    pub deployment: DeploymentId,
-    /// The robot.
-    pub robot: RobotId,
-    /// What it took the place of, and is desired again.
-    pub previous: Option<DeploymentId>,
-    desired: bool,
-}
-
-/// Columns of a list of assignments in a statement.
-const PAIR: &[&str] = &["TEXT", "TEXT"];
-
 impl Write {
     /// Gives each of `robots`, in this order, its part of a new deployment. Nothing is released yet; older parts of the
     /// same task that wait for their batch give way, and their deployments are returned.
@@ -57,23 +42,20 @@ impl Write {
         deployment: &DeploymentId,
         task: &TaskName,
         robots: &[RobotId],
-        expires_at_ms: u64,
         now_ms: u64,
     ) -> Result<BTreeSet<DeploymentId>, StoreError> {
         let mut place = 0;
         for group in groups(robots) {
             let sql = format!(
                 "WITH v (robot_id, place) AS ({})
-                 INSERT INTO assignments (deployment_id, robot_id, task, place, expires_at_ms, updated_at_ms, timeline)
-                 SELECT CAST($1 AS TEXT), v.robot_id, CAST($2 AS TEXT), v.place, CAST($3 AS BIGINT), CAST($4 AS BIGINT),
-                     CAST($5 AS TEXT)
+                 INSERT INTO assignments (deployment_id, robot_id, task, place, updated_at_ms, timeline)
+                 SELECT CAST($1 AS TEXT), v.robot_id, CAST($2 AS TEXT), v.place, CAST($3 AS BIGINT), CAST($4 AS TEXT)
                  FROM v",
-                values(6, group.len(), &["TEXT", "BIGINT"])
+                values(5, group.len(), &["TEXT", "BIGINT"])
             );
             let mut query = sqlx::query(AssertSqlSafe(sql))
                 .bind(deployment.as_str())
                 .bind(task.as_str())
-                .bind(stored(expires_at_ms))
                 .bind(stored(now_ms))
                 .bind(step(Phase::Assigned, now_ms, 0));
             for robot in group {
@@ -98,7 +80,7 @@ impl Write {
         deployments(superseded)
     }
 
-    /// Begins the next batch of at most `count` robots: what they had of the task gives way.
+    /// Begins the next batch of at most `count` robots: what they had of the task gives way. Their time begins now.
     pub async fn release(
         &mut self,
         deployment: &DeploymentId,
@@ -145,6 +127,7 @@ impl Write {
         // Of the first batch it was just said.
         sqlx::query(AssertSqlSafe(format!(
             "UPDATE assignments SET released = 1, desired = 1, updated_at_ms = $3,
+                 expires_at_ms = CAST($3 AS BIGINT) + (SELECT expires_at_ms - created_at_ms FROM deployments WHERE id = $1),
                  timeline = CASE WHEN updated_at_ms = $3 THEN timeline ELSE {} END
              WHERE deployment_id = $1 AND released = 0 AND ended = 0 AND place <= $2",
             grown_by(Phase::Assigned, "$3")
@@ -156,91 +139,6 @@ impl Write {
         .await?;
         self.raise_generations(&robots).await?;
         Ok(Released { robots, superseded: deployments(superseded)? })
-    }
-
-    /// What a cancel takes back: all that has not settled, and what ended badly but is still what its robot should have.
-    /// A service that runs has settled: there is nothing left to interrupt.
-    pub async fn revocable(&mut self, deployment: &DeploymentId) -> Result<Vec<Revocable>, StoreError> {
-        let rows = sqlx::query(
-            "SELECT a.deployment_id, a.robot_id, a.desired, a.previous FROM assignments a
-             JOIN deployments d ON d.id = a.deployment_id
-             WHERE a.deployment_id = $1 AND NOT (a.phase = 'running' AND d.kind = 'service')
-               AND (a.ended = 0 OR (a.desired = 1 AND a.phase NOT IN ('succeeded', 'stopped')))
-             ORDER BY a.place",
-        )
-        .bind(deployment.as_str())
-        .fetch_all(self.connection())
-        .await?;
-        rows.into_iter().map(revocable).collect()
-    }
-
-    /// What was not done in time. Diverged robots are left alone.
-    pub async fn overdue(&mut self, now_ms: u64) -> Result<Vec<Revocable>, StoreError> {
-        let rows = sqlx::query(
-            "SELECT a.deployment_id, a.robot_id, a.desired, a.previous FROM assignments a
-             JOIN robots r ON r.id = a.robot_id
-             WHERE a.ended = 0 AND a.expires_at_ms <= $1 AND r.observed_generation <= r.generation",
-        )
-        .bind(stored(now_ms))
-        .fetch_all(self.connection())
-        .await?;
-        rows.into_iter().map(revocable).collect()
-    }
-
-    /// Takes assignments back, those that have not ended in `phase`, and makes desired again what they had replaced.
-    /// Returns the robots whose desired state is new.
-    pub async fn take_back(
-        &mut self,
-        taken: &[Revocable],
-        phase: Phase,
-        now_ms: u64,
-    ) -> Result<Vec<RobotId>, StoreError> {
-        let end = format!(
-            "SET desired = 0, ended = 1, progress = NULL, updated_at_ms = $1,
-                 phase = CASE ended WHEN 1 THEN phase ELSE CAST($2 AS TEXT) END,
-                 timeline = CASE ended WHEN 1 THEN timeline ELSE {} END",
-            grown_by(phase, "$1")
-        );
-        self.set_pairs(&end, phase, now_ms, taken.iter().map(|row| (&row.deployment, &row.robot))).await?;
-        // Where the replaced one stands is what the robot's next report says; $2 is what it is until then.
-        let revive = format!(
-            "SET desired = 1, superseded_by = NULL, removed_generation = NULL, updated_at_ms = $1,
-                 ended = CASE phase WHEN 'superseded' THEN 0 ELSE ended END,
-                 timeline = CASE phase WHEN 'superseded' THEN {} ELSE timeline END,
-                 phase = CASE phase WHEN 'superseded' THEN CAST($2 AS TEXT) ELSE phase END",
-            grown_by(Phase::Assigned, "$1")
-        );
-        let previous =
-            taken.iter().filter(|row| row.desired).filter_map(|row| Some((row.previous.as_ref()?, &row.robot)));
-        self.set_pairs(&revive, Phase::Assigned, now_ms, previous).await?;
-        let robots: BTreeSet<RobotId> = taken.iter().filter(|row| row.desired).map(|row| row.robot.clone()).collect();
-        let robots: Vec<RobotId> = robots.into_iter().collect();
-        self.raise_generations(&robots).await?;
-        Ok(robots)
-    }
-
-    /// Runs `UPDATE assignments` with `set`, whose $1 is the time and $2 a phase, on the given rows.
-    async fn set_pairs<'a>(
-        &mut self,
-        set: &str,
-        phase: Phase,
-        now_ms: u64,
-        pairs: impl Iterator<Item = (&'a DeploymentId, &'a RobotId)>,
-    ) -> Result<(), StoreError> {
-        let pairs: Vec<_> = pairs.collect();
-        for group in groups(&pairs) {
-            let sql = format!(
-                "WITH v (deployment_id, robot_id) AS ({}) UPDATE assignments {set} FROM v
-                 WHERE assignments.deployment_id = v.deployment_id AND assignments.robot_id = v.robot_id",
-                values(3, group.len(), PAIR)
-            );
-            let mut query = sqlx::query(AssertSqlSafe(sql)).bind(stored(now_ms)).bind(phase.as_str());
-            for (deployment, robot) in group {
-                query = query.bind(deployment.as_str()).bind(robot.as_str());
-            }
-            query.execute(self.connection()).await?;
-        }
-        Ok(())
     }
 
     /// After `deployment` was cancelled, no later cancel may put it back: whoever replaced it puts back what it had
@@ -307,8 +205,8 @@ impl Write {
         Ok(changed)
     }
 
-    /// Ends the parts that wait for their batch on `robots`, of `task` or of all: what is removed must not come back with
-    /// a later batch. Returns their deployments.
+    /// Ends the parts that wait for their batch on `robots`, of `task` or of all: what is stopped or removed must not come back
+    /// with a later batch. Returns their deployments.
     pub async fn drop_waiting(
         &mut self,
         task: Option<&TaskName>,
@@ -376,16 +274,6 @@ impl Write {
         }
         Ok(())
     }
-}
-
-fn revocable(row: sqlx::any::AnyRow) -> Result<Revocable, StoreError> {
-    let previous: Option<String> = row.try_get("previous")?;
-    Ok(Revocable {
-        deployment: id("assignments.deployment_id", row.try_get("deployment_id")?)?,
-        robot: id("assignments.robot_id", row.try_get("robot_id")?)?,
-        desired: row.try_get::<i64, _>("desired")? == 1,
-        previous: previous.map(|previous| id("assignments.previous", &previous)).transpose()?,
-    })
 }
 
 fn deployments(rows: Vec<String>) -> Result<BTreeSet<DeploymentId>, StoreError> {

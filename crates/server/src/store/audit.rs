@@ -137,6 +137,8 @@ pub struct Deed {
     who: String,
     token: Option<TokenId>,
     address: Option<IpAddr>,
+    /// By whose rights; `None`: by nobody's, like signing in.
+    by: Option<Person>,
     act: Act,
     target: String,
     detail: BTreeMap<String, String>,
@@ -146,12 +148,12 @@ impl Deed {
     /// `person` does `act` to `target`.
     pub fn by(person: &Person, act: Act, target: impl ToString) -> Self {
         let (who, token) = (person.name.to_string(), Some(person.token.clone()));
-        Self::new(who, token, person.address, act, target)
+        Self { by: Some(person.clone()), ..Self::new(who, token, person.address, act, target) }
     }
 
     /// Someone who is no user, or not yet known to be one.
     pub fn new(who: String, token: Option<TokenId>, address: Option<IpAddr>, act: Act, target: impl ToString) -> Self {
-        Self { who, token, address, act, target: shortened(&target.to_string()), detail: BTreeMap::new() }
+        Self { who, token, address, by: None, act, target: shortened(&target.to_string()), detail: BTreeMap::new() }
     }
 
     /// With this as well.
@@ -180,8 +182,12 @@ fn shortened(text: &str) -> String {
 }
 
 impl Write {
-    /// Writes down what this write does. It is there if and only if the write is.
+    /// Writes down what this write does. It is there if and only if the write is; and the write is not, if whoever does it may
+    /// no longer: a request's body can come long after its head. So this comes before one's own rights are changed.
     pub async fn audit(&mut self, deed: &Deed, now_ms: u64) -> Result<(), StoreError> {
+        if let Some(by) = &deed.by {
+            self.check_rights(by, now_ms).await?;
+        }
         let last = sqlx::query("SELECT number, digest FROM audit ORDER BY number DESC LIMIT 1")
             .fetch_optional(self.connection())
             .await?;

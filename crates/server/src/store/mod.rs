@@ -24,6 +24,7 @@ mod robot_blobs;
 mod robot_pages;
 mod robots;
 mod rows;
+mod taking_back;
 mod timelines;
 mod tokens;
 mod users;
@@ -36,7 +37,7 @@ use sqlx::any::{Any, AnyPoolOptions};
 use sqlx::{AnyConnection, AnyPool, Transaction};
 
 use access::{Access, Ending};
-pub use assignments::{Released, Revocable, TaskOrder};
+pub use assignments::{Released, TaskOrder};
 pub use audit::{Act, Deed};
 pub use deliveries::{Decided, DeliveryOrder, RobotFacts};
 pub use deployments::{DeploymentPage, NewDeployment};
@@ -51,9 +52,12 @@ pub use reports::{OpenAssignment, ReportedRobot};
 pub use robot_blobs::bytes_taken;
 pub use robot_pages::RobotPage;
 pub use robots::{BrokerCredential, DesiredTasks, FetchedBy, KnownRobot};
+pub use taking_back::Revocable;
 pub use timelines::{HistoryPage, HistoryQuery};
 pub use tokens::{Admitted, EnrolmentTerms, TokenHolder};
 pub use users::{NewToken, User};
+
+use crate::person::Person;
 
 /// What of a SQLite database the writer keeps in memory: 16 MiB.
 const WRITER_CACHE: &str = "PRAGMA cache_size = -16384";
@@ -108,6 +112,9 @@ pub enum StoreError {
     /// A write that several wait for failed.
     #[error("a write for several robots failed")]
     Together(#[source] Arc<StoreError>),
+    /// Whoever asked had the right to when the request began, and has it no longer.
+    #[error("your rights have changed since this request began; sign in, or send it again")]
+    RightsEnded,
     /// A row holds what this version can't read.
     #[error("column {column} of the database holds what this version of taskd can't read")]
     Unreadable {
@@ -128,6 +135,8 @@ pub struct Write {
     transaction: Transaction<'static, Any>,
     turn: u64,
     ending: Ending,
+    /// Who was found to have their rights still.
+    vouched_for: Option<Person>,
 }
 
 impl Write {
@@ -225,7 +234,8 @@ impl Store {
         let turn: i64 = sqlx::query_scalar("UPDATE write_lock SET turn = turn + 1 WHERE id = 1 RETURNING turn")
             .fetch_one(&mut *transaction)
             .await?;
-        Ok(Write { transaction, turn: rows::number(turn), ending: self.access.until_ended() })
+        let ending = self.access.until_ended();
+        Ok(Write { transaction, turn: rows::number(turn), ending, vouched_for: None })
     }
 }
 

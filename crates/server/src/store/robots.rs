@@ -214,7 +214,8 @@ impl Store {
     }
 
     /// By which order `robot` may fetch the blob, the one that comes first; `None`: by none, as it belongs to no package that
-    /// the robot should have.
+    /// the robot should have. What was taken over from a robot's report, which has no time limit, only counts if such a package
+    /// is here.
     pub async fn fetched_by(&self, robot: &RobotId, digest: &Digest) -> Result<Option<Arc<FetchedBy>>, StoreError> {
         if let Some(order) = self.access.fetched_by(robot, digest) {
             return Ok(Some(order));
@@ -223,7 +224,10 @@ impl Store {
         let rows = sqlx::query(
             "SELECT d.package, d.priority, d.number, r.labels FROM assignments a JOIN deployments d ON d.id = a.deployment_id
              JOIN robots r ON r.id = a.robot_id
-             WHERE a.robot_id = $1 AND a.desired = 1 ORDER BY d.priority DESC, d.number",
+             WHERE a.robot_id = $1 AND a.desired = 1
+               AND (d.expires_at_ms > d.created_at_ms
+                    OR EXISTS (SELECT 1 FROM packages p WHERE p.name = d.task AND p.package = d.package))
+             ORDER BY d.priority DESC, d.number",
         )
         .bind(robot.as_str())
         .fetch_all(&self.reads)

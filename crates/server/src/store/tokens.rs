@@ -11,7 +11,7 @@ use task_proto::id::Labels;
 use task_proto::person::Roles;
 use task_proto::selector::Selector;
 use task_proto::token::{Token, TokenKind};
-use task_proto::{RobotId, UserName};
+use task_proto::{RobotId, TokenId, UserName};
 
 use super::rows::{from_optional_json, from_word, groups, id, json, number, optional, stored, values};
 use super::{Store, StoreError, Write};
@@ -183,6 +183,25 @@ impl Write {
         }))
     }
 
+    /// An error unless `by` may now what they might when they were let in. What this write changes itself does not count.
+    pub(super) async fn check_rights(&mut self, by: &Person, now_ms: u64) -> Result<(), StoreError> {
+        if self.vouched_for.as_ref() == Some(by) {
+            return Ok(());
+        }
+        let row = sqlx::query(VALID_TOKEN)
+            .bind(by.token.as_str())
+            .bind(kind_text(TokenKind::Operator))
+            .bind(stored(now_ms))
+            .fetch_optional(self.connection())
+            .await?;
+        let person = row.map(token_row).transpose()?.and_then(|row| row.person(&by.token));
+        if !person.is_some_and(|person| person.has_the_rights_of(by)) {
+            return Err(StoreError::RightsEnded);
+        }
+        self.vouched_for = Some(by.clone());
+        Ok(())
+    }
+
     /// Counts one enrolment by `token`.
     pub async fn use_enrolment_token(&mut self, token: &Token) -> Result<(), StoreError> {
         sqlx::query("UPDATE tokens SET uses_left = uses_left - 1 WHERE id = $1 AND uses_left IS NOT NULL")
@@ -322,7 +341,7 @@ impl Write {
 impl TokenRow {
     fn holder(self, token: &Token) -> Option<TokenHolder> {
         match token.kind() {
-            TokenKind::Operator => self.person(token).map(TokenHolder::Person),
+            TokenKind::Operator => self.person(&token.id().parse().ok()?).map(TokenHolder::Person),
             TokenKind::Enrolment => Some(TokenHolder::Enrolment),
             TokenKind::Robot if self.is_pending => {
                 self.robot.map(|robot| TokenHolder::Pending { robot, key: self.key })
@@ -334,14 +353,15 @@ impl TokenRow {
     }
 
     /// What the token allows is what both it and its user are allowed now; `None` if that is nothing.
-    fn person(self, token: &Token) -> Option<Person> {
+    fn person(self, token: &TokenId) -> Option<Person> {
+        let token = token.clone();
         let Some(UserPart { name, user, roles, scope, origin }) = self.user else { return Some(Person::first(token)) };
         let (user_roles, user_scope) = user?;
         let roles = match roles {
             Some(roles) => roles.within(&user_roles)?,
             None => user_roles,
         };
-        let (scope, token) = (Scope::of(user_scope.into_iter().chain(scope)), token.id().parse().ok()?);
+        let scope = Scope::of(user_scope.into_iter().chain(scope));
         Some(Person { name, roles, scope, token, origin, address: None })
     }
 

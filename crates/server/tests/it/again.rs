@@ -7,7 +7,7 @@ use task_proto::report::{Failure, FailureCode, Phase};
 use task_proto::selector::Selector;
 use task_proto::{DeploymentId, RepositoryName, TaskName};
 use taskd::actions::{ActionError, Rollback, TaskOrder};
-use taskd::person::{Person, Scope};
+use taskd::person::Person;
 use taskd::store::{NewManifest, PutManifest, Reference, StoredManifest};
 
 use crate::database::{TestDatabase, on_both_databases};
@@ -33,7 +33,7 @@ fn selector(text: &str) -> Selector {
 
 impl Fleet {
     /// Makes a version one that can be ordered again.
-    async fn publish(&self, version: &str) -> PackageView {
+    pub async fn publish(&self, version: &str) -> PackageView {
         let view = package(version, TaskKind::Service);
         let manifest = &view.package.manifest;
         let new = NewManifest {
@@ -86,7 +86,7 @@ impl Fleet {
         self.actions.roll_back(&self.operator, &random_key(), &task(), &selector(robots)).await
     }
 
-    async fn version(&self, robot: &Robot) -> String {
+    pub async fn version(&self, robot: &Robot) -> String {
         self.desired(robot).await.expect("not withheld").tasks[0].package.version.to_string()
     }
 }
@@ -96,7 +96,7 @@ fn names(robots: &[task_proto::api::MatchedRobot]) -> Vec<&str> {
 }
 
 async fn a_restart_is_a_new_run_of_all_that_have_the_task(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(3).await;
     let id = fleet.deploy("1", |order| order.selector = selector("!r2")).await;
     fleet.follow(&mut robots[0], Phase::Running).await;
@@ -116,7 +116,7 @@ async fn a_restart_is_a_new_run_of_all_that_have_the_task(database: TestDatabase
 }
 
 async fn a_retry_is_for_those_that_ended_badly_and_got_nothing_since(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     fleet.publish("1").await;
     let mut robots = fleet.enroll(7).await;
     let id = fleet.deploy("1", |_| ()).await;
@@ -158,7 +158,7 @@ async fn a_retry_is_for_those_that_ended_badly_and_got_nothing_since(database: T
 }
 
 async fn a_retry_may_be_for_some_and_keeps_the_orders_ways(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     fleet.publish("1").await;
     let mut robots = fleet.enroll(4).await;
     let id = fleet
@@ -194,7 +194,7 @@ async fn a_retry_may_be_for_some_and_keeps_the_orders_ways(database: TestDatabas
 }
 
 async fn a_rollback_brings_back_what_ran_before(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     for version in ["1", "2", "3"] {
         fleet.publish(version).await;
     }
@@ -250,7 +250,7 @@ async fn a_rollback_brings_back_what_ran_before(database: TestDatabase) {
 }
 
 async fn a_rollback_passes_over_what_never_ran_and_what_is_gone(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     for version in ["1", "2", "3", "4", "5"] {
         fleet.publish(version).await;
     }
@@ -275,7 +275,7 @@ async fn a_rollback_passes_over_what_never_ran_and_what_is_gone(database: TestDa
 }
 
 async fn orders_that_follow_stay_in_ones_scope(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     for version in ["1", "2"] {
         fleet.publish(version).await;
     }
@@ -288,8 +288,7 @@ async fn orders_that_follow_stay_in_ones_scope(database: TestDatabase) {
     for robot in &mut robots {
         fleet.follow(robot, Phase::Failed).await;
     }
-    let of_robot = |name: &str| Person { scope: Scope::of([selector(name)]), ..fleet.operator.clone() };
-    let (alice, carol) = (of_robot("r0"), of_robot("r7"));
+    let (alice, carol) = (fleet.limited("alice", "r0").await, fleet.limited("carol", "r7").await);
     let all = RetryDeployment::default();
     assert_eq!(code(fleet.retry(&alice, &two, &all).await), "out_of_scope");
     assert_eq!(code(fleet.retry(&carol, &one, &all).await), "out_of_scope");

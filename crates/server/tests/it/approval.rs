@@ -23,7 +23,7 @@ on_both_databases! {
 const DAY_MS: u64 = 24 * 60 * 60 * 1000;
 
 async fn a_robot_waits_until_it_is_approved_or_turned_away_or_a_week_has_passed(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let store = fleet.database.store.clone();
     let holder = async |token: &Token| {
         store
@@ -68,7 +68,7 @@ async fn a_robot_waits_until_it_is_approved_or_turned_away_or_a_week_has_passed(
 }
 
 async fn no_more_than_a_thousand_wait(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let token = fleet.enrolment_token(CreateEnrollmentToken { approval: true, ..Default::default() }).await;
     let mut first = None;
     for number in 0..1_000 {

@@ -8,7 +8,6 @@ use task_proto::api::{AuditQuery, BulkLabels, DeploymentView, MatchedRobots, Rob
 use task_proto::id::Labels;
 use task_proto::report::Phase;
 use taskd::changes::Change;
-use taskd::person::{Person, Scope};
 
 use crate::database::{TestDatabase, on_both_databases};
 use crate::fleet::Fleet;
@@ -35,7 +34,7 @@ fn order(selector: &str, set: &[(&str, &str)], remove: &[&str]) -> BulkLabels {
 }
 
 async fn labels_are_set_and_removed_at_once(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     // More than one statement takes.
     let robots = fleet.enroll(75).await;
     let label = async |order: &BulkLabels| fleet.actions.label_robots(&fleet.operator, order).await;
@@ -70,10 +69,10 @@ async fn labels_are_set_and_removed_at_once(database: TestDatabase) {
 }
 
 async fn a_label_order_beyond_the_scope_changes_nothing(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(3).await;
     fleet.actions.label_robots(&fleet.operator, &order("!r2", &[("site", "lab")], &[])).await.expect("done");
-    let alice = Person { scope: Scope::of(["site=lab".parse().expect("a selector")]), ..fleet.operator.clone() };
+    let alice = fleet.limited("alice", "site=lab").await;
     for beyond in [order("*", &[("a", "b")], &[]), order("site=lab", &[("site", "field")], &[])] {
         assert_eq!(code(fleet.actions.label_robots(&alice, &beyond).await), "out_of_scope");
     }
@@ -86,7 +85,7 @@ async fn a_label_order_beyond_the_scope_changes_nothing(database: TestDatabase) 
 }
 
 async fn robots_are_removed_at_once(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(75).await;
     let id = fleet.deploy("1", |order| order.batch = Some(1)).await;
     fleet.follow(&mut robots[0], Phase::Running).await;

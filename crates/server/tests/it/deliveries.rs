@@ -71,7 +71,7 @@ async fn every_robot_gets_what_its_rule_says(database: TestDatabase) {
         rule("connected", 1, Delivery::DirectPush),
         rule("transfers_at_least", 7, Delivery::Inline),
     ];
-    let fleet = Fleet::with_delivery(database, &settings(rules));
+    let fleet = Fleet::with_delivery(database, &settings(rules)).await;
     let mut robots = fleet.enroll(6).await;
     label(&fleet, &robots[0], "metered", "true").await;
     robots[1].battery_percent = Some(15);
@@ -106,7 +106,8 @@ async fn every_robot_gets_what_its_rule_says(database: TestDatabase) {
 }
 
 async fn robots_on_a_site_are_counted(database: TestDatabase) {
-    let fleet = Fleet::with_delivery(database, &settings(vec![rule("same_site_at_least", 2, Delivery::DirectPush)]));
+    let fleet =
+        Fleet::with_delivery(database, &settings(vec![rule("same_site_at_least", 2, Delivery::DirectPush)])).await;
     let robots = fleet.enroll(6).await;
     label(&fleet, &robots[0], "site", "hall").await;
     label(&fleet, &robots[1], "site", "hall").await;
@@ -127,7 +128,7 @@ async fn robots_on_a_site_are_counted(database: TestDatabase) {
 }
 
 async fn a_batch_is_decided_when_it_begins(database: TestDatabase) {
-    let fleet = Fleet::with_delivery(database, &settings(vec![rule("losses_above", 2, Delivery::Poll)]));
+    let fleet = Fleet::with_delivery(database, &settings(vec![rule("losses_above", 2, Delivery::Poll)])).await;
     let mut robots = fleet.enroll(2).await;
     let id = fleet.deploy("1", |order| order.batch = Some(1)).await;
     let tiny = decision(Delivery::Inline, "tiny", "size 2 B ≤ 32 KB");
@@ -141,7 +142,7 @@ async fn a_batch_is_decided_when_it_begins(database: TestDatabase) {
 }
 
 async fn a_robot_that_has_the_bytes_lacks_nothing(database: TestDatabase) {
-    let fleet = Fleet::with_delivery(database, &settings(vec![rule("lacking_at_most", 0, Delivery::Poll)]));
+    let fleet = Fleet::with_delivery(database, &settings(vec![rule("lacking_at_most", 0, Delivery::Poll)])).await;
     let mut robots = fleet.enroll(3).await;
     let id = fleet.deploy("1", |_| ()).await;
     assert_eq!(decisions(&fleet, &id).await, vec![decision(Delivery::Inline, "tiny", "size 2 B ≤ 32 KB"); 3]);
@@ -155,7 +156,7 @@ async fn a_robot_that_has_the_bytes_lacks_nothing(database: TestDatabase) {
 }
 
 async fn what_was_ordered_is_kept_and_orders_have_priorities(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(1).await;
     for (version, choice) in
         [("1", DeliveryChoice::DirectPush), ("2", DeliveryChoice::Poll), ("3", DeliveryChoice::Inline)]
@@ -186,7 +187,7 @@ async fn what_was_ordered_is_kept_and_orders_have_priorities(database: TestDatab
 }
 
 async fn more_than_an_announcement_carries_is_refused(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     fleet.enroll(1).await;
     let mut large = package("1", TaskKind::Service);
     large.package.content.size = 10_171_187;
@@ -208,7 +209,7 @@ async fn more_than_an_announcement_carries_is_refused(database: TestDatabase) {
 }
 
 async fn a_decision_of_an_older_version_is_the_orders(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(1).await;
     let id = fleet.deploy("1", |order| order.delivery = DeliveryChoice::Poll).await;
     fleet.database.forget_decisions().await;
@@ -217,7 +218,7 @@ async fn a_decision_of_an_older_version_is_the_orders(database: TestDatabase) {
 }
 
 async fn blobs_ride_along_until_the_robot_has_them(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(1).await;
     let riding = async |robot: &Robot| fleet.actions.desired(&robot.id).await.expect("a state").along;
     let package = |version| package(version, TaskKind::Service).package;
@@ -237,7 +238,7 @@ async fn blobs_ride_along_until_the_robot_has_them(database: TestDatabase) {
 }
 
 async fn a_link_is_kept_until_another_is_measured(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(1).await;
     let link = LinkFacts { throughput_bytes_per_s: Some(9), rtt_ms: Some(2), reconnects: 1, losses: 0 };
     robots[0].link = Some(link);
@@ -256,7 +257,7 @@ async fn a_link_is_kept_until_another_is_measured(database: TestDatabase) {
 }
 
 async fn who_waits_for_parts_is_known_until_it_has_them_or_pulls(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(2).await;
     let content = package("1", TaskKind::Service).package.content.digest;
     let id = fleet.deploy("1", |order| order.delivery = DeliveryChoice::DirectPush).await;

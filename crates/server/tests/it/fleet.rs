@@ -3,13 +3,17 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use task_proto::api::{CreateDeployment, CreateEnrollmentToken, DeploymentView, EnrollRequest, PackageView, RobotView};
+use task_proto::api::{
+    AddUser, CreateDeployment, CreateEnrollmentToken, CreateToken, DeploymentView, EnrollRequest, PackageView,
+    RobotView,
+};
 use task_proto::desired::{BlobRef, DesiredState, DesiredTask, PackageRef};
 use task_proto::envelope::{DESIRED_STATE_TYPE, SigningKey};
 use task_proto::manifest::{TaskKind, TaskManifest};
+use task_proto::person::{Role, Roles};
 use task_proto::report::{HostFacts, LinkFacts, Phase, Report, TaskReport};
 use task_proto::token::{Token, TokenKind};
-use task_proto::{DeploymentId, Digest, Generation, InstanceId, MacAddress, RobotId};
+use task_proto::{DeploymentId, Digest, Generation, InstanceId, MacAddress, RobotId, UserName};
 use taskd::actions::{ActionError, ActionSettings, Actions, Enrolled, IdempotencyKey};
 use taskd::changes::Changes;
 use taskd::chooser::{Chooser, ServerLoad};
@@ -18,6 +22,7 @@ use taskd::config::DeliverySettings;
 use taskd::person::Person;
 use taskd::presence::Presence;
 use taskd::report_writer::ReportWriter;
+use taskd::store::TokenHolder;
 
 use crate::database::TestDatabase;
 
@@ -48,11 +53,11 @@ pub struct Robot {
 }
 
 impl Fleet {
-    pub fn new(database: TestDatabase) -> Self {
-        Self::with_delivery(database, &DeliverySettings::default())
+    pub async fn new(database: TestDatabase) -> Self {
+        Self::with_delivery(database, &DeliverySettings::default()).await
     }
 
-    pub fn with_delivery(database: TestDatabase, settings: &DeliverySettings) -> Self {
+    pub async fn with_delivery(database: TestDatabase, settings: &DeliverySettings) -> Self {
         let load = Arc::new(ServerLoad::default());
         let (clock, changes) = (Clock::fixed(1_000_000), Changes::new());
         let presence = Arc::new(Presence::new(90_000));
@@ -67,8 +72,25 @@ impl Fleet {
             ActionSettings::default(),
             chooser.clone(),
         );
-        let operator = Person::first(&Token::random(TokenKind::Operator));
+        let token = Token::random(TokenKind::Operator);
+        database.store.create_operator_token(&token, clock.now_ms()).await.expect("stored");
+        let operator = Person::first(token.id().parse().expect("an id"));
         Self { database, actions, operator, writer, clock, changes, presence, load, chooser }
+    }
+
+    /// An administrator of the robots that `scope` means.
+    pub async fn limited(&self, name: &str, scope: &str) -> Person {
+        let user: UserName = name.parse().expect("a name");
+        let scope = Some(scope.parse().expect("a selector"));
+        let order = AddUser { name: user.clone(), roles: Roles::one(Role::Admin), scope, password: None };
+        self.actions.add_user(&self.operator, &order).await.expect("added");
+        let order = CreateToken { user: Some(user), ..CreateToken::default() };
+        let made = self.actions.create_token(&self.operator, &order).await.expect("made");
+        let token = made.token.parse().expect("a token");
+        match self.database.store.token_holder(&token, self.clock.now_ms()).await.expect("reads") {
+            Some(TokenHolder::Person(person)) => person,
+            other => panic!("{other:?}"),
+        }
     }
 
     pub async fn enrolment_token(&self, order: CreateEnrollmentToken) -> task_proto::token::Token {

@@ -33,7 +33,7 @@ fn steps(past: &PastAssignment) -> Vec<(Phase, u64, u32)> {
 }
 
 async fn every_phase_says_when_it_began(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let mut robot = fleet.enroll(1).await.remove(0);
     let began_ms = fleet.clock.now_ms();
     let first = fleet.deploy("1.0.0", |_| {}).await;
@@ -77,7 +77,7 @@ async fn every_phase_says_when_it_began(database: TestDatabase) {
 }
 
 async fn what_a_robot_has_comes_back_into_its_timeline(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let mut robot = fleet.enroll(1).await.remove(0);
     fleet.deploy("1.0.0", |_| {}).await;
     fleet.follow(&mut robot, Phase::Running).await;
@@ -91,7 +91,7 @@ async fn what_a_robot_has_comes_back_into_its_timeline(database: TestDatabase) {
 }
 
 async fn a_long_timeline_keeps_its_beginning_and_its_end(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let mut robot = fleet.enroll(1).await.remove(0);
     fleet.deploy("1.0.0", |_| {}).await;
     let began_ms = fleet.clock.now_ms();
@@ -107,7 +107,7 @@ async fn a_long_timeline_keeps_its_beginning_and_its_end(database: TestDatabase)
 }
 
 async fn a_robots_history_is_read_in_pages(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(2).await;
     let mut ordered = Vec::new();
     for version in ["1.0.0", "1.1.0", "1.2.0"] {
@@ -133,7 +133,7 @@ async fn a_robots_history_is_read_in_pages(database: TestDatabase) {
 }
 
 async fn settings_are_part_of_the_desired_state(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(2).await;
     let before = fleet.desired(&robots[0]).await.expect("a state");
     assert!(before.settings.is_empty());

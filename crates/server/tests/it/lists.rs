@@ -17,7 +17,7 @@ on_both_databases! {
 }
 
 async fn pages_of_robots_have_each_once(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     fleet.enroll(12).await;
     // The order is that of the bytes, on every database: capitals come first, r10 before r2.
     let everything = Scope::everything();
@@ -47,7 +47,7 @@ async fn pages_of_robots_have_each_once(database: TestDatabase) {
 }
 
 async fn pages_of_deployments_have_each_once(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(2).await;
     let mut ordered = Vec::new();
     for version in 0..7 {

@@ -24,6 +24,7 @@ mod fleet;
 mod harness;
 mod headers;
 mod history;
+mod late;
 mod lists;
 mod logs;
 mod mqtt;

@@ -69,7 +69,7 @@ async fn a_package_in_use_outlives_its_manifest(database: TestDatabase) {
     let tags: Value = registry.get("/v2/talker/tags/list").await.json().await.expect("JSON");
     assert_eq!(tags["tags"], json!(["1.0.0"]));
 
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(1).await;
     let ordered = registry.registry.store.packages().await.expect("packages").remove(0);
     fleet

@@ -1,5 +1,6 @@
 //! A registry over a real listener, and a client that says what it wants of it.
 
+use std::sync::LazyLock;
 use std::time::Duration;
 
 use axum::Router;
@@ -12,6 +13,7 @@ use task_proto::Digest;
 use task_proto::desired::BlobRef;
 use task_proto::oci::MANIFEST_TYPE;
 use task_proto::token::{Token, TokenKind};
+
 use taskd::blobs::{BlobSettings, Blobs};
 use taskd::changes::Changes;
 use taskd::clock::Clock;
@@ -28,6 +30,9 @@ use tempfile::TempDir;
 pub const GRACE: Duration = Duration::from_secs(3600);
 /// Past what any file's time can be when a test runs.
 pub const NOW_MS: u64 = 4_000_000_000_000;
+
+/// What [`operator`] comes with.
+static OPERATOR: LazyLock<Token> = LazyLock::new(|| Token::random(TokenKind::Operator));
 
 pub struct TestRegistry {
     pub base: String,
@@ -50,6 +55,7 @@ impl TestRegistry {
 
     pub async fn start_on(store: Store, data: TempDir, settings: BlobSettings, caller: Option<Caller>) -> Self {
         let blobs = Blobs::open(data.path(), settings).expect("a blob store");
+        store.create_operator_token(&OPERATOR, NOW_MS).await.expect("stored");
         let site_label = "site".parse().expect("a label's key");
         let transfers = Transfers::new(&TransferLimits::default(), site_label);
         let (clock, changes) = (Clock::fixed(NOW_MS), Changes::new());
@@ -136,7 +142,7 @@ pub async fn let_in(
 }
 
 pub fn operator() -> Caller {
-    Caller::Person(Person::first(&Token::random(TokenKind::Operator)))
+    Caller::Person(Person::first(OPERATOR.id().parse().expect("an id")))
 }
 
 pub fn image(config: BlobRef, layer: BlobRef) -> Value {

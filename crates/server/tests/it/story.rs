@@ -38,7 +38,7 @@ pub fn code<T>(result: Result<T, ActionError>) -> &'static str {
 }
 
 async fn a_removed_robot_leaves_its_mac_and_name(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let token = fleet.enrolment_token(CreateEnrollmentToken::default()).await;
     let old = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("enrols");
     let mut robot = Robot::new(old.robot_id.clone());
@@ -59,7 +59,7 @@ async fn a_removed_robot_leaves_its_mac_and_name(database: TestDatabase) {
 }
 
 async fn an_order_reaches_all_that_match_and_settles(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(3).await;
     let nobody = order_of(&package("1", TaskKind::Service));
     let nobody = task_proto::api::CreateDeployment { selector: "site=mars".parse().expect("valid"), ..nobody };
@@ -93,7 +93,7 @@ async fn an_order_reaches_all_that_match_and_settles(database: TestDatabase) {
 }
 
 async fn an_idempotency_key_orders_once(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     fleet.enroll(1).await;
     let (key, package) = (random_key(), package("1", TaskKind::Service));
     let order = order_of(&package);
@@ -119,7 +119,7 @@ async fn an_idempotency_key_orders_once(database: TestDatabase) {
 }
 
 async fn racing_operators_leave_one_winner(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(5).await;
     // A second server process on the same database would be as good a rival as a second operator.
     let rival = Store::open(&fleet.database.url).await.expect("opens");
@@ -160,7 +160,7 @@ async fn racing_operators_leave_one_winner(database: TestDatabase) {
 }
 
 async fn a_newer_deployment_supersedes_and_a_cancel_puts_back(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(2).await;
     let old = fleet.deploy("1", |_| ()).await;
     for robot in &mut robots {
@@ -200,7 +200,7 @@ async fn a_newer_deployment_supersedes_and_a_cancel_puts_back(database: TestData
 }
 
 async fn a_cancel_skips_what_was_cancelled_before(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(1).await;
     let one = fleet.deploy("1", |_| ()).await;
     let two = fleet.deploy("2", |_| ()).await;
@@ -215,7 +215,7 @@ async fn a_cancel_skips_what_was_cancelled_before(database: TestDatabase) {
 }
 
 async fn robots_that_are_to_poll_are_not_rung(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(2).await;
     let poll = fleet.deploy("1", |order| {
         order.selector = "r0".parse().expect("valid");
@@ -228,7 +228,7 @@ async fn robots_that_are_to_poll_are_not_rung(database: TestDatabase) {
 }
 
 async fn batches_follow_each_other_and_failures_pause(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(6).await;
     let id = fleet
         .deploy("1", |order| {
@@ -267,7 +267,7 @@ async fn batches_follow_each_other_and_failures_pause(database: TestDatabase) {
 }
 
 async fn what_is_not_done_in_time_expires(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(2).await;
     let old = fleet.deploy("1", |_| ()).await;
     for robot in &mut robots {
@@ -290,7 +290,7 @@ async fn what_is_not_done_in_time_expires(database: TestDatabase) {
 }
 
 async fn tasks_are_stopped_started_and_removed(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(2).await;
     let id = fleet.deploy("1", |order| order.selector = "r0".parse().expect("valid")).await;
     let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
@@ -333,7 +333,7 @@ async fn tasks_are_stopped_started_and_removed(database: TestDatabase) {
 }
 
 async fn late_reports_change_nothing(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(1).await;
     let id = fleet.deploy("1", |_| ()).await;
     let robot = &mut robots[0];
@@ -352,7 +352,7 @@ async fn late_reports_change_nothing(database: TestDatabase) {
 }
 
 async fn reports_at_once_are_all_acknowledged(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(20).await;
     let id = fleet.deploy("1", |_| ()).await;
     let mut submissions = tokio::task::JoinSet::new();
@@ -369,7 +369,7 @@ async fn reports_at_once_are_all_acknowledged(database: TestDatabase) {
 }
 
 async fn a_report_that_can_not_be_stored_is_answered_so(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(1).await;
     fleet.database.store.close().await;
     let refused = fleet.writer.submit(robots[0].next_report(), 0).await;
@@ -377,10 +377,10 @@ async fn a_report_that_can_not_be_stored_is_answered_so(database: TestDatabase) 
 }
 
 async fn a_restored_database_leaves_robots_alone_until_the_next_order(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(2).await;
     // The robots know three orders that this database has never seen.
-    let before = Fleet::new(crate::database::sqlite().await);
+    let before = Fleet::new(crate::database::sqlite().await).await;
     let mut elsewhere = before.enroll(1).await;
     for version in ["1", "2", "3"] {
         before.deploy(version, |_| ()).await;
@@ -416,7 +416,7 @@ async fn a_restored_database_leaves_robots_alone_until_the_next_order(database: 
 }
 
 async fn numbers_at_the_end_of_their_range_stop_no_order(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(2).await;
     fleet.deploy("1", |_| ()).await;
     for robot in &mut robots {
@@ -443,7 +443,7 @@ async fn numbers_at_the_end_of_their_range_stop_no_order(database: TestDatabase)
 }
 
 async fn a_reopened_database_knows_everything(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(1).await;
     let id = fleet.deploy("1", |_| ()).await;
     fleet.follow(&mut robots[0], Phase::Running).await;

@@ -25,7 +25,7 @@ on_both_databases! {
 }
 
 async fn enrolment_gives_identities_by_mac(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let labels = [("site".parse().expect("key"), "lab".parse().expect("value"))].into();
     let token = fleet.enrolment_token(CreateEnrollmentToken { uses: Some(2), labels, ..Default::default() }).await;
     let one = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("enrols");
@@ -56,7 +56,7 @@ async fn enrolment_gives_identities_by_mac(database: TestDatabase) {
 }
 
 async fn tokens_stand_for_their_holder_until_they_end(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let store = &fleet.database.store;
     let operator = Token::random(TokenKind::Operator);
     let now_ms = fleet.clock.now_ms();
@@ -64,7 +64,7 @@ async fn tokens_stand_for_their_holder_until_they_end(database: TestDatabase) {
     store.create_operator_token(&operator, now_ms).await.expect("stored");
     assert_eq!(
         store.token_holder(&operator, now_ms).await.expect("reads"),
-        Some(TokenHolder::Person(Person::first(&operator)))
+        Some(TokenHolder::Person(Person::first(operator.id().parse().expect("an id"))))
     );
     let enrolment = fleet.enrolment_token(CreateEnrollmentToken { ttl_s: Some(60), ..Default::default() }).await;
     assert_eq!(store.token_holder(&enrolment, now_ms).await.expect("reads"), Some(TokenHolder::Enrolment));
@@ -98,7 +98,7 @@ async fn robot_of(store: &Store, token: &Token) -> Option<RobotId> {
 }
 
 async fn a_new_token_ends_the_old_one_when_it_is_first_used(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let store = fleet.database.store.clone();
     let admit = async |token: &Token| match store.admit(token, &ClientProof::NotAsked, 1_000_000).await.expect("reads")
     {
@@ -156,7 +156,7 @@ async fn a_new_token_ends_the_old_one_when_it_is_first_used(database: TestDataba
 }
 
 async fn a_first_use_by_two_at_once_is_one(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let token = fleet.enrolment_token(CreateEnrollmentToken::default()).await;
     let robot = fleet.try_enroll(&token, mac(1), None).await.expect("enrols");
     let mut uses = tokio::task::JoinSet::new();
@@ -171,7 +171,7 @@ async fn a_first_use_by_two_at_once_is_one(database: TestDatabase) {
 }
 
 async fn a_fleet_that_comes_at_once_is_let_in_whole(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let token = fleet.enrolment_token(CreateEnrollmentToken::default()).await;
     let mut robots = Vec::new();
     for number in 0..100 {
@@ -198,7 +198,7 @@ async fn a_fleet_that_comes_at_once_is_let_in_whole(database: TestDatabase) {
 }
 
 async fn a_lost_answer_to_an_enrolment_is_mended_by_asking_again(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let store = fleet.database.store.clone();
     let order = || CreateEnrollmentToken { uses: Some(1), ..Default::default() };
     let (token, other) = (fleet.enrolment_token(order()).await, fleet.enrolment_token(order()).await);
@@ -234,7 +234,7 @@ async fn a_lost_answer_to_an_enrolment_is_mended_by_asking_again(database: TestD
 }
 
 async fn a_revoked_robots_tokens_end_and_its_late_reports_come_too_late(database: TestDatabase) {
-    let fleet = Fleet::new(database);
+    let fleet = Fleet::new(database).await;
     let store = fleet.database.store.clone();
     let order = || CreateEnrollmentToken { robot: Some("atlas".to_owned()), ..Default::default() };
     let token = fleet.enrolment_token(CreateEnrollmentToken::default()).await;

@@ -139,7 +139,10 @@ impl OciError {
 
 impl From<StoreError> for OciError {
     fn from(error: StoreError) -> Self {
-        Self::internal(&error)
+        match error {
+            StoreError::RightsEnded => Self::new(StatusCode::UNAUTHORIZED, "UNAUTHORIZED", error.to_string()),
+            _ => Self::internal(&error),
+        }
     }
 }
 

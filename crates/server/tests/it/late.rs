@@ -1,0 +1,178 @@
+//! Orders that come too late, or for robots about which the database knows too little: nothing is taken away by them, and
+//! nothing moves again that somebody stopped.
+
+use task_proto::Generation;
+use task_proto::desired::Wanted;
+use task_proto::manifest::TaskKind;
+use task_proto::report::Phase;
+use taskd::actions::TaskOrder;
+
+use crate::database::{TestDatabase, on_both_databases};
+use crate::fleet::{Fleet, Robot, package, random_key};
+use crate::story::code;
+
+on_both_databases! {
+    a_restart_that_comes_too_late_leaves_what_runs,
+    what_was_stopped_stays_so,
+    a_silent_robot_holds_up_its_batch_and_no_later_one,
+    nobody_takes_over_robots_that_are_not_theirs,
+    a_robots_word_opens_no_blob,
+    what_was_taken_over_can_be_rolled_back_to,
+    an_order_for_a_robot_that_diverged_since_expires,
+}
+
+/// What is ordered of a task that has run, and does not reach its robot in time, takes nothing away from it.
+async fn a_restart_that_comes_too_late_leaves_what_runs(database: TestDatabase) {
+    let fleet = Fleet::new(database).await;
+    let mut robots = fleet.enroll(2).await;
+    let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
+    let order = async |order| {
+        fleet.actions.order_task(&fleet.operator, &random_key(), order, &task, &everyone).await.expect("ordered");
+    };
+    fleet.deploy("1", |order| order.selector = "r0".parse().expect("valid")).await;
+    fleet.follow(&mut robots[0], Phase::Running).await;
+    let new = fleet.deploy("2", |_| ()).await;
+    for robot in &mut robots {
+        fleet.follow(robot, Phase::Running).await;
+    }
+    for (late, wanted, phase) in [
+        (TaskOrder::Restart, Wanted::Running, Phase::Running),
+        (TaskOrder::Stop, Wanted::Stopped, Phase::Stopped),
+        (TaskOrder::Start, Wanted::Stopped, Phase::Stopped),
+    ] {
+        order(late).await;
+        if late == TaskOrder::Stop {
+            for robot in &mut robots {
+                fleet.follow(robot, Phase::Stopped).await;
+            }
+        }
+        fleet.clock.advance_ms(8 * 24 * 3_600_000);
+        fleet.actions.expire().await.expect("done");
+        for robot in &robots {
+            let desired = fleet.desired(robot).await.expect("state").tasks.remove(0);
+            assert_eq!((desired.deployment, desired.wanted, desired.run), (new.clone(), wanted, 1), "{late:?}");
+        }
+        assert_eq!(fleet.phases(&new).await, [phase; 2], "{late:?}");
+    }
+    // A cancel of its order neither takes away what was only told to start again.
+    order(TaskOrder::Restart).await;
+    fleet.actions.cancel_deployment(&fleet.operator, &new).await.expect("cancelled");
+    for robot in &robots {
+        assert_eq!(fleet.desired(robot).await.expect("state").tasks[0].deployment, new);
+    }
+    // Who has heard of a restart, and did not come to it, does not come to it later.
+    order(TaskOrder::Restart).await;
+    fleet.follow(&mut robots[0], Phase::Staged).await;
+    fleet.clock.advance_ms(8 * 24 * 3_600_000);
+    fleet.actions.expire().await.expect("done");
+    let desired = fleet.desired(&robots[0]).await.expect("state").tasks.remove(0);
+    assert_eq!((desired.deployment, desired.wanted), (new, Wanted::Stopped));
+}
+
+async fn what_was_stopped_stays_so(database: TestDatabase) {
+    let fleet = Fleet::new(database).await;
+    let mut robots = fleet.enroll(2).await;
+    let stop = async || {
+        let (task, of) = ("talker".parse().expect("valid"), "r1".parse().expect("valid"));
+        fleet.actions.order_task(&fleet.operator, &random_key(), TaskOrder::Stop, &task, &of).await.expect("ordered");
+    };
+    let old = fleet.deploy("1", |_| ()).await;
+    for robot in &mut robots {
+        fleet.follow(robot, Phase::Running).await;
+    }
+    // Though a later batch would have brought another version of it.
+    fleet.deploy("2", |order| order.batch = Some(1)).await;
+    stop().await;
+    fleet.follow(&mut robots[0], Phase::Running).await;
+    let desired = fleet.desired(&robots[1]).await.expect("state").tasks.remove(0);
+    assert_eq!((desired.deployment, desired.wanted), (old.clone(), Wanted::Stopped));
+    // Though what it was stopped in is taken back.
+    fleet.deploy("3", |order| order.selector = "r1".parse().expect("valid")).await;
+    stop().await;
+    fleet.clock.advance_ms(8 * 24 * 3_600_000);
+    fleet.actions.expire().await.expect("done");
+    let desired = fleet.desired(&robots[1]).await.expect("state").tasks.remove(0);
+    assert_eq!((desired.deployment, desired.wanted), (old, Wanted::Stopped));
+}
+
+async fn a_silent_robot_holds_up_its_batch_and_no_later_one(database: TestDatabase) {
+    let fleet = Fleet::new(database).await;
+    let mut robots = fleet.enroll(3).await;
+    let id = fleet.deploy("1", |order| (order.batch, order.expires_in_s) = (Some(1), Some(60))).await;
+    fleet.clock.advance_ms(60_000);
+    fleet.actions.expire().await.expect("done");
+    assert_eq!(fleet.phases(&id).await, [Phase::Expired, Phase::Assigned, Phase::Assigned]);
+    // The second batch has as much time as the first.
+    fleet.clock.advance_ms(59_999);
+    fleet.actions.expire().await.expect("done");
+    fleet.follow(&mut robots[1], Phase::Running).await;
+    assert_eq!(fleet.desired(&robots[2]).await.expect("state").tasks[0].deployment, id);
+}
+
+/// A fleet whose robots run version 1 of orders that its database has never seen.
+async fn restored(database: TestDatabase, count: u32) -> (Fleet, Vec<Robot>) {
+    let fleet = Fleet::new(database).await;
+    let mut robots = fleet.enroll(count).await;
+    let before = Fleet::new(crate::database::sqlite().await).await;
+    let elsewhere = before.enroll(1).await;
+    before.deploy("1", |_| ()).await;
+    let lost = before.desired(&elsewhere[0]).await.expect("state");
+    for robot in &mut robots {
+        robot.accept(&lost, Phase::Running);
+        fleet.report(robot).await;
+    }
+    (fleet, robots)
+}
+
+async fn nobody_takes_over_robots_that_are_not_theirs(database: TestDatabase) {
+    let (fleet, robots) = restored(database, 2).await;
+    let alice = fleet.limited("alice", "r0").await;
+    let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
+    let meant = fleet.actions.order_task(&alice, &random_key(), TaskOrder::Stop, &task, &everyone).await;
+    assert_eq!(meant.expect("ordered").len(), 1);
+    assert_eq!(fleet.view(&robots[0]).await.generation, Generation(2));
+    assert_eq!(fleet.view(&robots[1]).await.generation, Generation(0));
+    assert_eq!(code(fleet.desired(&robots[1]).await), "diverged");
+}
+
+async fn a_robots_word_opens_no_blob(database: TestDatabase) {
+    let (fleet, robots) = restored(database, 1).await;
+    let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
+    fleet.actions.order_task(&fleet.operator, &random_key(), TaskOrder::Stop, &task, &everyone).await.expect("ordered");
+    let named = package("1", TaskKind::Service).package;
+    assert_eq!(fleet.desired(&robots[0]).await.expect("state").tasks[0].package, named);
+    let may = async || {
+        let order = fleet.database.store.fetched_by(&robots[0].id, &named.content.digest).await.expect("reads");
+        order.is_some()
+    };
+    assert!(!may().await, "it may have made it up");
+    fleet.publish("1").await;
+    assert!(may().await);
+}
+
+async fn what_was_taken_over_can_be_rolled_back_to(database: TestDatabase) {
+    let (fleet, mut robots) = restored(database, 1).await;
+    for version in ["1", "2"] {
+        fleet.publish(version).await;
+    }
+    let two = fleet.deploy("2", |_| ()).await;
+    fleet.follow(&mut robots[0], Phase::Failed).await;
+    assert_eq!(fleet.phases(&two).await, [Phase::Failed]);
+    let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
+    let back = fleet.actions.roll_back(&fleet.operator, &random_key(), &task, &everyone).await.expect("there is one");
+    assert_eq!(back.robots.len(), 1);
+    assert_eq!(fleet.version(&robots[0]).await, "1");
+}
+
+async fn an_order_for_a_robot_that_diverged_since_expires(database: TestDatabase) {
+    let fleet = Fleet::new(database).await;
+    let mut robots = fleet.enroll(1).await;
+    let id = fleet.deploy("1", |_| ()).await;
+    robots[0].observed = Generation(1 << 40);
+    fleet.report(&mut robots[0]).await;
+    fleet.clock.advance_ms(8 * 24 * 3_600_000);
+    fleet.actions.expire().await.expect("done");
+    assert_eq!(fleet.phases(&id).await, [Phase::Expired]);
+    let view = fleet.view(&robots[0]).await;
+    assert_eq!((view.generation, view.conditions[0].code.as_str()), (Generation(1), "diverged"));
+}

@@ -26,6 +26,7 @@ const page = await context.newPage();
 const devtools = await context.newCDPSession(page);
 
 await page.goto(`${url}/#token=${process.env.TASKD_TOKEN}`);
+await page.getByRole('button', { name: 'Sign in with it' }).click();
 await allRows();
 
 const seen = { browser: browser.version(), first_rows_ms: [], all_rows_ms: [], frame_ms: [], frame_cpu_ms: [], task_ms: [], heap_bytes: [] };

@@ -79,6 +79,8 @@ const page = {
   heardAt: null,
   /** Another way to sign in, if there is one. */
   provider: null,
+  /** What a link brought to sign in with. */
+  token: null,
   clockAheadMs: 0,
   problem: null,
   isSigningIn: false,
@@ -98,13 +100,21 @@ async function start({ token, problem } = ofLink()) {
   try {
     const { expires_at_ms: until, provider } = await api.session();
     page.provider = provider;
-    if (token) signIn({ token });
-    else if (until) enter();
+    if (until) enter();
     else leave(problem && problemOfProvider(problem));
+    if (token) offer(token);
   } catch (error) {
     change(() => (page.problem = error.message));
     setTimeout(() => start({ token, problem }), REFETCH_PAUSE_MS);
   }
+}
+
+/** Leaves a link's token to who is not in: anybody can make such a link, so it signs nobody in by itself. */
+function offer(token) {
+  if (page.state === 'in') return;
+  change(() => (page.token = token));
+  // After the drawing that was just asked for.
+  requestAnimationFrame(() => document.querySelector('.by-token button')?.focus());
 }
 
 async function signIn(who) {
@@ -120,7 +130,7 @@ async function signIn(who) {
 function enter() {
   live?.stop();
   change(() => {
-    Object.assign(page, { state: 'in', problem: null, isSigningIn: false, stream: { state: 'connecting' } });
+    Object.assign(page, { state: 'in', problem: null, token: null, isSigningIn: false, stream: { state: 'connecting' } });
     forget();
     arrive();
   });
@@ -168,9 +178,9 @@ function arrive() {
   page.view.arrive(here);
 }
 
-addEventListener('hashchange', () => {
-  const { token } = ofLink();
-  if (token) signIn({ token });
+addEventListener('hashchange', ({ oldURL }) => {
+  const { token } = ofLink(oldURL);
+  if (token) offer(token);
   else if (page.state === 'in') change(arrive);
 });
 

@@ -15,10 +15,10 @@ const PROVIDER_PROBLEMS = {
 
 export const problemOfProvider = (code) => PROVIDER_PROBLEMS[code] ?? PROVIDER_PROBLEMS.failed;
 
-/** What a link says, `/#token=…` or `/#problem=…`, which then leaves the address bar and the history. */
-export function ofLink() {
+/** What a link says, `/#token=…` or `/#problem=…`, which then leaves the address bar and the history: `before` takes its place. */
+export function ofLink(before = location.pathname) {
   const said = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
-  if (said.token || said.problem) history.replaceState(null, '', location.pathname);
+  if (said.token || said.problem) history.replaceState(null, '', before);
   return said;
 }
 
@@ -29,25 +29,26 @@ function whoOf(event) {
   return fields.token ? { token: fields.token.trim() } : { user: fields.user.trim(), password: fields.password };
 }
 
-/** The view. `signIn` gets `{ user, password }` or `{ token }`. */
-export const signInView = ({ provider, problem, isSigningIn }, signIn) => html`
+/** The view. `token` is what a link brought; `signIn` gets `{ user, password }` or `{ token }`. */
+export const signInView = ({ provider, problem, token, isSigningIn }, signIn) => html`
   <main class="sign-in">
     <h1>taskd</h1>
     ${provider ? html`<p><a class="button by-provider" href=${provider.url}>Sign in with ${provider.title}</a></p>` : nothing}
     <form class="by-password" @submit=${(event) => signIn(whoOf(event))}>
       <label for="user">Name</label>
-      <input id="user" name="user" required autofocus autocomplete="username" autocapitalize="none" spellcheck="false">
+      <input id="user" name="user" required ?autofocus=${!token} autocomplete="username" autocapitalize="none" spellcheck="false">
       <label for="password">Password</label>
       <input id="password" name="password" type="password" required autocomplete="current-password" aria-describedby="problem">
       <button class="primary" ?disabled=${isSigningIn}>Sign in</button>
       <p id="problem" class="bad" role="alert">${problem ?? ''}</p>
     </form>
-    <details>
+    <details ?open=${Boolean(token)}>
       <summary>With a token</summary>
       <form class="by-token" @submit=${(event) => signIn(whoOf(event))}>
         <label for="token">Token</label>
-        <input id="token" name="token" type="password" required autocomplete="off" spellcheck="false" aria-describedby="hint problem">
-        <button class="primary" ?disabled=${isSigningIn}>Sign in with it</button>
+        <input id="token" name="token" type="password" required autocomplete="off" spellcheck="false" aria-describedby="hint problem" .value=${token ?? ''}>
+        ${token ? html`<p id="of-link">A link brought this token. Use it only if you know from whom it comes.</p>` : nothing}
+        <button class="primary" aria-describedby=${token ? 'of-link' : nothing} ?disabled=${isSigningIn}>Sign in with it</button>
       </form>
       <p id="hint" class="quiet">It starts with <code>tsko_</code>. The first one lies in the server's data directory, in <code>operator.token</code>.</p>
     </details>

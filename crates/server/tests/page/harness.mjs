@@ -281,7 +281,7 @@ const REFUSAL = /^Failed to load resource: .* status of (409|504) /;
 /** Contexts whose pages were opened by `open`, each with what its browser complained of. */
 const complaints = new WeakMap();
 
-/** A page at `hash`, signed in by the token in the link. What it asks of other hosts, and what its console says, fails the test at its end. */
+/** A page at `hash`, signed in with the token of a link. What it asks of other hosts, and what its console says, fails the test at its end. */
 export async function open(t, server, { on, hash = '', token = server.token, ...options } = {}) {
   const context = await (on ?? (await browser(t))).newContext({ viewport: { width: 1280, height: 900 }, ...options });
   context.setDefaultTimeout(PATIENCE_MS);
@@ -294,10 +294,16 @@ export async function open(t, server, { on, hash = '', token = server.token, ...
   context.on('console', (message) => ['error', 'warning'].includes(message.type()) && !REFUSAL.test(message.text()) && said.push(message.text()));
   context.on('weberror', (error) => said.push(String(error.error().stack)));
   const page = await context.newPage();
-  await page.goto(`${server.url}/#token=${token}`);
+  await followLink(page, server, token);
   await live(page);
   if (hash) await page.goto(`${server.url}/${hash}`);
   return page;
+}
+
+/** Comes by a link with a token, and signs in with it. */
+export async function followLink(page, server, token) {
+  await page.goto(`${server.url}/#token=${token}`);
+  await page.getByRole('button', { name: 'Sign in with it' }).press('Enter');
 }
 
 /** What the page's browser complained of since the last time. */

@@ -52,10 +52,11 @@ test('a wrong token is refused in words, and a restarted server is found again',
   const it = await browser(t);
   const page = await it.newPage();
   await page.goto(`${server.url}/#token=tsko_wrong`);
-  await page.getByRole('alert').filter({ hasText: 'token: ' }).waitFor();
+  await until(page, () => document.activeElement.matches('.by-token button'));
   assert.equal(page.url(), `${server.url}/`, 'the token has left the address bar');
+  await page.keyboard.press('Enter');
+  await page.getByRole('alert').filter({ hasText: 'token: ' }).waitFor();
   const signIn = async () => {
-    await page.getByText('With a token').click();
     await page.locator('form.by-token input').fill(server.token);
     await page.getByRole('button', { name: 'Sign in with it' }).click();
     await live(page);
@@ -67,10 +68,54 @@ test('a wrong token is refused in words, and a restarted server is found again',
   // Sessions end with the server; the page finds it and asks to sign in again.
   await page.getByLabel('Name', { exact: true }).waitFor();
   await page.reload();
+  await page.getByText('With a token').click();
   await signIn();
   await page.getByRole('button', { name: 'Sign out' }).click();
   await page.getByLabel('Name', { exact: true }).waitFor();
   assert.equal(await page.evaluate(() => fetch('/api/v1/robots').then(({ status }) => status)), 401);
+});
+
+test('a link with a token signs nobody in by itself', async (t) => {
+  const server = await Server.start(t);
+  await server.ask('POST', '/users', { name: 'mallory', roles: ['viewer'] });
+  const { token } = await server.ask('POST', '/tokens', { user: 'mallory' });
+  const link = `${server.url}/#token=${token}`;
+  const it = await browser(t);
+  const page = await open(t, server, { on: it, hash: '#/settings' });
+  const sent = [];
+  page.context().on('request', (request) => request.method() === 'POST' && sent.push(request.url()));
+  const isStillIn = async (one) => {
+    await live(one);
+    await settled(one);
+    assert.equal(await one.locator('.who').innerText(), 'operator.token');
+    assert.equal(await one.evaluate(() => fetch('/api/v1/me').then((answer) => answer.json()).then(({ name }) => name)), 'operator.token');
+  };
+  // Where somebody is in, they stay: in the page that is open, and in one that the link opens.
+  await page.goto(link);
+  await page.waitForURL(/#\/settings$/);
+  await isStillIn(page);
+  await page.getByRole('heading', { name: 'Settings', exact: true }).waitFor();
+  const another = await page.context().newPage();
+  await another.goto(link);
+  await isStillIn(another);
+  assert.equal(another.url(), `${server.url}/`, 'the token has left the address bar');
+  assert.deepEqual(sent, [], 'nothing was sent to sign in');
+  assertQuiet(page);
+  // Where nobody is in, they are asked: by the page that the link opens, and by one that shows the way in already.
+  const stranger = await it.newPage();
+  const isAsked = async () => {
+    await stranger.getByText('Use it only if you know from whom it comes.').waitFor();
+    await until(stranger, () => document.activeElement.matches('.by-token button'));
+    assert.equal(await stranger.evaluate(() => fetch('/api/v1/me').then(({ status }) => status)), 401);
+  };
+  await stranger.goto(link);
+  await isAsked();
+  await stranger.reload();
+  await stranger.getByLabel('Name', { exact: true }).waitFor();
+  await stranger.goto(link);
+  await isAsked();
+  await stranger.keyboard.press('Enter');
+  await stranger.locator('.who', { hasText: 'mallory' }).waitFor();
 });
 
 test('a person sees their robots and what they may do with them', async (t) => {

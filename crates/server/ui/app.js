@@ -121,20 +121,21 @@ async function signIn(who) {
   change(() => Object.assign(page, { isSigningIn: true, problem: null }));
   try {
     await api.signIn(who);
-    enter();
+    enter({ isNew: true });
   } catch (error) {
     leave(error.message);
   }
 }
 
-function enter() {
+/** Goes in with the session there is; `isNew` says that it has just begun here. */
+function enter({ isNew = false } = {}) {
   live?.stop();
   change(() => {
     Object.assign(page, { state: 'in', problem: null, token: null, isSigningIn: false, stream: { state: 'connecting' } });
     forget();
     arrive();
   });
-  live = listen(hear);
+  live = listen(hear, { isNew });
 }
 
 function leave(problem = null) {

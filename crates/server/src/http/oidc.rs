@@ -113,7 +113,7 @@ async fn sign_in(
         app.broker.disconnect_person(&signed_in.user);
     }
     app.actions.provider_sign_in_succeeded(address);
-    Ok(begin_session(app, signed_in.token, signed_in.user, now_ms))
+    Ok(begin_session(app, headers, signed_in.token, signed_in.user, now_ms))
 }
 
 fn failed(error: &OidcError) -> &'static str {

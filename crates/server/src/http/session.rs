@@ -107,8 +107,9 @@ pub(super) fn set_cookie(app: &App, name: &str, value: &str, attributes: &str, m
     format!("{name}={value}; {attributes}; Max-Age={max_age_s}{secure}")
 }
 
-/// Begins a session and gives its cookie.
-pub(super) fn begin_session(app: &App, token: Token, user: UserName, now_ms: u64) -> String {
+/// Begins a session in place of the one that these headers came with, if any, and gives its cookie.
+pub(super) fn begin_session(app: &App, headers: &HeaderMap, token: Token, user: UserName, now_ms: u64) -> String {
+    app.sessions.end(headers);
     let id = app.sessions.begin(token, user, now_ms);
     set_cookie(app, COOKIE, &id, COOKIE_ATTRIBUTES, LIFETIME_MS / 1000)
 }
@@ -139,7 +140,7 @@ pub(super) async fn sign_in(
         }
         _ => return Err(ApiError::invalid("user: expected a user and a password, or else a token")),
     };
-    let cookie = begin_session(&app, token, user, now_ms);
+    let cookie = begin_session(&app, &headers, token, user, now_ms);
     let view = SessionView { expires_at_ms: Some(now_ms + LIFETIME_MS), provider: None };
     Ok(([(header::SET_COOKIE, cookie)], Json(view)).into_response())
 }

@@ -190,6 +190,32 @@ async fn a_session_opens_what_its_token_opens_and_only_from_its_own_page() {
     assert!(heard.expect("a proper end").contains("hello"));
 }
 
+/// Signs the operator in, from a browser with this cookie; gives the one it has then.
+async fn sign_in_with(server: &TestServer, cookie: &str) -> String {
+    let request = server.bare(Method::POST, "/api/v1/session").header("cookie", cookie);
+    let request = request.json(&json!({ "token": server.operator.reveal() }));
+    let response = request.send().await.expect("an answer");
+    assert_eq!(response.status(), StatusCode::OK);
+    let cookie = response.headers()["set-cookie"].to_str().expect("text");
+    cookie.split(';').next().expect("a pair").to_owned()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn signing_in_ends_the_session_that_the_browser_had() {
+    let server = TestServer::start().await;
+    let robots = |cookie: &str| server.bare(Method::GET, "/api/v1/robots").header("cookie", cookie);
+    let (first, other) = (sign_in_with(&server, "theme=dark").await, sign_in_with(&server, "theme=dark").await);
+    let wrong = json!({ "token": Token::random(TokenKind::Operator).reveal() });
+    let wrong = server.bare(Method::POST, "/api/v1/session").header("cookie", &first).json(&wrong);
+    assert_eq!(refusal(wrong).await.0, 401);
+    assert_eq!(robots(&first).send().await.expect("an answer").status(), StatusCode::OK, "only if that succeeds");
+    let second = sign_in_with(&server, &first).await;
+    assert_eq!(refusal(robots(&first)).await.0, 401);
+    for lives in [&second, &other] {
+        assert_eq!(robots(lives).send().await.expect("an answer").status(), StatusCode::OK);
+    }
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_cookie_of_an_encrypted_server_takes_no_other_way() {
     let directory = tempfile::TempDir::new().expect("a directory");

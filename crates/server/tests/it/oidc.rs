@@ -168,6 +168,17 @@ async fn somebody_comes_in_and_may_what_the_rules_say() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn coming_in_again_ends_the_session_that_the_browser_had() {
+    let (server, _provider) = town().await;
+    let mut visitor = Visitor::new(&server);
+    assert_eq!(visitor.sign_in().await, "/");
+    let former = visitor.cookie();
+    assert_eq!(visitor.sign_in().await, "/");
+    assert_eq!(visitor.me().await.name.as_str(), "alice");
+    assert_eq!(refusal(server.bare(Method::GET, "/api/v1/me").header("cookie", former)).await.0, 401);
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn without_a_provider_there_is_no_such_way_in() {
     let server = TestServer::start().await;
     let view: SessionView = answer(server.bare(Method::GET, "/api/v1/session")).await;

@@ -1,8 +1,9 @@
 // What does not depend on agents: many tabs, signing in, what robots say, keys, and that everybody can use it.
 
 import { test } from 'node:test';
-import { assert, assertAccessible, assertQuiet, browser, eventually, live, open, Puppet, Server, settled, takeComplaints, until } from './harness.mjs';
+import { assert, assertAccessible, assertQuiet, browser, eventually, followLink, live, open, Puppet, Server, settled, takeComplaints, until } from './harness.mjs';
 
+const PASSWORD = 'correct horse battery';
 const HOSTILE = '<img src=x onerror="document.title=\'owned\'"><script>document.title=\'owned\'</script>';
 
 test('nine tabs are live at once', async (t) => {
@@ -118,10 +119,31 @@ test('a link with a token signs nobody in by itself', async (t) => {
   await stranger.locator('.who', { hasText: 'mallory' }).waitFor();
 });
 
+test('who signs in hears nothing that was for who was in before', async (t) => {
+  const server = await Server.start(t);
+  await Puppet.enroll(server, 'atlas', { site: 'lab' });
+  await server.ask('POST', '/users', { name: 'alice', roles: ['viewer'], scope: 'site=lab', password: PASSWORD });
+  const context = await (await browser(t)).newContext();
+  const [mine, theirs] = [await context.newPage(), await context.newPage()];
+  await mine.goto(server.url);
+  await mine.getByLabel('Name', { exact: true }).fill('alice');
+  await mine.getByLabel('Password').fill(PASSWORD);
+  await followLink(theirs, server, server.token);
+  await live(theirs);
+  await mine.getByRole('button', { name: 'Sign in', exact: true }).click();
+  await live(mine);
+  await theirs.getByLabel('Name', { exact: true }).waitFor();
+  await Puppet.enroll(server, 'borea', { site: 'yard' });
+  await Puppet.enroll(server, 'corvus', { site: 'lab' });
+  await mine.locator('[data-robot]', { hasText: 'corvus' }).waitFor();
+  assert.deepEqual(await mine.locator('[data-robot] .name').allInnerTexts(), ['atlas', 'corvus']);
+  assert.match(await mine.locator('.who').innerText(), /^alice/);
+});
+
 test('a person sees their robots and what they may do with them', async (t) => {
   const server = await Server.start(t);
   for (const name of ['atlas', 'borea']) await Puppet.enroll(server, name);
-  await server.ask('POST', '/users', { name: 'alice', roles: ['viewer'], scope: 'atlas', password: 'correct horse battery' });
+  await server.ask('POST', '/users', { name: 'alice', roles: ['viewer'], scope: 'atlas', password: PASSWORD });
   const page = await (await browser(t)).newPage();
   await page.goto(server.url);
   const signIn = async (password) => {
@@ -131,7 +153,7 @@ test('a person sees their robots and what they may do with them', async (t) => {
   };
   await signIn('wrong');
   await page.getByRole('alert').filter({ hasText: 'or the password is wrong' }).waitFor();
-  await signIn('correct horse battery');
+  await signIn(PASSWORD);
   await live(page);
   await page.locator('.who', { hasText: 'alice' }).waitFor();
   assert.deepEqual(await page.locator('[data-robot] .name').allInnerTexts(), ['atlas']);

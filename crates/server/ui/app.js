@@ -13,7 +13,7 @@ import { ago, plural } from './format.js';
 import { change, drawWith } from './frame.js';
 import { showHelp } from './help.js';
 import { listen } from './live.js';
-import { complain, noticeView } from './notice.js';
+import { complain, hide as hideNotice, noticeView } from './notice.js';
 import { at, place } from './router.js';
 import { ofLink, problemOfProvider, signInView } from './signin.js';
 import { sign } from './signs.js';
@@ -152,13 +152,19 @@ function leave(problem = null) {
 function forget() {
   page.view?.leave?.();
   page.hurry?.();
+  hideNotice();
   app.uploads.stop();
   Object.assign(page, { view: null, viewKey: null, backlog: null, heardAt: null, failures: 0 });
   Object.assign(app, { fleet: new Fleet(), selection: new Selection(), uploads: new Uploads(), me: null });
 }
 
 async function signOut() {
-  await api.signOut().catch(() => null);
+  try {
+    await api.signOut();
+  } catch (error) {
+    // Whoever loads the page next would be in: scripts can't take the cookie away.
+    if (!(error instanceof api.SignedOut)) return complain(`Signing out failed: ${error.message}`);
+  }
   live?.signOut();
   leave();
 }

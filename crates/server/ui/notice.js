@@ -20,7 +20,8 @@ function show(notice, duration) {
   if (duration) timer = setTimeout(hide, duration);
 }
 
-const hide = () => change(() => (current = null));
+/** Shows nothing any more. */
+export const hide = () => change(() => (current = null));
 
 export const noticeView = () => html`
   <div class="notice" role="status">${current

@@ -8,7 +8,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use axum::Json;
 use axum::extract::{ConnectInfo, State};
 use axum::response::{IntoResponse, Response};
-use http::{HeaderMap, StatusCode, header};
+use http::{HeaderMap, HeaderName, StatusCode, header};
 use task_proto::api::{LogIn, SessionView, SignIn, TokenOrigin};
 use task_proto::token::Token;
 use task_proto::{Digest, UserName};
@@ -171,8 +171,10 @@ pub(super) async fn sign_out(State(app): State<App>, by: Person, headers: Header
     app.sessions.end(&headers);
     app.actions.sign_out(&by).await?;
     app.broker.disconnect_person(&by.name);
-    let cookie = set_cookie(&app, COOKIE, "", COOKIE_ATTRIBUTES, 0);
-    Ok((StatusCode::NO_CONTENT, [(header::SET_COOKIE, cookie)]).into_response())
+    let cookie = (header::SET_COOKIE, set_cookie(&app, COOKIE, "", COOKIE_ATTRIBUTES, 0));
+    // What the browser has kept is not for whoever uses it next.
+    let forget = (HeaderName::from_static("clear-site-data"), "\"cache\"".to_owned());
+    Ok((StatusCode::NO_CONTENT, [cookie, forget]).into_response())
 }
 
 #[cfg(test)]

@@ -217,6 +217,29 @@ async fn signing_in_ends_the_session_that_the_browser_had() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_browser_uses_nothing_that_it_kept_without_asking() {
+    let server = TestServer::start().await;
+    let package = server.push("talker", "1.0.0").await;
+    let cookie = sign_in_with(&server, "theme=dark").await;
+    let (blob, manifest) = (package.content.digest, package.manifest.digest);
+    for path in [format!("/v2/talker/blobs/{blob}"), format!("/v2/talker/manifests/{manifest}")] {
+        let by_token = server.request(Method::GET, &path).send().await.expect("an answer");
+        assert_eq!(by_token.headers()["cache-control"], "private, max-age=31536000, immutable", "{path}");
+        let by_cookie = || server.bare(Method::GET, &path).header("cookie", &cookie);
+        let whole = by_cookie().send().await.expect("an answer");
+        assert_eq!(whole.status(), StatusCode::OK, "{path}");
+        assert_eq!(whole.headers()["cache-control"], "private, no-cache", "{path}");
+        let known = by_cookie().header("if-none-match", &whole.headers()["etag"]).send().await.expect("an answer");
+        assert_eq!(known.status(), StatusCode::NOT_MODIFIED, "{path}");
+        assert_eq!(known.headers()["cache-control"], "private, no-cache", "{path}");
+    }
+    let out = server.bare(Method::DELETE, "/api/v1/session").header("cookie", &cookie);
+    let out = out.header("origin", server.url("")).send().await.expect("an answer");
+    assert_eq!(out.status(), StatusCode::NO_CONTENT);
+    assert_eq!(out.headers()["clear-site-data"], "\"cache\"");
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_cookie_of_an_encrypted_server_takes_no_other_way() {
     let directory = tempfile::TempDir::new().expect("a directory");
     let server = TestServer::start_in(directory, |config| config.tls.private_ca = Some(true)).await;

@@ -140,6 +140,26 @@ test('who signs in hears nothing that was for who was in before', async (t) => {
   assert.match(await mine.locator('.who').innerText(), /^alice/);
 });
 
+test('who could not be signed out is told so, and stays in', async (t) => {
+  const server = await Server.start(t);
+  const page = await open(t, server);
+  const signOut = page.getByRole('button', { name: 'Sign out' });
+  await page.route(/\/session$/, (route) => (route.request().method() === 'DELETE' ? route.fulfill({ status: 504 }) : route.continue()));
+  await signOut.click();
+  await page.getByText('Signing out failed: the server answered 504').waitFor();
+  assert.ok(await signOut.isVisible(), 'the page is still in');
+  await page.unrouteAll();
+  await signOut.click();
+  await page.getByLabel('Name', { exact: true }).waitFor();
+  // What has ended already needs no ending.
+  await followLink(page, server, server.token);
+  await live(page);
+  assert.equal(await page.getByText('Signing out failed').count(), 0, 'who comes next is told nothing of it');
+  await page.route(/\/session$/, (route) => (route.request().method() === 'DELETE' ? route.fulfill({ status: 401 }) : route.continue()));
+  await signOut.click();
+  await page.getByLabel('Name', { exact: true }).waitFor();
+});
+
 test('a person sees their robots and what they may do with them', async (t) => {
   const server = await Server.start(t);
   for (const name of ['atlas', 'borea']) await Puppet.enroll(server, name);

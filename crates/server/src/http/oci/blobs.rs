@@ -6,7 +6,8 @@ use axum::body::Body;
 use axum::response::Response;
 use bytes::Bytes;
 use http::header::{
-    ACCEPT_RANGES, CACHE_CONTROL, CONTENT_LENGTH, CONTENT_RANGE, CONTENT_TYPE, ETAG, IF_NONE_MATCH, IF_RANGE, RANGE,
+    ACCEPT_RANGES, AUTHORIZATION, CACHE_CONTROL, CONTENT_LENGTH, CONTENT_RANGE, CONTENT_TYPE, ETAG, IF_NONE_MATCH,
+    IF_RANGE, RANGE,
 };
 use http::request::Parts;
 use http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode};
@@ -17,6 +18,9 @@ use crate::blobs::Blob;
 use crate::person::Person;
 use crate::store::{Act, Deed};
 use crate::transfers::Claim;
+
+/// It may be kept, but not be used before the server was asked.
+pub(super) const REVALIDATED: &str = "private, no-cache";
 
 /// `GET /v2/<name>/blobs/<digest>` by a person.
 pub(super) async fn get(registry: &Registry, repository: &RepositoryName, digest: Digest, request: &Parts) -> Answer {
@@ -70,8 +74,14 @@ pub(super) async fn delete(
 async fn read(registry: &Registry, digest: Digest, request: &Parts) -> Answer {
     let blob = registry.blobs.get(digest).await?.ok_or_else(OciError::blob_unknown)?;
     let content_type = HeaderValue::from_static("application/octet-stream");
-    let cache = HeaderValue::from_static("private, max-age=31536000, immutable");
-    serve(&blob, request, content_type, cache)
+    serve(&blob, request, content_type, caching(request))
+}
+
+/// How long what never changes may be kept. Whoever came by a cookie shares the browser with whoever signs in next, so it asks
+/// each time, and is told that nothing has changed.
+pub(super) fn caching(request: &Parts) -> HeaderValue {
+    let is_by_cookie = !request.headers.contains_key(AUTHORIZATION);
+    HeaderValue::from_static(if is_by_cookie { REVALIDATED } else { "private, max-age=31536000, immutable" })
 }
 
 /// Answers with the part of a blob that the request's headers ask for.

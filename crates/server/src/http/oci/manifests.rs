@@ -14,7 +14,7 @@ use task_proto::oci::{ImageManifest, PACKAGE_TYPE};
 use task_proto::output::{MAX_FILES, OutputSet};
 use task_proto::{Digest, RepositoryName, Tag};
 
-use super::blobs::serve;
+use super::blobs::{REVALIDATED, caching, serve};
 use super::parsed::Parsed;
 use super::uploads::kept_bytes;
 use super::{Answer, OciError, Registry, empty, signed};
@@ -44,10 +44,10 @@ pub(super) async fn get(
     let blob = registry.blobs.get(stored.digest).await?.ok_or_else(OciError::manifest_unknown)?;
     let content_type = HeaderValue::try_from(stored.media_type).map_err(|_| OciError::manifest_unknown())?;
     let cache = match reference {
-        Reference::Digest(_) => "private, max-age=31536000, immutable",
-        Reference::Tag(_) => "private, no-cache",
+        Reference::Digest(_) => caching(request),
+        Reference::Tag(_) => HeaderValue::from_static(REVALIDATED),
     };
-    serve(&blob, request, content_type, HeaderValue::from_static(cache))
+    serve(&blob, request, content_type, cache)
 }
 
 /// What is pushed where, and by whom.

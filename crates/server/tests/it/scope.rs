@@ -8,7 +8,8 @@ use reqwest::{Method, RequestBuilder, StatusCode};
 use serde_json::{Value, json};
 use task_proto::api::{AccessToken, DeploymentList, DeploymentView, OutputList, RobotList};
 use task_proto::report::Phase;
-use tokio::io::AsyncReadExt as _;
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::TcpStream;
 
 use crate::harness::{TestRobot, TestServer, answer, refusal};
 use crate::mqtt_harness::{Connect, PATIENCE, Raw};
@@ -222,7 +223,7 @@ async fn events_are_of_ones_own_robots_and_end_with_ones_rights() {
 
 async fn mqtt(sites: &Sites, token: &str) -> (Raw, [u8; 4]) {
     let connect = Connect { password: Some(token.to_owned()), ..Connect::operator("") };
-    let stream = tokio::net::TcpStream::connect(&sites.server.server.addresses().mqtt).await.expect("listens");
+    let stream = TcpStream::connect(&sites.server.server.addresses().mqtt).await.expect("listens");
     let mut raw = Raw { stream };
     raw.send(&connect.packet()).await;
     let mut answer = [0; 4];
@@ -291,4 +292,75 @@ async fn a_sign_in_flood_does_not_keep_robots_waiting() {
     let count = |status: u16| answers.iter().filter(|answer| **answer == status).count();
     assert_eq!(count(401) + count(429), answers.len(), "{answers:?}");
     assert!(count(401) <= 50 && count(429) >= 150, "one address has its limit: {answers:?}");
+}
+
+/// The head of a request by `token` with a body of `length` bytes.
+fn head(request: &str, token: &str, length: usize) -> String {
+    format!(
+        "{request} HTTP/1.1\r\nhost: localhost\r\nauthorization: Bearer {token}\r\nconnection: close\r\n\
+         content-type: application/json\r\ncontent-length: {length}\r\nexpect: 100-continue\r\n\r\n"
+    )
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn who_was_removed_while_their_request_came_does_nothing_by_it() {
+    let sites = Sites::new().await;
+    for name in ["mallory", "alice"] {
+        sites.add(name, &["admin"], None).await;
+    }
+    let mallory = sites.log_in("mallory").await;
+    let bodies = [
+        ("POST /api/v1/users", json!({ "name": "evil", "roles": ["admin"] })),
+        ("POST /api/v1/tokens", json!({ "user": "alice" })),
+    ];
+    let mut held = Vec::new();
+    for (request, body) in bodies {
+        let body = body.to_string();
+        let mut stream = TcpStream::connect(&sites.server.server.addresses().http).await.expect("listens");
+        stream.write_all(head(request, &mallory.token, body.len()).as_bytes()).await.expect("sent");
+        // Who is asked for the body was let in.
+        let mut asked = [0; 25];
+        tokio::time::timeout(PATIENCE, stream.read_exact(&mut asked)).await.expect("in time").expect("asked");
+        assert_eq!(&asked, b"HTTP/1.1 100 Continue\r\n\r\n");
+        held.push((stream, body));
+    }
+    let removed = sites.server.request(Method::DELETE, "/api/v1/users/mallory").send().await.expect("an answer");
+    assert_eq!(removed.status(), StatusCode::NO_CONTENT);
+    for (mut stream, body) in held {
+        stream.write_all(body.as_bytes()).await.expect("sent");
+        let mut said = String::new();
+        tokio::time::timeout(PATIENCE, stream.read_to_string(&mut said)).await.expect("in time").expect("an answer");
+        assert!(said.starts_with("HTTP/1.1 401 "), "{said}");
+    }
+    let users: Value = sites.server.get("/api/v1/users").await;
+    assert_eq!(users["users"].as_array().map(Vec::len), Some(1), "{users}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_removed_persons_session_ends_also_if_nobody_waits_for_the_answer() {
+    let sites = Sites::new().await;
+    let is_there = async |name: &str| {
+        let users: Value = sites.server.get("/api/v1/users").await;
+        users["users"].as_array().is_some_and(|users| users.iter().any(|user| user["name"] == name))
+    };
+    for number in 0..12 {
+        let name = format!("user{number}");
+        let user = json!({ "name": name, "roles": ["viewer"] });
+        let _: Value = sites.server.post("/api/v1/users", &user).await;
+        let made: Value = sites.server.post("/api/v1/tokens", &json!({ "user": name })).await;
+        let (mut session, answer) = mqtt(&sites, made["token"].as_str().expect("a token")).await;
+        assert_eq!(answer, [0x20, 2, 0, 0]);
+        // Nobody knows when the caller hangs up: at once, in which case nothing happens, or after this and that.
+        let mut others = number % 4;
+        while is_there(&name).await {
+            let mut stream = TcpStream::connect(&sites.server.server.addresses().http).await.expect("listens");
+            let request = head(&format!("DELETE /api/v1/users/{name}"), &sites.server.operator.reveal(), 0);
+            stream.write_all(request.as_bytes()).await.expect("sent");
+            for _ in 0..others {
+                let _: Value = sites.server.get("/api/v1/session").await;
+            }
+            others += 1;
+        }
+        session.expect_close().await;
+    }
 }

@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeSet, HashSet};
 use std::convert::Infallible;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use axum::extract::State;
@@ -12,8 +12,8 @@ use futures_util::{Stream, StreamExt as _};
 use http::{HeaderMap, header};
 use task_proto::api::{DeploymentView, Event, RobotView};
 use task_proto::token::Token;
-use task_proto::{DeploymentId, RobotId};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, broadcast};
+use task_proto::{DeploymentId, RobotId, UserName};
+use tokio::sync::broadcast;
 use tokio_stream::wrappers::BroadcastStream;
 use tokio_util::sync::CancellationToken;
 
@@ -36,6 +36,8 @@ const GATHER: Duration = Duration::from_millis(200);
 const BACKLOG: usize = 16 * 1024;
 /// The most listeners at once.
 const MOST_LISTENERS: usize = 512;
+/// Of these the most that are one person's, or one person could keep everybody else out.
+const MOST_OF_ONE: usize = 32;
 /// How often a stream looks whether its listener may still listen, when nobody has said anything.
 const RIGHTS_INTERVAL: Duration = Duration::from_secs(30);
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
@@ -71,24 +73,45 @@ impl Audience {
     }
 }
 
-/// The limited scopes of those who listen, each with how many they are.
-type Scopes = Arc<Mutex<Vec<(Scope, usize)>>>;
+/// Somebody who listens.
+#[derive(Clone, PartialEq, Eq)]
+struct Listener {
+    name: UserName,
+    scope: Scope,
+}
+
+/// Those who listen, one for each place that is taken.
+#[derive(Clone, Default)]
+struct Listeners(Arc<Mutex<Vec<Listener>>>);
+
+impl Listeners {
+    fn all(&self) -> MutexGuard<'_, Vec<Listener>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The limited scopes among them, each once.
+    fn limited_scopes(&self) -> Vec<Scope> {
+        let mut scopes: Vec<Scope> = Vec::new();
+        for Listener { scope, .. } in self.all().iter() {
+            if !scope.is_everything() && !scopes.contains(scope) {
+                scopes.push(scope.clone());
+            }
+        }
+        scopes
+    }
+}
 
 /// A listener's place; dropping it makes room.
 pub(super) struct Place {
-    scopes: Scopes,
-    scope: Scope,
-    _permit: OwnedSemaphorePermit,
+    listeners: Listeners,
+    listener: Listener,
 }
 
 impl Drop for Place {
     fn drop(&mut self) {
-        let mut scopes = self.scopes.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(at) = scopes.iter().position(|(scope, _)| *scope == self.scope) {
-            scopes[at].1 -= 1;
-            if scopes[at].1 == 0 {
-                scopes.swap_remove(at);
-            }
+        let mut all = self.listeners.all();
+        if let Some(at) = all.iter().position(|other| *other == self.listener) {
+            all.swap_remove(at);
         }
     }
 }
@@ -97,8 +120,7 @@ impl Drop for Place {
 #[derive(Clone)]
 pub struct EventFeed {
     lines: broadcast::Sender<Line>,
-    places: Arc<Semaphore>,
-    scopes: Scopes,
+    listeners: Listeners,
 }
 
 /// What the feed reads from.
@@ -120,22 +142,23 @@ pub struct EventSource {
 impl EventFeed {
     /// A feed without listeners; [`EventFeed::run`] fills it.
     pub fn new() -> Self {
-        let (lines, places) = (broadcast::Sender::new(BACKLOG), Arc::new(Semaphore::new(MOST_LISTENERS)));
-        Self { lines, places, scopes: Scopes::default() }
+        Self { lines: broadcast::Sender::new(BACKLOG), listeners: Listeners::default() }
     }
 
-    /// A place among the listeners for someone with this scope, for as long as it is held.
-    pub(super) fn place(&self, scope: &Scope) -> Result<Place, ApiError> {
-        let permit = self.places.clone().try_acquire_owned();
-        let permit = permit.map_err(|_| ApiError::unavailable("too many pages listen to events already"))?;
-        if !scope.is_everything() {
-            let mut scopes = self.scopes.lock().unwrap_or_else(PoisonError::into_inner);
-            match scopes.iter_mut().find(|(known, _)| known == scope) {
-                Some((_, count)) => *count += 1,
-                None => scopes.push((scope.clone(), 1)),
-            }
+    /// A place among the listeners for a person with this scope, for as long as it is held.
+    pub(super) fn place(&self, name: &UserName, scope: &Scope) -> Result<Place, ApiError> {
+        let mut all = self.listeners.all();
+        if all.len() >= MOST_LISTENERS {
+            return Err(ApiError::unavailable("too many pages listen to events already"));
         }
-        Ok(Place { scopes: self.scopes.clone(), scope: scope.clone(), _permit: permit })
+        if all.iter().filter(|other| other.name == *name).count() >= MOST_OF_ONE {
+            let message =
+                format!("{name} listens to events and logs {MOST_OF_ONE} times already; close a page or a log");
+            return Err(ApiError::unavailable(message));
+        }
+        let listener = Listener { name: name.clone(), scope: scope.clone() };
+        all.push(listener.clone());
+        Ok(Place { listeners: self.listeners.clone(), listener })
     }
 
     /// Turns notices into events until `stop`.
@@ -222,9 +245,8 @@ impl EventFeed {
         if deployments.is_empty() {
             return Ok(());
         }
-        let limited = self.scopes.lock().unwrap_or_else(PoisonError::into_inner).clone();
-        let mut scopes = Vec::with_capacity(limited.len());
-        for (scope, _) in limited {
+        let mut scopes = Vec::new();
+        for scope in self.listeners.limited_scopes() {
             let robots: HashSet<RobotId> = source.store.robots_in(&scope).await?.into_iter().collect();
             scopes.push((scope, robots));
         }
@@ -277,18 +299,18 @@ fn name_of(event: &Event) -> &'static str {
 #[utoipa::path(get, path = "/api/v1/events", tag = "events",
     responses((status = 200, description = "Server-sent events, each of which has an `Event` as its data.",
             content((Event = "text/event-stream"))),
-        (status = 503, description = "Too many listen already.")))]
+        (status = 503, description = "Too many listen already, or this person too often.")))]
 pub(super) async fn stream(
     State(app): State<App>,
     by: Person,
     headers: HeaderMap,
 ) -> Result<Sse<impl Stream<Item = Result<SentEvent, Infallible>>>, ApiError> {
     // The place is free again when the stream is dropped.
-    let place = app.events.place(&by.scope)?;
+    let place = app.events.place(&by.name, &by.scope)?;
     let lines = BroadcastStream::new(app.events.lines.subscribe());
     let events = lines.filter_map(move |line| {
         let event = match line {
-            Ok(line) if !line.audience.includes(&place.scope) => None,
+            Ok(line) if !line.audience.includes(&place.listener.scope) => None,
             Ok(line) => Some(SentEvent::default().event(line.name).data(line.data)),
             Err(_) => Some(SentEvent::default().event("missed").data(r#"{"type":"missed"}"#)),
         };
@@ -347,4 +369,42 @@ pub(super) fn end_of_stream(
             () = may_no_longer => {}
         }
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn name(text: &str) -> UserName {
+        text.parse().expect("a name")
+    }
+
+    #[test]
+    fn one_person_has_a_share_of_the_places() {
+        let (feed, everything) = (EventFeed::new(), Scope::everything());
+        let lab = Scope::of(["site=lab".parse().expect("a selector")]);
+        let mut held: Vec<Place> = (0..MOST_OF_ONE)
+            .map(|n| feed.place(&name("alice"), if n % 2 == 0 { &everything } else { &lab }).expect("room"))
+            .collect();
+        let refused = feed.place(&name("alice"), &lab).map(drop).expect_err("she has her share");
+        assert_eq!((refused.status.as_u16(), refused.code), (503, "unavailable"));
+        assert!(refused.message.starts_with("alice listens"), "{}", refused.message);
+        let bobs = feed.place(&name("bob"), &lab).expect("there is room for others");
+        assert_eq!(feed.listeners.limited_scopes(), std::slice::from_ref(&lab));
+        held.pop();
+        held.push(feed.place(&name("alice"), &everything).expect("one left"));
+        drop((held, bobs));
+        assert!(feed.listeners.limited_scopes().is_empty() && feed.listeners.all().is_empty());
+    }
+
+    #[test]
+    fn all_together_have_so_many_places() {
+        let (feed, everything) = (EventFeed::new(), Scope::everything());
+        let comers: Vec<UserName> = (0..=MOST_LISTENERS).map(|n| name(&format!("user{n}"))).collect();
+        let held: Vec<Place> = comers[1..].iter().map(|name| feed.place(name, &everything).expect("room")).collect();
+        let refused = feed.place(&comers[0], &everything).map(drop).expect_err("all are taken");
+        assert_eq!((refused.status.as_u16(), refused.code), (503, "unavailable"));
+        drop(held);
+        assert!(feed.place(&comers[0], &everything).is_ok());
+    }
 }

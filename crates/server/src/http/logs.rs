@@ -41,7 +41,7 @@ const DEFAULT_LINES: u64 = 500;
     responses((status = 200, description = "The lines; or server-sent events, each of which has a `LogEvent` as its data.",
             content((LogsView = "application/json"), (LogEvent = "text/event-stream"))),
         (status = 409, description = "`no_such_task`: the robot has no such task."),
-        (status = 503, description = "Too many listen already.")))]
+        (status = 503, description = "Too many listen already, or this person too often.")))]
 pub(super) async fn show(
     State(app): State<App>,
     by: Person,
@@ -126,8 +126,8 @@ fn stream(
     filter: Filter,
     headers: &HeaderMap,
 ) -> Result<Sse<impl Stream<Item = Result<SentEvent, Infallible>> + use<>>, ApiError> {
+    let place = app.events.place(&by.name, &Scope::everything())?;
     let end = end_of_stream(app, by, Some(robot.clone()), headers)?;
-    let place = app.events.place(&Scope::everything())?;
     let Joined { follower, told, is_first } = app.logs.follow(&robot, filter.level);
     if is_first {
         tokio::spawn(keep_following(app.clone(), robot));

@@ -3,10 +3,13 @@
 use reqwest::{Method, StatusCode};
 use serde_json::{Value, json};
 use task_proto::oci::{ImageManifest, MANIFEST_TYPE};
+use task_proto::person::{Role, Roles};
+use task_proto::token::{Token, TokenKind};
 use task_proto::{Digest, RobotId};
 use taskd::blobs::BlobSettings;
 use taskd::collector::Collected;
 use taskd::http::auth::Caller;
+use taskd::person::Person;
 
 use crate::database::{TestDatabase, on_both_databases};
 use crate::fleet::{Fleet, order_of, random_key};
@@ -123,6 +126,40 @@ async fn what_nothing_refers_to_is_collected_after_its_grace() {
     assert_eq!(registry.status(Method::DELETE, &path).await, StatusCode::ACCEPTED);
     assert_eq!(registry.collect(NOW_MS + 2 * grace_ms).await.blobs, 0);
     assert_eq!(registry.collect(NOW_MS + 2 * grace_ms + 1).await.blobs, 3);
+}
+
+#[tokio::test]
+async fn only_who_may_push_there_spares_a_blob_by_asking_for_it() {
+    let registry = TestRegistry::start().await;
+    let grace_ms = u64::try_from(GRACE.as_millis()).expect("small");
+    let robot = RobotId::random();
+    let viewer = Person { roles: Roles::one(Role::Viewer), ..Person::first(&Token::random(TokenKind::Operator)) };
+    let to_viewer = serve(registry.registry.clone(), Some(Caller::Person(viewer))).await;
+    let to_robot = serve(registry.registry.clone(), Some(Caller::Robot(robot.clone()))).await;
+    let outputs: &str = &format!("outputs/{robot}/mapping");
+    let read = registry.push_blob("a", b"read").await.digest;
+    let deleted = registry.push_blob("a", b"deleted").await.digest;
+    let pushed = registry.push_blob("a", b"pushed again").await.digest;
+    let brought = registry.push_blob(outputs, b"brought back").await.digest;
+    assert_eq!(registry.status(Method::DELETE, &format!("/v2/a/blobs/{deleted}")).await, StatusCode::ACCEPTED);
+
+    registry.registry.clock.advance_ms(grace_ms);
+    for (server, repository, digest, expected) in [
+        (&to_viewer, "a", read, StatusCode::OK),
+        (&registry.base, "a", deleted, StatusCode::NOT_FOUND),
+        (&registry.base, "a", pushed, StatusCode::OK),
+        (&to_robot, outputs, brought, StatusCode::OK),
+    ] {
+        let path = format!("{server}/v2/{repository}/blobs/{digest}");
+        assert_eq!(registry.status(Method::HEAD, &path).await, expected, "{path}");
+    }
+    assert_eq!(registry.collect(NOW_MS + grace_ms + 1).await.blobs, 2, "what was only read, and what was deleted");
+    for (repository, digest, expected) in
+        [("a", read, StatusCode::NOT_FOUND), ("a", pushed, StatusCode::OK), (outputs, brought, StatusCode::OK)]
+    {
+        let path = format!("/v2/{repository}/blobs/{digest}");
+        assert_eq!(registry.status(Method::GET, &path).await, expected, "{path}");
+    }
 }
 
 #[tokio::test]

@@ -22,7 +22,7 @@ use crate::transfers::Claim;
 /// It may be kept, but not be used before the server was asked.
 pub(super) const REVALIDATED: &str = "private, no-cache";
 
-/// `GET /v2/<name>/blobs/<digest>` by a person.
+/// `GET /v2/<name>/blobs/<digest>` by a person, and `HEAD` by one who only reads.
 pub(super) async fn get(registry: &Registry, repository: &RepositoryName, digest: Digest, request: &Parts) -> Answer {
     if !registry.store.has_blob(Some(repository), &digest).await? {
         return Err(OciError::blob_unknown());
@@ -30,11 +30,19 @@ pub(super) async fn get(registry: &Registry, repository: &RepositoryName, digest
     read(registry, digest, request).await
 }
 
-/// `HEAD` of the same: asked before a push, so from now on the answer must hold for a while.
-pub(super) async fn head(registry: &Registry, repository: &RepositoryName, digest: Digest, request: &Parts) -> Answer {
+/// `HEAD` of the same by who may push there: asked before a push, so from now on the answer must hold for a while.
+pub(super) async fn head_before_push(
+    registry: &Registry,
+    repository: &RepositoryName,
+    digest: Digest,
+    request: &Parts,
+) -> Answer {
     let _hold = registry.blobs.hold_collection().await;
+    if !registry.store.has_blob(Some(repository), &digest).await? {
+        return Err(OciError::blob_unknown());
+    }
     registry.blobs.touch(digest, registry.clock.now_ms()).await?;
-    get(registry, repository, digest, request).await
+    read(registry, digest, request).await
 }
 
 /// `GET` or `HEAD` by a robot. Its packages count, whatever repository they came from and whether it still has them. It may

@@ -130,8 +130,10 @@ pub async fn dispatch(State(registry): State<Registry>, Path(path): Path<String>
         Endpoint::Blob(digest) => {
             let digest = parse_digest(digest)?;
             match method {
-                Method::GET => blobs::get(&registry, &repository, digest, &parts).await,
-                Method::HEAD => blobs::head(&registry, &repository, digest, &parts).await,
+                Method::HEAD if may_begin(person, &repository) => {
+                    blobs::head_before_push(&registry, &repository, digest, &parts).await
+                }
+                Method::GET | Method::HEAD => blobs::get(&registry, &repository, digest, &parts).await,
                 Method::DELETE => blobs::delete(&registry, person, &repository, digest).await,
                 _ => Err(OciError::method("GET, HEAD, DELETE")),
             }
@@ -209,6 +211,11 @@ fn needed(repository: &RepositoryName, method: &Method, endpoint: &Endpoint<'_>)
         _ if is_output || repository.as_str() == LIST_REPOSITORY => Permission::Administer,
         _ => Permission::Publish,
     }
+}
+
+/// Whether who was let in to this repository may push there: a robot comes this far only to its own outputs.
+fn may_begin(person: Option<&Person>, repository: &RepositoryName) -> bool {
+    person.is_none_or(|person| person.may(needed(repository, &Method::POST, &Endpoint::Uploads)))
 }
 
 /// Whether this is part of pushing one of the robot's own outputs. It deletes nothing and reads nothing back.

@@ -378,7 +378,7 @@ async fn method_not_allowed(request: Request) -> Response {
 }
 
 /// What a browser may do with an answer that is not the page: nothing.
-const ANSWER_POLICY: &str = "default-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
+const ANSWER_POLICY: &str = "default-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; sandbox";
 
 /// Headers for browsers: nothing is ever framed or sniffed, or shown to other pages.
 async fn harden(mut response: Response) -> Response {

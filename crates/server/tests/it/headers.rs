@@ -2,7 +2,7 @@
 //! page's own files.
 
 use reqwest::{Method, Response};
-use serde_json::json;
+use serde_json::{Value, json};
 use taskd::http::routes;
 
 use crate::harness::TestServer;
@@ -14,7 +14,7 @@ const EVERYWHERE: [(&str, &str); 5] = [
     ("cross-origin-opener-policy", "same-origin"),
     ("cross-origin-resource-policy", "same-origin"),
 ];
-const ANSWER: &str = "default-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
+const ANSWER: &str = "default-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; sandbox";
 const PAGE: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; font-src 'self'; \
                     connect-src 'self'; worker-src 'self'; manifest-src 'self'; base-uri 'none'; form-action 'none'; \
                     frame-ancestors 'none'";
@@ -90,11 +90,17 @@ async fn what_others_stored_is_never_a_page_and_neither_is_an_error() {
     }
     // A type that would make it one is refused.
     let manifest = get(&format!("/v2/talker/manifests/{}", package.manifest.digest)).send().await.expect("an answer");
-    let manifest = manifest.bytes().await.expect("a body");
+    let mut manifest: Value = manifest.json().await.expect("JSON");
+    // What it says itself would contradict.
+    manifest.as_object_mut().expect("an object").remove("mediaType").expect("it has one");
     let put = server.request(Method::PUT, "/v2/talker/manifests/2.0.0").header("content-type", "text/html");
-    let refused = put.body(manifest).send().await.expect("an answer");
-    assert!(refused.status().is_client_error(), "{}", refused.status());
+    let refused = put.body(manifest.to_string()).send().await.expect("an answer");
+    assert_eq!(refused.status(), 400);
     check(&refused, ANSWER, "a manifest that is said to be HTML");
+    let answer: Value = refused.json().await.expect("JSON");
+    assert_eq!(answer["errors"][0]["code"], "MANIFEST_INVALID");
+    let message = answer["errors"][0]["message"].as_str().expect("text");
+    assert!(message.contains("text/html"), "{message}");
     let too_large = server.request(Method::POST, "/api/v1/users").json(&json!({ "name": "x".repeat(100_000) }));
     check(&too_large.send().await.expect("an answer"), ANSWER, "a body that is too large");
     let page = server.bare(Method::GET, "/").send().await.expect("an answer");

@@ -8,8 +8,10 @@ use task_proto::{Digest, RobotId};
 use taskd::blobs::BlobSettings;
 use taskd::config::BlobRead;
 use taskd::http::auth::Caller;
+use taskd::http::oci::Registry;
+use taskd::store::{NewManifest, PutManifest, StoredManifest};
 
-use crate::registry::{TestRegistry, header, image, operator, refusal, refused};
+use crate::registry::{NOW_MS, TestRegistry, header, image, operator, refusal, refused};
 
 #[tokio::test]
 async fn nobody_is_let_in_without_a_token() {
@@ -224,6 +226,30 @@ async fn a_manifest_that_can_not_be_is_refused_with_the_reason() {
     // What is not understood is kept all the same.
     let foreign = registry.put_manifest("/v2/a/manifests/v1", "application/x-foreign+json", &json!({ "x": 1 })).await;
     assert_eq!(foreign.status(), StatusCode::CREATED);
+}
+
+#[tokio::test]
+async fn a_manifest_that_was_taken_as_a_page_is_served_as_bytes() {
+    let registry = TestRegistry::start().await;
+    let Registry { store, blobs, .. } = &registry.registry;
+    let page = "<script>fetch('/api/v1/users')</script>";
+    let digest = blobs.put(page.into()).await.expect("stored");
+    let new = NewManifest {
+        manifest: StoredManifest { digest, size: page.len() as u64, media_type: "text/html".to_owned() },
+        artifact_type: None,
+        annotations: Default::default(),
+        subject: None,
+        parts: Vec::new(),
+        tags: vec!["old".parse().expect("a tag")],
+        package: None,
+        output: None,
+        document: None,
+    };
+    let put = store.put_manifest(&"a".parse().expect("a name"), &new, None, NOW_MS).await;
+    assert_eq!(put.expect("writes"), PutManifest::Stored);
+    let answer = registry.get("/v2/a/manifests/old").await;
+    assert_eq!(header(&answer, "content-type"), "application/octet-stream");
+    assert_eq!(answer.text().await.expect("text"), page);
 }
 
 #[tokio::test]

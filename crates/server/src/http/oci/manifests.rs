@@ -15,7 +15,7 @@ use task_proto::output::{MAX_FILES, OutputSet};
 use task_proto::{Digest, RepositoryName, Tag};
 
 use super::blobs::{REVALIDATED, caching, serve};
-use super::parsed::Parsed;
+use super::parsed::{Parsed, is_json};
 use super::uploads::kept_bytes;
 use super::{Answer, OciError, Registry, empty, signed};
 use crate::blobs::Blob;
@@ -42,7 +42,11 @@ pub(super) async fn get(
     let Ok(reference) = reference else { return Err(OciError::manifest_unknown()) };
     let stored = registry.store.manifest(repository, &reference).await?.ok_or_else(OciError::manifest_unknown)?;
     let blob = registry.blobs.get(stored.digest).await?.ok_or_else(OciError::manifest_unknown)?;
-    let content_type = HeaderValue::try_from(stored.media_type).map_err(|_| OciError::manifest_unknown())?;
+    let content_type = match is_json(&stored.media_type) {
+        true => HeaderValue::try_from(stored.media_type).map_err(|_| OciError::manifest_unknown())?,
+        // Once any type was taken, also one that makes it a page.
+        false => HeaderValue::from_static("application/octet-stream"),
+    };
     let cache = match reference {
         Reference::Digest(_) => caching(request),
         Reference::Tag(_) => HeaderValue::from_static(REVALIDATED),

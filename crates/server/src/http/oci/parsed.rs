@@ -19,7 +19,7 @@ const MAX_PARTS: usize = 4096;
 /// A manifest of any kind, as far as it is understood.
 #[derive(Debug)]
 pub struct Parsed {
-    /// The content type it is served with.
+    /// The content type it is served with: one of JSON.
     pub media_type: String,
     /// What a list of referrers says it is.
     pub artifact_type: Option<String>,
@@ -98,11 +98,7 @@ impl Parsed {
 
     /// These go into headers and columns, which not every character can.
     fn check_texts(&self) -> Result<(), OciError> {
-        let texts = [
-            ("mediaType", Some(&self.media_type)),
-            ("artifactType", self.artifact_type.as_ref()),
-            ("subject", self.subject.as_ref()),
-        ];
+        let texts = [("artifactType", self.artifact_type.as_ref()), ("subject", self.subject.as_ref())];
         match texts.iter().find(|(_, text)| text.is_some_and(|text| text.contains(char::is_control))) {
             Some((key, _)) => Err(OciError::manifest_invalid(format!("{key}: it has a control character"))),
             None => Ok(()),
@@ -147,11 +143,54 @@ impl Document {
 /// The manifest's type: what the header and the document say, which must be the same.
 fn media_type(header: Option<&str>, document: Option<&str>) -> Result<String, OciError> {
     let header = header.and_then(|text| text.split(';').next()).map(str::trim).filter(|text| !text.is_empty());
-    match (header, document.filter(|text| !text.is_empty())) {
-        (Some(header), Some(document)) if header != document => Err(OciError::manifest_invalid(format!(
-            "the Content-Type is {header:?}, the manifest's mediaType {document:?}"
-        ))),
-        (Some(media_type), _) | (None, Some(media_type)) => Ok(media_type.to_owned()),
-        (None, None) => Ok(MANIFEST_TYPE.to_owned()),
+    let media_type = match (header, document.filter(|text| !text.is_empty())) {
+        (Some(header), Some(document)) if header != document => {
+            return Err(OciError::manifest_invalid(format!(
+                "the Content-Type is {header:?}, the manifest's mediaType {document:?}"
+            )));
+        }
+        (Some(media_type), _) | (None, Some(media_type)) => media_type,
+        (None, None) => MANIFEST_TYPE,
+    };
+    if !is_json(media_type) {
+        let message =
+            format!("{media_type:?} is no manifest's type; those are application/json and application/…+json");
+        return Err(OciError::manifest_invalid(message));
+    }
+    Ok(media_type.to_owned())
+}
+
+/// Whether this is a media type of JSON, which no browser shows as a page: with the characters of RFC 6838, section 4.2.
+pub(super) fn is_json(media_type: &str) -> bool {
+    let is_character = |b: u8| b.is_ascii_alphanumeric() || b"!#$&-^_.+".contains(&b);
+    media_type
+        .strip_prefix("application/")
+        .is_some_and(|subtype| (subtype == "json" || subtype.ends_with("+json")) && subtype.bytes().all(is_character))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_manifests_type_is_one_of_json() {
+        for text in ["application/json", MANIFEST_TYPE, DOCKER_LIST_TYPE, "application/x-foreign+json"] {
+            assert!(is_json(text), "{text}");
+            assert_eq!(media_type(Some(text), None).expect("taken"), text);
+            assert_eq!(media_type(Some(&format!("{text}; charset=utf-8")), Some(text)).expect("taken"), text);
+        }
+        for text in [
+            "text/html",
+            "application/xhtml+xml",
+            "image/svg+json",
+            "application/",
+            "application/xjson",
+            "application/x,text/html+json",
+            "application/x\n+json",
+            "application/ä+json",
+        ] {
+            assert!(!is_json(text), "{text}");
+            assert!(media_type(Some(text), None).is_err() && media_type(None, Some(text)).is_err(), "{text}");
+        }
     }
 }

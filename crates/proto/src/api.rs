@@ -392,7 +392,8 @@ pub struct DeploymentView {
     pub package: PackageRef,
     /// Service or job.
     pub kind: TaskKind,
-    /// The selector as it was given. Absent in lists and events where it is longer than 1,000 characters.
+    /// The selector as it was given. Absent in lists and events where it is longer than 1,000 characters, and for who is
+    /// limited to some robots: it may name others.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub selector: Option<Selector>,
     /// How the bytes travel, as it was ordered.
@@ -412,7 +413,7 @@ pub struct DeploymentView {
     pub expires_at_ms: u64,
     /// How many assignments stand in each phase, zeros left out, in the order of a life.
     pub counts: Vec<PhaseCount>,
-    /// Deployments it took the place of on some robot.
+    /// Deployments it took the place of on some robot; none for who is limited to some robots.
     pub supersedes: Vec<DeploymentId>,
     /// One per robot, sorted by name; only in `GET /deployments/{id}` and the answer to an order.
     #[serde(default, skip_serializing_if = "Option::is_none")]

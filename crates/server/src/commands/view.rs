@@ -63,7 +63,7 @@ fn describe(view: &DeploymentView) -> String {
     let mut facts = vec![
         ("deployment", view.id.to_string()),
         ("package", format!("{} {} {}", view.package.name, view.package.version, view.package.manifest.digest)),
-        ("selector", view.selector.as_ref().map_or_else(String::new, ToString::to_string)),
+        ("selector", view.selector.as_ref().map_or_else(|| "…".to_owned(), ToString::to_string)),
         ("delivery", view.delivery.to_string()),
         ("state", state(view.state).to_owned()),
         ("phases", phases(view)),

@@ -16,7 +16,7 @@ use utoipa::IntoParams;
 
 use super::extract::{JsonBody, PathParam, QueryParams, idempotency_key, page_limit};
 use super::openapi::OrderKey;
-use super::views::{complete_deployment, complete_matched, narrowed};
+use super::views::{complete_deployment, complete_matched, narrowed, without_others};
 use crate::person::Person;
 
 /// The query of `GET /deployments`.
@@ -52,7 +52,11 @@ pub(super) async fn list(
         let before = before.map(DeploymentId::as_str).unwrap_or_default();
         ApiError::not_found(format!("before: there is no deployment {before}"))
     })?;
-    Ok(Json(DeploymentList { deployments: page.deployments, next: page.next }))
+    let deployments = match by.scope.is_everything() {
+        true => page.deployments,
+        false => page.deployments.into_iter().map(without_others).collect(),
+    };
+    Ok(Json(DeploymentList { deployments, next: page.next }))
 }
 
 /// The query of `GET /deployments/{deployment}`.

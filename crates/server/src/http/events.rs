@@ -253,7 +253,6 @@ impl EventFeed {
         for id in deployments {
             let summary = source.store.deployment_summary(&id).await?;
             let Some(deployment) = summary.map(Box::new) else { continue };
-            let selector = deployment.selector.clone();
             self.send(&Event::Deployment { deployment }, Audience::Scope(Scope::everything()));
             if scopes.is_empty() {
                 continue;
@@ -261,7 +260,7 @@ impl EventFeed {
             let Some(whole) = source.store.deployment(&id, false).await? else { continue };
             for (scope, robots) in &scopes {
                 if let Some(part) = narrowed(whole.clone(), robots) {
-                    let deployment = Box::new(DeploymentView { assignments: None, selector: selector.clone(), ..part });
+                    let deployment = Box::new(DeploymentView { assignments: None, ..part });
                     self.send(&Event::Deployment { deployment }, Audience::Scope(scope.clone()));
                 }
             }

@@ -16,7 +16,7 @@ use http::StatusCode;
 use serde::Deserialize;
 use task_archive::UnpackError;
 use task_proto::api::{PackageDiff, PackageFile, PackageFiles, PackageList, PackageVersions, PackageView};
-use task_proto::{Digest, TaskName};
+use task_proto::{Digest, RobotId, TaskName};
 use utoipa::{IntoParams, ToSchema};
 
 use super::App;
@@ -164,11 +164,14 @@ fn unknown(name: &TaskName, version: &PackageReference) -> ApiError {
     ApiError::new(StatusCode::NOT_FOUND, "package_not_found", format!("there is no package {name} {version}"))
 }
 
-/// Says who keeps a package in use; of robots that are none of the person's only how many.
+/// Says who keeps a package in use; of robots that are none of the person's, and deployments for none of theirs, only how many.
 fn in_use(by: &Person, package: &str, users: &PackageUsers) -> String {
     let own = users.robots.iter().filter(|robot| by.scope.covers(&robot.id, &robot.name, &robot.labels));
-    let robots: Vec<&str> = own.map(|robot| robot.name.as_str()).take(MOST_NAMED).collect();
-    let deployments: Vec<&str> = users.deployments.iter().map(|id| id.as_str()).take(MOST_NAMED).collect();
+    let (ids, names): (HashSet<&RobotId>, Vec<&str>) = own.map(|robot| (&robot.id, robot.name.as_str())).unzip();
+    let is_own = |robots: &[RobotId]| by.scope.is_everything() || robots.iter().any(|robot| ids.contains(robot));
+    let deployments = users.deployments.iter().filter(|(_, robots)| is_own(robots));
+    let deployments: Vec<&str> = deployments.map(|(id, _)| id.as_str()).take(MOST_NAMED).collect();
+    let robots: Vec<&str> = names.into_iter().take(MOST_NAMED).collect();
     let named = |names: Vec<&str>, of: usize| match of > names.len() {
         true if names.is_empty() => String::new(),
         true => format!(": {}, …", names.join(", ")),

@@ -47,7 +47,12 @@ pub fn narrowed(mut view: DeploymentView, robots: &HashSet<RobotId>) -> Option<D
     view.counts = counts.filter(|counted| counted.count > 0).collect();
     let (is_cancelled, is_paused) = (view.state == DeploymentState::Cancelled, view.state == DeploymentState::Paused);
     view.state = deployment::state(view.kind, is_cancelled, is_paused, &view.counts);
-    Some(view)
+    Some(without_others(view))
+}
+
+/// Without what names robots and deployments that may be none of the person's.
+pub fn without_others(view: DeploymentView) -> DeploymentView {
+    DeploymentView { selector: None, supersedes: Vec::new(), ..view }
 }
 
 /// Says which of the robots are there.

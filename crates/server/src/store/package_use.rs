@@ -26,8 +26,8 @@ pub enum DeletePackage {
 /// Who keeps a package in use.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct PackageUsers {
-    /// By which orders.
-    pub deployments: Vec<DeploymentId>,
+    /// By which orders, each with those of the robots that it is for.
+    pub deployments: Vec<(DeploymentId, Vec<RobotId>)>,
     /// The robots, sorted by name.
     pub robots: Vec<KnownRobot>,
 }
@@ -135,11 +135,11 @@ impl Write {
             }
             let assigned = "SELECT robot_id FROM assignments WHERE deployment_id = $1 AND (desired = 1 OR ended = 0)";
             let sql = format!("{KNOWN} AND id IN ({assigned})");
-            let robots = sqlx::query(AssertSqlSafe(sql)).bind(&deployment).fetch_all(self.connection()).await?;
-            for row in &robots {
-                users.robots.push(known_robot(row)?);
-            }
-            users.deployments.push(id("deployments.id", &deployment)?);
+            let rows = sqlx::query(AssertSqlSafe(sql)).bind(&deployment).fetch_all(self.connection()).await?;
+            let robots = rows.iter().map(known_robot).collect::<Result<Vec<_>, _>>()?;
+            let ids = robots.iter().map(|robot| robot.id.clone()).collect();
+            users.deployments.push((id("deployments.id", &deployment)?, ids));
+            users.robots.extend(robots);
         }
         users.robots.sort_by(|one, other| one.name.cmp(&other.name));
         users.robots.dedup();

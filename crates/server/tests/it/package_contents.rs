@@ -113,7 +113,7 @@ async fn a_package_in_use_is_not_deleted() {
     for name in ["atlas", "boreas"] {
         server.enroll(name).await;
     }
-    server.deploy(&old, "*", "one").await;
+    let one = server.deploy(&old, "*", "one").await;
     let delete = |version: &str| server.request(Method::DELETE, &format!("/api/v1/packages/mapper/{version}"));
     let refused = delete("1.0.0").send().await.expect("an answer");
     assert_eq!(refused.status(), StatusCode::CONFLICT);
@@ -125,7 +125,8 @@ async fn a_package_in_use_is_not_deleted() {
         "{said}"
     );
 
-    // Whoever is limited to some robots is told of those.
+    // Whoever is limited to some robots is told of those, and of what is for them.
+    let other = server.deploy(&old, "atlas", "other").await;
     let user = json!({ "name": "pia", "roles": ["publisher"], "scope": "boreas", "password": PASSWORD });
     let _: serde_json::Value = server.post("/api/v1/users", &user).await;
     let login = server.bare(Method::POST, "/api/v1/login").json(&json!({ "user": "pia", "password": PASSWORD }));
@@ -133,6 +134,7 @@ async fn a_package_in_use_is_not_deleted() {
     let hers = server.bare(Method::DELETE, "/api/v1/packages/mapper/1.0.0").bearer_auth(&pia.token);
     let said = hers.send().await.expect("an answer").text().await.expect("text");
     assert!(said.contains("2 robots should have: boreas, …,") && !said.contains("atlas"), "{said}");
+    assert!(said.contains(&format!("by 2 deployments: {}, …;", one.id)) && !said.contains(other.id.as_str()), "{said}");
     let package = server.bare(Method::GET, "/api/v1/packages/mapper").bearer_auth(&pia.token);
     let package: PackageVersions = answer(package).await;
     assert_eq!(package.running[0].robots, 1);

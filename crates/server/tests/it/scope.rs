@@ -71,7 +71,9 @@ async fn lists_and_views_have_only_ones_own_robots() {
     let mut sites = Sites::new().await;
     sites.add("alice", &["operator"], Some("site=lab")).await;
     let package = sites.server.push("talker", "1.0.0").await;
-    let everywhere = sites.server.deploy(&package, "*", "everywhere").await;
+    let before = sites.server.deploy(&package, "boreas", "before").await;
+    let everywhere = sites.server.deploy(&package, "atlas,boreas", "everywhere").await;
+    assert_eq!(everywhere.supersedes, std::slice::from_ref(&before.id));
     let elsewhere = sites.server.deploy(&package, "boreas", "elsewhere").await;
     for robot in [&sites.lab, &sites.field] {
         let push = Push::new(&sites.server, robot, format!("outputs/{}/mapping", robot.id));
@@ -96,6 +98,10 @@ async fn lists_and_views_have_only_ones_own_robots() {
     assert_eq!(part.counts, deployments.deployments[0].counts);
     assert_eq!(part.state, task_proto::api::DeploymentState::Settled, "hers runs");
     assert_eq!(part.assignments.expect("asked for").len(), 1);
+    for view in ["/api/v1/deployments", path.as_str()] {
+        let text = alice.ask(Method::GET, view).send().await.expect("an answer").text().await.expect("text");
+        assert!(!text.contains("boreas") && !text.contains(before.id.as_str()), "{view}: {text}");
+    }
 
     let own = ["/api/v1/robots/atlas", "/api/v1/robots/atlas/logs", "/api/v1/outputs?robot=atlas"];
     for path in own {
@@ -194,14 +200,16 @@ async fn events_are_of_ones_own_robots_and_end_with_ones_rights() {
     let mut events = Events::open(&alice).await;
     let mut all = Events::open(&Asker { server: &sites.server, token: sites.server.operator.reveal() }).await;
     let package = sites.server.push("talker", "1.0.0").await;
-    sites.server.deploy(&package, "boreas", "elsewhere").await;
-    let everywhere = sites.server.deploy(&package, "*", "everywhere").await;
+    let elsewhere = sites.server.deploy(&package, "boreas", "elsewhere").await;
+    let everywhere = sites.server.deploy(&package, "atlas,boreas", "everywhere").await;
     let last = |text: &str| text.contains(everywhere.id.as_str());
     all.until(|text| last(text) && text.contains("\"boreas\"") && text.contains("\"atlas\"")).await;
     // The feed may name it before the deployment itself comes.
     let is_counted = |text: &str| text.contains("\"counts\":");
     let seen = events.until(|text| last(text) && is_counted(text) && text.contains("\"atlas\"")).await;
-    assert!(!seen.contains("boreas") && !seen.contains(sites.field.id.as_str()), "{seen}");
+    for other in ["boreas", sites.field.id.as_str(), elsewhere.id.as_str()] {
+        assert!(!seen.contains(other), "{other}: {seen}");
+    }
     let counted = seen.split("\"counts\":").nth(1).expect("a deployment");
     assert!(counted.starts_with("[{\"phase\":\"assigned\",\"count\":1}]"), "{counted}");
     // A robot that is removed elsewhere is none of her business either.

@@ -69,7 +69,7 @@ pub enum BlobError {
     /// Another request writes to the same upload.
     #[error("another request is writing to this upload")]
     UploadBusy,
-    /// [`BlobSettings::max_uploads`] is reached.
+    /// [`BlobSettings::max_uploads`] is reached, and none gives way; or a robot has its share.
     #[error("{max} uploads are unfinished already; finish or cancel one")]
     TooManyUploads {
         /// The limit.

@@ -1,5 +1,6 @@
 //! Unfinished uploads: `uploads/<id>` holds the bytes that came, memory holds their running hash; a restart ends them all.
-//! It never lets bytes become a blob before they hash to what was announced, nor robots take more than is theirs.
+//! It never lets bytes become a blob before they hash to what was announced, nor robots take more than is theirs, nor uploads
+//! that somebody left keep others from pushing.
 
 use std::collections::HashMap;
 use std::fs::{self, File};
@@ -9,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use futures_util::{Stream, StreamExt as _};
@@ -81,6 +82,8 @@ struct Upload {
     /// The same for those who don't hold the lock.
     bytes: Arc<AtomicU64>,
     hasher: Sha256,
+    /// When it was begun or got its last bytes.
+    written_at: Instant,
     /// Finished or cancelled by whoever had the lock before.
     ended: bool,
 }
@@ -88,7 +91,8 @@ struct Upload {
 impl Upload {
     fn create(path: PathBuf) -> io::Result<Self> {
         let file = File::create_new(&path)?;
-        Ok(Self { path, file, offset: 0, bytes: Arc::default(), hasher: Sha256::new(), ended: false })
+        let (bytes, hasher, written_at) = (Arc::default(), Sha256::new(), Instant::now());
+        Ok(Self { path, file, offset: 0, bytes, hasher, written_at, ended: false })
     }
 
     /// Takes all of `chunks` or, on an error, nothing: bytes beyond the offset are overwritten by the next try.
@@ -102,8 +106,16 @@ impl Upload {
             self.hasher.update(chunk);
         }
         self.offset = offset;
+        self.written_at = Instant::now();
         self.bytes.store(offset, Ordering::Relaxed);
         Ok(())
+    }
+
+    /// Orders those that nobody writes to by which gives way first: what was left for a while, the empty before the rest,
+    /// and then what was written to the longest ago.
+    fn gives_way(&self) -> (bool, bool, Instant) {
+        let is_left = self.written_at.elapsed() >= SILENCE;
+        (!is_left, is_left && self.offset > 0, self.written_at)
     }
 
     fn cancel(&mut self) -> Result<(), BlobError> {
@@ -151,12 +163,11 @@ impl Uploads {
         self.active.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn insert(&self, id: UploadId, active: Active) -> Result<(), BlobError> {
+    /// Takes an upload in. Where every place is taken it gets one of a person's that nobody writes to: that is returned, and
+    /// the caller cancels it.
+    fn insert(&self, id: UploadId, active: Active) -> Result<Option<OwnedMutexGuard<Upload>>, BlobError> {
         let max = self.settings.max_uploads;
         let mut all = self.active();
-        if all.len() >= max {
-            return Err(BlobError::TooManyUploads { max });
-        }
         if let Some((robot, _)) = owner(&active.repository) {
             // However many robots there are, a quarter stays free for operators.
             let max_of_robots = max - max / 4;
@@ -168,8 +179,14 @@ impl Uploads {
                 return Err(BlobError::TooManyUploads { max: MAX_OF_ROBOT });
             }
         }
+        let mut left = None;
+        if all.len() >= max {
+            let (other, upload) = left_by_people(&all).ok_or(BlobError::TooManyUploads { max })?;
+            all.remove(&other);
+            left = Some(upload);
+        }
         all.insert(id, active);
-        Ok(())
+        Ok(left)
     }
 
     /// Whether there is room for so many bytes more of a robot of which `kept` are kept already.
@@ -190,6 +207,14 @@ impl Uploads {
     }
 }
 
+/// Of people's uploads that nobody writes to, the one that gives way first.
+fn left_by_people(all: &HashMap<UploadId, Active>) -> Option<(UploadId, OwnedMutexGuard<Upload>)> {
+    let of_people = all.iter().filter(|(_, active)| owner(&active.repository).is_none());
+    let left = of_people.filter_map(|(id, active)| Some((id, active.upload.clone().try_lock_owned().ok()?)));
+    let (id, upload) = left.min_by_key(|(_, upload)| upload.gives_way())?;
+    Some((id.clone(), upload))
+}
+
 impl Blobs {
     /// Begins an upload; only requests for the same repository reach it.
     pub async fn begin_upload(&self, repository: &RepositoryName) -> Result<UploadId, BlobError> {
@@ -199,10 +224,14 @@ impl Blobs {
         let bytes = Arc::clone(&created.bytes);
         let active =
             Active { repository: repository.clone(), upload: Arc::new(tokio::sync::Mutex::new(created)), bytes };
-        if let Err(refused) = self.shared.uploads.insert(id.clone(), active) {
-            // Best effort: what stays is removed at the next start.
-            let _ = fs::remove_file(&path);
-            return Err(refused);
+        // Best effort, both: what stays is removed at the next start.
+        match self.shared.uploads.insert(id.clone(), active) {
+            Ok(None) => {}
+            Ok(Some(mut left)) => drop(on_disk(move || left.cancel()).await),
+            Err(refused) => {
+                let _ = fs::remove_file(&path);
+                return Err(refused);
+            }
         }
         Ok(id)
     }
@@ -338,9 +367,10 @@ impl Blobs {
     /// The only writer's right to an upload. A second writer is refused rather than queued: its chunk would be out of
     /// order anyway.
     fn lock_upload(&self, repository: &RepositoryName, id: &UploadId) -> Result<OwnedMutexGuard<Upload>, BlobError> {
-        let active = self.shared.uploads.active().get(id).filter(|active| active.repository == *repository).cloned();
-        let upload = active.ok_or(BlobError::UploadUnknown)?.upload;
-        let upload = upload.try_lock_owned().map_err(|_| BlobError::UploadBusy)?;
+        // Held until the end: who looks for one to give way takes each for a moment.
+        let all = self.shared.uploads.active();
+        let active = all.get(id).filter(|active| active.repository == *repository).ok_or(BlobError::UploadUnknown)?;
+        let upload = active.upload.clone().try_lock_owned().map_err(|_| BlobError::UploadBusy)?;
         if upload.ended { Err(BlobError::UploadUnknown) } else { Ok(upload) }
     }
 }
@@ -422,6 +452,52 @@ mod tests {
         };
         assert_eq!(begun(first, MAX_OF_ROBOT + 1).await, MAX_OF_ROBOT);
         assert_eq!(begun(second, MAX_OF_ROBOT).await, MAX_OF_ROBOT / 2, "a quarter is nobody's");
-        assert_eq!(begun("talker", MAX_OF_ROBOT).await, MAX_OF_ROBOT / 2);
+        assert_eq!(begun("talker", MAX_OF_ROBOT).await, MAX_OF_ROBOT, "people's give way to people's");
+        let is_peoples = |active: &&Active| owner(&active.repository).is_none();
+        assert_eq!(blobs.shared.uploads.active().values().filter(is_peoples).count(), MAX_OF_ROBOT / 2);
+    }
+
+    #[tokio::test]
+    async fn what_people_left_keeps_no_robot_out() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let settings = BlobSettings { max_uploads: 4, ..BlobSettings::default() };
+        let blobs = Blobs::open(directory.path(), settings).expect("opens");
+        let begin = async |repository: &str| blobs.begin_upload(&repository.parse().expect("a name")).await;
+        for _ in 0..4 {
+            begin("talker").await.expect("begins");
+        }
+        for _ in 0..3 {
+            begin("outputs/r00000000000000a1/mapping").await.expect("begins");
+        }
+        let refused = begin("outputs/r00000000000000a1/mapping").await;
+        assert!(matches!(refused, Err(BlobError::TooManyUploads { max: 3 })), "{refused:?}");
+    }
+
+    #[tokio::test]
+    async fn an_upload_that_was_left_gives_way_and_one_that_is_written_to_never_does() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let settings = BlobSettings { max_uploads: 3, ..BlobSettings::default() };
+        let blobs = Blobs::open(directory.path(), settings).expect("opens");
+        let repository: RepositoryName = "talker".parse().expect("a name");
+        let begin = async || blobs.begin_upload(&repository).await;
+        let mut ids = vec![begin().await.expect("begins")];
+        let body = futures_util::stream::iter([Ok::<_, io::Error>(Bytes::from_static(b"some"))]);
+        blobs.append(&repository, &ids[0], None, body, 0).await.expect("there is room");
+        ids.push(begin().await.expect("begins"));
+        for id in &ids {
+            blobs.lock_upload(&repository, id).expect("there").written_at -= SILENCE;
+        }
+        // The empty one gives way, then the one with bytes, and only then what was begun a moment ago.
+        for gone in [None, Some(1), Some(0), Some(2)] {
+            ids.push(begin().await.expect("begins"));
+            let there: Vec<bool> = ids.iter().map(|id| blobs.lock_upload(&repository, id).is_ok()).collect();
+            assert!(gone.is_none_or(|gone: usize| !there[gone]), "{there:?}");
+            assert_eq!(there.iter().filter(|there| **there).count(), 3, "{there:?}");
+        }
+        let writing: Vec<_> = ids[3..].iter().map(|id| blobs.lock_upload(&repository, id).expect("there")).collect();
+        let refused = begin().await;
+        assert!(matches!(refused, Err(BlobError::TooManyUploads { max: 3 })), "{refused:?}");
+        drop(writing);
+        assert_eq!(fs::read_dir(&blobs.shared.uploads.directory).expect("there").count(), 3);
     }
 }

@@ -132,9 +132,20 @@ async fn wrong_bytes_and_cancelled_uploads_leave_nothing() {
 async fn limits_are_told_and_held() {
     let settings = BlobSettings { max_blob_bytes: 1000, max_uploads: 1, ..BlobSettings::default() };
     let registry = TestRegistry::start_with(settings, Some(operator())).await;
+    let left = registry.begin("a").await;
     let upload = registry.begin("a").await;
+    assert_eq!(refusal(registry.get(&left).await).await, refused(404, "BLOB_UPLOAD_UNKNOWN"), "it gave way");
+    let (sender, chunks) = tokio::sync::mpsc::channel::<Result<Vec<u8>, std::io::Error>>(1);
+    let body = reqwest::Body::wrap_stream(tokio_stream::wrappers::ReceiverStream::new(chunks));
+    let writing = tokio::spawn(registry.ask(Method::PATCH, &upload).body(body).send());
+    sender.send(Ok(b"some".to_vec())).await.expect("read");
+    while registry.status(Method::GET, &upload).await != StatusCode::CONFLICT {
+        tokio::task::yield_now().await;
+    }
     let second = registry.ask(Method::POST, "/v2/a/blobs/uploads/").send().await.expect("an answer");
-    assert_eq!(refusal(second).await, refused(429, "TOOMANYREQUESTS"));
+    assert_eq!(refusal(second).await, refused(429, "TOOMANYREQUESTS"), "the only one is written to");
+    drop(sender);
+    assert_eq!(writing.await.expect("no panic").expect("an answer").status(), StatusCode::ACCEPTED);
 
     let announced = registry.ask(Method::PATCH, &upload).body(vec![0; 1001]).send().await.expect("an answer");
     assert_eq!(refusal(announced).await, refused(413, "SIZE_INVALID"));

@@ -58,6 +58,11 @@ impl OciError {
         Self::new(StatusCode::BAD_REQUEST, "NAME_INVALID", error.to_string())
     }
 
+    /// 400: a path that is no text, so nothing in it is a name.
+    pub fn path_invalid() -> Self {
+        Self::new(StatusCode::BAD_REQUEST, "NAME_INVALID", "the path is not UTF-8")
+    }
+
     /// 404: no such repository.
     pub fn name_unknown() -> Self {
         Self::new(StatusCode::NOT_FOUND, "NAME_UNKNOWN", "there is no such repository")
@@ -126,9 +131,9 @@ impl OciError {
         }
     }
 
-    /// 400: the query of a list makes no sense.
+    /// 400: a query that makes no sense. The specification has no code for that.
     pub fn query_invalid(message: &'static str) -> Self {
-        Self::new(StatusCode::BAD_REQUEST, "PAGINATION_NUMBER_INVALID", message)
+        Self::new(StatusCode::BAD_REQUEST, "UNSUPPORTED", message)
     }
 
     pub(super) fn internal(error: &(dyn std::error::Error + 'static)) -> Self {

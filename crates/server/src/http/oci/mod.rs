@@ -10,6 +10,7 @@ mod publish;
 mod signed;
 mod uploads;
 
+use axum::extract::rejection::PathRejection;
 use axum::extract::{Path, Request, State};
 use axum::response::{IntoResponse, Response};
 use http::{HeaderMap, HeaderValue, Method, StatusCode, Uri};
@@ -103,13 +104,18 @@ pub async fn version(request: Request) -> Answer {
     params(("path" = String, Path, description = "A repository and what of it, which has slashes.")),
     responses((status = 200, description = "As the OCI distribution specification says.", body = String,
         content_type = "application/octet-stream")))]
-pub async fn dispatch(State(registry): State<Registry>, Path(path): Path<String>, request: Request) -> Answer {
+pub async fn dispatch(
+    State(registry): State<Registry>,
+    path: Result<Path<String>, PathRejection>,
+    request: Request,
+) -> Answer {
     let (parts, body) = request.into_parts();
     let caller = parts.extensions.get::<Caller>().cloned();
-    let (name, endpoint) = match &caller {
-        Some(Caller::Person(_) | Caller::Robot(_)) => endpoint(&path).ok_or_else(OciError::no_endpoint)?,
-        _ => return Err(OciError::unauthorized()),
-    };
+    if !matches!(caller, Some(Caller::Person(_) | Caller::Robot(_))) {
+        return Err(OciError::unauthorized());
+    }
+    let Path(path) = path.map_err(|_| OciError::path_invalid())?;
+    let (name, endpoint) = endpoint(&path).ok_or_else(OciError::no_endpoint)?;
     let repository: RepositoryName = name.parse().map_err(|error| OciError::name_invalid(&error))?;
     let method = parts.method.clone();
     let (robot, person) = (caller.as_ref().and_then(Caller::robot), caller.as_ref().and_then(Caller::person));
@@ -121,14 +127,14 @@ pub async fn dispatch(State(registry): State<Registry>, Path(path): Path<String>
     {
         return match (&method, endpoint) {
             (&Method::GET | &Method::HEAD, Endpoint::Blob(digest)) => {
-                blobs::get_for_robot(&registry, robot, parse_digest(digest)?, &parts).await
+                blobs::get_for_robot(&registry, robot, digest_of_blob(digest)?, &parts).await
             }
             _ => Err(OciError::denied("a robot may only read its packages' blobs and push its own outputs")),
         };
     }
     match endpoint {
         Endpoint::Blob(digest) => {
-            let digest = parse_digest(digest)?;
+            let digest = digest_of_blob(digest)?;
             match method {
                 Method::HEAD if may_begin(person, &repository) => {
                     blobs::head_before_push(&registry, &repository, digest, &parts).await
@@ -155,8 +161,8 @@ pub async fn dispatch(State(registry): State<Registry>, Path(path): Path<String>
                 _ => Err(OciError::method("GET, PATCH, PUT, DELETE")),
             }
         }
-        Endpoint::Manifest(reference) => {
-            let reference = parse_reference(reference);
+        Endpoint::Manifest(text) => {
+            let reference = parse_reference(text);
             match method {
                 Method::GET | Method::HEAD => manifests::get(&registry, &repository, reference, &parts).await,
                 Method::PUT => {
@@ -164,6 +170,7 @@ pub async fn dispatch(State(registry): State<Registry>, Path(path): Path<String>
                     let push = manifests::Push { repository: &repository, reference: reference?, by: person, only };
                     manifests::put(&registry, push, &parts, body).await
                 }
+                Method::DELETE if is_of_another_algorithm(text) => Err(OciError::manifest_unknown()),
                 Method::DELETE => manifests::delete(&registry, person, &repository, reference?).await,
                 _ => Err(OciError::method("GET, HEAD, PUT, DELETE")),
             }
@@ -231,7 +238,20 @@ fn may_push(robot: &RobotId, repository: &RepositoryName, method: &Method, endpo
 }
 
 fn parse_digest(text: &str) -> Result<Digest, OciError> {
-    text.parse().map_err(|error: task_proto::digest::InvalidDigest| OciError::digest_invalid(error.to_string()))
+    text.parse().map_err(|error: task_proto::digest::InvalidDigest| match is_of_another_algorithm(text) {
+        true => OciError::digest_invalid("only sha256 is supported"),
+        false => OciError::digest_invalid(error.to_string()),
+    })
+}
+
+/// The digest of a blob to find: there is none under one of another algorithm.
+fn digest_of_blob(text: &str) -> Result<Digest, OciError> {
+    if is_of_another_algorithm(text) { Err(OciError::blob_unknown()) } else { parse_digest(text) }
+}
+
+/// Whether this is a digest, but not one of those that things have here.
+fn is_of_another_algorithm(text: &str) -> bool {
+    !text.starts_with("sha256:") && lists::is_digest(text)
 }
 
 fn parse_reference(text: &str) -> Result<Reference, OciError> {

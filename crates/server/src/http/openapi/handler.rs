@@ -40,6 +40,13 @@ impl Argument for Request {}
 impl Argument for Caller {}
 impl Argument for Person {}
 
+/// A handler that answers in its own way to who does not send it.
+impl<T: Argument, E> Argument for Result<T, E> {
+    fn describe(draft: &mut Draft) {
+        T::describe(draft);
+    }
+}
+
 impl<T: ToSchema> Argument for JsonBody<T> {
     fn describe(draft: &mut Draft) {
         draft.takes_json::<T>(true);

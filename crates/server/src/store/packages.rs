@@ -8,7 +8,6 @@ use sqlx::any::AnyRow;
 use task_proto::api::PackageView;
 use task_proto::desired::{BlobRef, PackageRef};
 use task_proto::manifest::TaskManifest;
-use task_proto::oci::Descriptor;
 use task_proto::{Digest, RepositoryName, Tag, TaskName};
 
 use super::{Deed, NewOutput, SignedDocument, Store, StoreError, Write, rows};
@@ -192,19 +191,6 @@ impl Store {
         // Sorted here: a database sorts by its locale.
         tags.sort();
         Ok(Some(tags))
-    }
-
-    /// The manifests whose subject is `subject`, sorted by digest.
-    pub async fn referrers(&self, repository: &RepositoryName, subject: &str) -> Result<Vec<Descriptor>, StoreError> {
-        let rows = sqlx::query(
-            "SELECT digest, size, media_type, artifact_type, annotations FROM manifests
-             WHERE repository = $1 AND subject = $2 ORDER BY digest",
-        )
-        .bind(repository.as_str())
-        .bind(subject)
-        .fetch_all(&self.reads)
-        .await?;
-        rows.iter().map(descriptor).collect()
     }
 
     /// Makes a blob part of a repository.
@@ -423,16 +409,6 @@ impl Write {
 
 fn blobs_of(package: &PackageRef) -> [BlobRef; 3] {
     [package.manifest, package.config, package.content]
-}
-
-fn descriptor(row: &AnyRow) -> Result<Descriptor, StoreError> {
-    let digest = rows::id("manifests.digest", row.try_get("digest")?)?;
-    let blob = BlobRef { digest, size: rows::number(row.try_get("size")?) };
-    Ok(Descriptor {
-        artifact_type: row.try_get("artifact_type")?,
-        annotations: rows::from_json("manifests.annotations", row.try_get("annotations")?)?,
-        ..Descriptor::new(row.try_get("media_type")?, blob)
-    })
 }
 
 pub(super) fn package_view(row: &AnyRow) -> Result<PackageView, StoreError> {

@@ -4,14 +4,17 @@ use reqwest::{Method, Response, StatusCode};
 use serde_json::{Value, json};
 use task_proto::desired::BlobRef;
 use task_proto::oci::{INDEX_TYPE, MANIFEST_TYPE};
-use task_proto::{Digest, RobotId};
+use task_proto::{Digest, RepositoryName, RobotId};
 use taskd::blobs::BlobSettings;
 use taskd::config::BlobRead;
 use taskd::http::auth::Caller;
 use taskd::http::oci::Registry;
 use taskd::store::{NewManifest, PutManifest, StoredManifest};
 
+use crate::database::{TestDatabase, on_both_databases};
 use crate::registry::{NOW_MS, TestRegistry, header, image, operator, refusal, refused};
+
+on_both_databases!(referrers_come_in_pages);
 
 #[tokio::test]
 async fn nobody_is_let_in_without_a_token() {
@@ -318,6 +321,13 @@ async fn of_two_manifests_for_one_tag_one_wins() {
     assert_eq!(Digest::of(&latest.bytes().await.expect("a body")), digest);
 }
 
+/// Where a list goes on.
+fn following(answer: &Response) -> Option<String> {
+    let link = answer.headers().get("link")?.to_str().expect("text");
+    let (path, _) = link.trim_start_matches('<').split_once(">; rel=\"next\"").expect("a link");
+    Some(path.to_owned())
+}
+
 #[tokio::test]
 async fn tags_are_listed_in_pages() {
     let registry = TestRegistry::start().await;
@@ -329,14 +339,14 @@ async fn tags_are_listed_in_pages() {
     let mut next = "/v2/a/tags/list?n=2".to_owned();
     loop {
         let answer = registry.get(&next).await;
-        let link = answer.headers().get("link").map(|link| link.to_str().expect("text").to_owned());
+        let following = following(&answer);
         let body: Value = answer.json().await.expect("JSON");
         assert_eq!(body["name"], "a");
         let tags = body["tags"].as_array().expect("a list").clone();
         assert!(tags.len() <= 2);
         seen.extend(tags);
-        let Some(link) = link else { break };
-        next = link.trim_start_matches('<').split_once(">; rel=\"next\"").expect("a link").0.to_owned();
+        let Some(following) = following else { break };
+        next = following;
     }
     assert_eq!(seen, ["B", "C", "a", "b", "c_1"]);
     let none: Value = registry.get("/v2/a/tags/list?n=0").await.json().await.expect("JSON");
@@ -369,4 +379,83 @@ async fn referrers_are_found_by_subject_and_filtered_by_type() {
     let nothing: Value = registry.get(&format!("/v2/b/referrers/{}", blob.digest)).await.json().await.expect("JSON");
     assert_eq!(nothing["manifests"], json!([]));
     assert_eq!(refusal(registry.get("/v2/a/referrers/x").await).await, refused(400, "DIGEST_INVALID"));
+}
+
+/// Stores a manifest that refers to `subject` as it was possible before there was a limit.
+async fn put_referrer(registry: &TestRegistry, number: usize, kind: &str, subject: Digest, annotation: String) {
+    let digest = Digest::of(format!("referrer {number}").as_bytes());
+    let new = NewManifest {
+        manifest: StoredManifest { digest, size: 1, media_type: MANIFEST_TYPE.to_owned() },
+        artifact_type: Some(kind.to_owned()),
+        annotations: [("note".to_owned(), annotation)].into(),
+        subject: Some(subject.to_string()),
+        parts: Vec::new(),
+        tags: Vec::new(),
+        package: None,
+        output: None,
+        document: None,
+    };
+    let repository: RepositoryName = "a".parse().expect("a name");
+    let put = registry.registry.store.put_manifest(&repository, &new, None, NOW_MS).await;
+    assert_eq!(put.expect("writes"), PutManifest::Stored);
+}
+
+async fn referrers_come_in_pages(database: TestDatabase) {
+    let data = tempfile::tempdir().expect("a directory");
+    let store = database.store.clone();
+    let registry = TestRegistry::start_on(store, data, BlobSettings::default(), Some(operator())).await;
+    let (many, large) = (Digest::of(b"many"), Digest::of(b"large"));
+    for number in 0..90 {
+        let kind = if number < 80 { "application/x-one+json" } else { "application/x-two" };
+        put_referrer(&registry, number, kind, many, "x".repeat(60_000)).await;
+    }
+    for number in 90..92 {
+        put_referrer(&registry, number, "application/x-one+json", large, "x".repeat(5_000_000)).await;
+    }
+    for (subject, filter, pages) in [
+        (many, "", vec![69, 21]),
+        (many, "?artifactType=application%2Fx-one%2Bjson", vec![69, 11]),
+        (many, "?artifactType=application/x-two", vec![10]),
+        (large, "", vec![1, 1]),
+    ] {
+        let (mut seen, mut counts) = (Vec::new(), Vec::new());
+        let mut next = Some(format!("/v2/a/referrers/{subject}{filter}"));
+        while let Some(path) = next {
+            let answer = registry.get(&path).await;
+            next = following(&answer);
+            assert_eq!(answer.headers().contains_key("oci-filters-applied"), !filter.is_empty(), "{path}");
+            let body = answer.text().await.expect("text");
+            assert!(body.len() < 6 << 20, "{path}: {} bytes", body.len());
+            let index: Value = serde_json::from_str(&body).expect("JSON");
+            let manifests = index["manifests"].as_array().expect("a list");
+            counts.push(manifests.len());
+            seen.extend(manifests.iter().map(|manifest| manifest["digest"].as_str().expect("text").to_owned()));
+        }
+        assert_eq!(counts, pages, "{filter}");
+        assert!(seen.is_sorted_by(|one, next| one < next), "each once");
+    }
+    for nonsense in ["last=x", "artifactType=%00"] {
+        let path = format!("/v2/a/referrers/{many}?{nonsense}");
+        assert_eq!(registry.status(Method::GET, &path).await, StatusCode::BAD_REQUEST, "{nonsense}");
+    }
+}
+
+#[tokio::test]
+async fn what_lists_of_referrers_repeat_is_bounded() {
+    let registry = TestRegistry::start().await;
+    let blob = registry.push_blob("a", b"{}").await;
+    let mut manifest = image(blob, blob);
+    manifest["annotations"] = json!({ "note": "x".repeat(64 * 1024 - 3) });
+    let alone = registry.put_manifest("/v2/a/manifests/alone", MANIFEST_TYPE, &manifest).await;
+    assert_eq!(alone.status(), StatusCode::CREATED, "nothing repeats them");
+    manifest["subject"] = json!({ "mediaType": MANIFEST_TYPE, "digest": blob.digest, "size": blob.size });
+    let answer = registry.put_manifest("/v2/a/manifests/long", MANIFEST_TYPE, &manifest).await;
+    assert_eq!(answer.status(), StatusCode::BAD_REQUEST);
+    let body: Value = answer.json().await.expect("an error body");
+    assert_eq!(body["errors"][0]["code"], "MANIFEST_INVALID");
+    let message = body["errors"][0]["message"].as_str().expect("text");
+    assert!(message.starts_with("annotations: they have 65537 bytes"), "{message}");
+    manifest["annotations"] = json!({ "note": "x".repeat(64 * 1024 - 4) });
+    let fits = registry.put_manifest("/v2/a/manifests/long", MANIFEST_TYPE, &manifest).await;
+    assert_eq!(fits.status(), StatusCode::CREATED);
 }

@@ -10,7 +10,7 @@ use serde_json::json;
 use task_proto::RepositoryName;
 use task_proto::oci::INDEX_TYPE;
 
-use super::{Answer, OciError, Registry, query};
+use super::{Answer, OciError, Registry, parse_digest, query};
 
 /// The most tags in one answer.
 const MAX_TAGS: usize = 1000;
@@ -25,6 +25,7 @@ struct TagsQuery {
 #[serde(rename_all = "camelCase")]
 struct ReferrersQuery {
     artifact_type: Option<String>,
+    last: Option<String>,
 }
 
 /// `GET /v2/<name>/tags/list`.
@@ -57,15 +58,28 @@ pub(super) async fn referrers(
         return Err(OciError::digest_invalid(format!("{subject:?} is not a digest")));
     }
     let query: ReferrersQuery = query(&request.uri)?;
-    let mut manifests = registry.store.referrers(repository, subject).await?;
-    let mut response = Json(()).into_response();
-    if let Some(kind) = query.artifact_type.filter(|kind| !kind.is_empty()) {
-        manifests.retain(|manifest| manifest.artifact_type.as_ref() == Some(&kind));
-        response.headers_mut().insert("oci-filters-applied", HeaderValue::from_static("artifactType"));
+    let kind = query.artifact_type.as_deref().filter(|kind| !kind.is_empty());
+    if kind.is_some_and(|kind| kind.contains(char::is_control)) {
+        return Err(OciError::query_invalid("artifactType: it has a control character"));
     }
-    let index = json!({ "schemaVersion": 2, "mediaType": INDEX_TYPE, "manifests": manifests });
-    *response.body_mut() = index.to_string().into();
-    response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static(INDEX_TYPE));
+    let after = query.last.as_deref().map(parse_digest).transpose()?;
+    let page = registry.store.referrers(repository, subject, kind, after.as_ref()).await?;
+    let index = json!({ "schemaVersion": 2, "mediaType": INDEX_TYPE, "manifests": page.manifests });
+    let mut response = index.to_string().into_response();
+    let headers = response.headers_mut();
+    headers.insert(CONTENT_TYPE, HeaderValue::from_static(INDEX_TYPE));
+    if kind.is_some() {
+        headers.insert("oci-filters-applied", HeaderValue::from_static("artifactType"));
+    }
+    if let Some(last) = page.next {
+        // The same question, asked from there on.
+        let asked = request.uri.query().unwrap_or_default();
+        let kept = asked.split('&').filter(|pair| !pair.is_empty() && !pair.starts_with("last="));
+        let kept: String = kept.map(|pair| format!("{pair}&")).collect();
+        let link = format!("</v2/{repository}/referrers/{subject}?{kept}last={last}>; rel=\"next\"");
+        let link = HeaderValue::try_from(link).map_err(|_| OciError::query_invalid("a query no header can hold"))?;
+        headers.insert(LINK, link);
+    }
     Ok(response)
 }
 

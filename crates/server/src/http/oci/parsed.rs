@@ -15,6 +15,8 @@ const DOCKER_MANIFEST_TYPE: &str = "application/vnd.docker.distribution.manifest
 const DOCKER_LIST_TYPE: &str = "application/vnd.docker.distribution.manifest.list.v2+json";
 /// The most blobs and manifests one manifest is made of: each is looked up.
 const MAX_PARTS: usize = 4096;
+/// The most bytes of annotations, names included, of a manifest that refers to another: lists of referrers repeat them.
+const MAX_ANNOTATION_BYTES: usize = 64 * 1024;
 
 /// A manifest of any kind, as far as it is understood.
 #[derive(Debug)]
@@ -93,6 +95,7 @@ impl Parsed {
             publishers,
         };
         parsed.check_texts()?;
+        parsed.check_annotations()?;
         Ok(parsed)
     }
 
@@ -103,6 +106,17 @@ impl Parsed {
             Some((key, _)) => Err(OciError::manifest_invalid(format!("{key}: it has a control character"))),
             None => Ok(()),
         }
+    }
+
+    fn check_annotations(&self) -> Result<(), OciError> {
+        let bytes: usize = self.annotations.iter().map(|(key, value)| key.len() + value.len()).sum();
+        if self.subject.is_none() || bytes <= MAX_ANNOTATION_BYTES {
+            return Ok(());
+        }
+        let message = format!(
+            "annotations: they have {bytes} bytes, {MAX_ANNOTATION_BYTES} are possible where there is a subject"
+        );
+        Err(OciError::manifest_invalid(message))
     }
 }
 

@@ -65,8 +65,12 @@ pub async fn run(store: Store, blobs: Blobs, clock: Clock, grace: Duration, stop
 pub async fn collect(store: &Store, blobs: &Blobs, now_ms: u64, grace: Duration) -> Result<Collected, CollectError> {
     let before = |grace: Duration| now_ms.saturating_sub(u64::try_from(grace.as_millis()).unwrap_or(u64::MAX));
     let uploads = blobs.drop_idle_uploads(before(grace)).await?;
-    let old = blobs.untouched_since(before(grace)).await?;
-    let dropped = store.blobs_dropped_by_robots().await?;
+    let mut old = blobs.untouched_since(before(grace)).await?;
+    let mut dropped = store.blobs_dropped_by_robots().await?;
+    // Most are needed, and that is found out while nobody waits. The rest is looked at once more below.
+    let needed = store.needed_blobs().await?;
+    old.retain(|digest| !needed.contains(digest));
+    dropped.retain(|digest| !needed.contains(digest));
     let removed = remove(store, blobs, &old, before(grace)).await?
         + remove(store, blobs, &dropped, before(grace.min(DROPPED_GRACE))).await?;
     Ok(Collected { uploads, blobs: removed })
@@ -79,7 +83,7 @@ async fn remove(store: &Store, blobs: &Blobs, candidates: &[Digest], before_ms: 
         let collection = blobs.begin_collection().await;
         let mut untouched = Vec::with_capacity(candidates.len());
         for &digest in candidates {
-            // A pusher may have asked for it while we waited for the right to collect.
+            // A pusher may have asked for it since it was listed.
             if blobs.is_untouched_since(digest, before_ms).await? {
                 untouched.push(digest);
             }

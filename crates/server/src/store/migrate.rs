@@ -26,6 +26,7 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[
     (16, "ran_before", include_str!("../migrations/0016_ran_before.sql")),
     (17, "robot_blobs", include_str!("../migrations/0017_robot_blobs.sql")),
     (18, "referrers", include_str!("../migrations/0018_referrers.sql")),
+    (19, "needs", include_str!("../migrations/0019_needs.sql")),
 ];
 
 /// Applies what has not been applied yet.

@@ -14,6 +14,7 @@ mod enrolments;
 mod fan_outs;
 mod first_use;
 mod migrate;
+mod needs;
 mod orders;
 mod outputs;
 mod package_use;

@@ -1,7 +1,7 @@
 //! Repositories, manifests, tags and task packages: what the registry knows of the bytes in the blob store. It never
 //! touches those bytes, and never decides what is a valid manifest.
 
-use std::collections::{BTreeMap, HashSet};
+use std::collections::BTreeMap;
 
 use sqlx::Row as _;
 use sqlx::any::AnyRow;
@@ -268,31 +268,6 @@ impl Store {
                 .await?;
         row.as_ref().map(package_view).transpose()
     }
-
-    /// Those of `candidates` that no manifest and no package in use needs. Repositories that hold one without need forget
-    /// it. The caller holds back everybody who could come to rely on one.
-    pub async fn forget_unneeded(&self, candidates: Vec<Digest>) -> Result<Vec<Digest>, StoreError> {
-        if candidates.is_empty() {
-            return Ok(candidates);
-        }
-        let texts: Vec<String> =
-            sqlx::query_scalar("SELECT digest FROM manifests UNION SELECT digest FROM manifest_parts")
-                .fetch_all(&self.reads)
-                .await?;
-        let needed = texts.iter().map(|text| rows::id("manifests.digest", text));
-        let mut needed = needed.collect::<Result<HashSet<Digest>, _>>()?;
-        let in_use = self.packages_in_use().await?;
-        needed.extend(in_use.iter().flat_map(blobs_of).map(|blob| blob.digest));
-        let unneeded: Vec<Digest> = candidates.into_iter().filter(|digest| !needed.contains(digest)).collect();
-        let mut write = self.begin().await?;
-        for digest in &unneeded {
-            let query = sqlx::query("DELETE FROM repository_blobs WHERE digest = $1").bind(digest.to_string());
-            query.execute(write.connection()).await?;
-            write.uncount_blob(digest).await?;
-        }
-        write.commit().await?;
-        Ok(unneeded)
-    }
 }
 
 impl Write {
@@ -405,10 +380,6 @@ impl Write {
         .await?;
         Ok(())
     }
-}
-
-fn blobs_of(package: &PackageRef) -> [BlobRef; 3] {
-    [package.manifest, package.config, package.content]
 }
 
 pub(super) fn package_view(row: &AnyRow) -> Result<PackageView, StoreError> {

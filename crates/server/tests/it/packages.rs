@@ -1,19 +1,25 @@
 //! Packages in the registry: what is checked, who may read what, and what is collected when.
 
+use std::time::Duration;
+
+use futures_util::FutureExt as _;
 use reqwest::{Method, StatusCode};
 use serde_json::{Value, json};
 use task_proto::oci::{ImageManifest, MANIFEST_TYPE};
 use task_proto::person::{Role, Roles};
 use task_proto::token::{Token, TokenKind};
-use task_proto::{Digest, RobotId};
+use task_proto::{Digest, RepositoryName, RobotId};
 use taskd::blobs::BlobSettings;
-use taskd::collector::Collected;
+use taskd::collector::{self, Collected};
 use taskd::http::auth::Caller;
 use taskd::person::Person;
+use taskd::store::{NewManifest, PutManifest, StoredManifest};
 
 use crate::database::{TestDatabase, on_both_databases};
 use crate::fleet::{Fleet, order_of, random_key};
 use crate::registry::{GRACE, NOW_MS, TestRegistry, operator, serve};
+
+const YEAR_MS: u64 = 365 * 24 * 3_600_000;
 
 fn task(name: &str) -> Value {
     json!({
@@ -88,8 +94,7 @@ async fn a_package_in_use_outlives_its_manifest(database: TestDatabase) {
     assert_eq!(registry.status(Method::DELETE, &path).await, StatusCode::ACCEPTED);
     assert_eq!(registry.status(Method::GET, &path).await, StatusCode::NOT_FOUND);
     let loose = registry.push_blob("talker", b"loose").await.digest;
-    let year_ms = 365 * 24 * 3_600_000;
-    assert_eq!(registry.collect(NOW_MS + year_ms).await.blobs, 1);
+    assert_eq!(registry.collect(NOW_MS + YEAR_MS).await.blobs, 1);
     for (digest, expected) in [
         (manifest, StatusCode::OK),
         (config.digest, StatusCode::OK),
@@ -102,7 +107,61 @@ async fn a_package_in_use_outlives_its_manifest(database: TestDatabase) {
     }
 }
 
-on_both_databases!(a_package_in_use_outlives_its_manifest);
+async fn what_is_needed_holds_no_push_back_and_is_no_write(database: TestDatabase) {
+    let data = tempfile::tempdir().expect("a directory");
+    let store = database.store.clone();
+    let registry = TestRegistry::start_on(store, data, BlobSettings::default(), Some(operator())).await;
+    registry.push_image("a", "v1").await;
+    // A write that is not committed leaves the number as it was.
+    let turn = async || database.store.begin_keeping_rights().await.expect("begins").turn();
+    let before = turn().await;
+    let _push = registry.registry.blobs.hold_collection().await;
+    let collected = tokio::time::timeout(Duration::from_secs(30), registry.collect(NOW_MS + YEAR_MS)).await;
+    assert_eq!(collected.expect("it waits for no push"), Collected::default());
+    assert_eq!(turn().await, before);
+}
+
+async fn what_is_needed_since_it_was_looked_for_is_kept(database: TestDatabase) {
+    let data = tempfile::tempdir().expect("a directory");
+    let store = database.store.clone();
+    let registry = TestRegistry::start_on(store, data, BlobSettings::default(), Some(operator())).await;
+    let (part, loose) = (registry.push_blob("a", b"part").await, registry.push_blob("a", b"loose").await);
+    let (store, blobs) = (database.store.clone(), registry.registry.blobs.clone());
+    let push = blobs.hold_collection().await;
+    let collecting = tokio::spawn({
+        let (store, blobs) = (store.clone(), blobs.clone());
+        async move { collector::collect(&store, &blobs, NOW_MS + YEAR_MS, GRACE).await.expect("collected") }
+    });
+    // Once the collector waits for this push, the next one waits for the collector.
+    while !collecting.is_finished() && blobs.hold_collection().now_or_never().is_some() {
+        tokio::task::yield_now().await;
+    }
+    let new = NewManifest {
+        manifest: StoredManifest { digest: Digest::of(b"manifest"), size: 8, media_type: MANIFEST_TYPE.to_owned() },
+        artifact_type: None,
+        annotations: Default::default(),
+        subject: None,
+        parts: vec![part.digest],
+        tags: Vec::new(),
+        package: None,
+        output: None,
+        document: None,
+    };
+    let repository: RepositoryName = "a".parse().expect("a name");
+    let put = store.put_manifest(&repository, &new, None, NOW_MS).await;
+    assert_eq!(put.expect("writes"), PutManifest::Stored);
+    drop(push);
+    assert_eq!(collecting.await.expect("it ends").blobs, 1);
+    for (digest, expected) in [(part.digest, StatusCode::OK), (loose.digest, StatusCode::NOT_FOUND)] {
+        assert_eq!(registry.status(Method::GET, &format!("/v2/a/blobs/{digest}")).await, expected);
+    }
+}
+
+on_both_databases! {
+    a_package_in_use_outlives_its_manifest,
+    what_is_needed_holds_no_push_back_and_is_no_write,
+    what_is_needed_since_it_was_looked_for_is_kept,
+}
 
 #[tokio::test]
 async fn what_nothing_refers_to_is_collected_after_its_grace() {

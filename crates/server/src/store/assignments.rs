@@ -141,21 +141,6 @@ impl Write {
         Ok(Released { robots, superseded: deployments(superseded)? })
     }
 
-    /// After `deployment` was cancelled, no later cancel may put it back: whoever replaced it puts back what it had
-    /// replaced itself.
-    pub async fn skip_as_previous(&mut self, deployment: &DeploymentId) -> Result<(), StoreError> {
-        sqlx::query(
-            "UPDATE assignments SET previous = (
-                 SELECT skipped.previous FROM assignments skipped
-                 WHERE skipped.deployment_id = $1 AND skipped.robot_id = assignments.robot_id)
-             WHERE previous = $1",
-        )
-        .bind(deployment.as_str())
-        .execute(self.connection())
-        .await?;
-        Ok(())
-    }
-
     /// Carries out an order on `task` where it changes anything on `robots`. Returns the assignments it changed.
     pub async fn order_on_task(
         &mut self,

@@ -8,7 +8,7 @@ use task_proto::desired::Wanted;
 use task_proto::report::{Failure, Phase, Report};
 use task_proto::{DeploymentId, RobotId};
 
-use super::rows::{from_optional_json, from_word, groups, id, json, number, stored, values, word};
+use super::rows::{from_optional_json, from_word, groups, id, json, number, parts_of, stored, values, word};
 use super::timelines::grown_by;
 use super::{StoreError, Write};
 
@@ -105,8 +105,9 @@ impl Write {
                 grown_by(Phase::Assigned, "$1")
             );
             let replaced = taken.iter().filter(|row| row.desired && row.wanted == wanted);
-            let previous = replaced.filter_map(|row| Some((row.previous.as_ref()?, &row.robot)));
-            self.set_pairs(&revive, Phase::Assigned, now_ms, previous).await?;
+            let previous: Vec<_> = replaced.filter_map(|row| Some((row.previous.as_ref()?, &row.robot))).collect();
+            self.set_pairs(&revive, Phase::Assigned, now_ms, previous.iter().copied()).await?;
+            self.pass_over_deleted(&previous).await?;
         }
         let is_told = |row: &&Revocable| row.left.as_ref().map_or(row.desired, |left| left.is_told);
         let robots: BTreeSet<RobotId> =
@@ -141,6 +142,54 @@ impl Write {
                     .bind(left.failure.as_ref().map(json));
             }
             query.execute(self.connection()).await?;
+        }
+        Ok(())
+    }
+
+    /// After `deployment` was cancelled, no later cancel may put it back: whoever replaced it puts back what it had
+    /// replaced itself.
+    pub async fn skip_as_previous(&mut self, deployment: &DeploymentId) -> Result<(), StoreError> {
+        let changed: Vec<(String, String)> = sqlx::query_as(
+            "UPDATE assignments SET previous = (
+                 SELECT skipped.previous FROM assignments skipped
+                 WHERE skipped.deployment_id = $1 AND skipped.robot_id = assignments.robot_id)
+             WHERE previous = $1
+             RETURNING deployment_id, robot_id",
+        )
+        .bind(deployment.as_str())
+        .fetch_all(self.connection())
+        .await?;
+        let changed = parts_of(changed)?;
+        let changed: Vec<_> = changed.iter().map(|(deployment, robot)| (deployment, robot)).collect();
+        self.pass_over_deleted(&changed).await
+    }
+
+    /// Has these put back nothing that was deleted, but what that had replaced itself. A deleted package's bytes are kept while
+    /// it is desired, or what a cancel of that puts back; these become that only now, so theirs may be gone.
+    async fn pass_over_deleted(&mut self, pairs: &[(&DeploymentId, &RobotId)]) -> Result<(), StoreError> {
+        for group in groups(pairs) {
+            // The same package has the same text.
+            let sql = format!(
+                "WITH v (deployment_id, robot_id) AS ({})
+                 UPDATE assignments SET previous = (
+                     SELECT gone.previous FROM assignments gone
+                     WHERE gone.deployment_id = assignments.previous AND gone.robot_id = assignments.robot_id)
+                 FROM v
+                 WHERE assignments.deployment_id = v.deployment_id AND assignments.robot_id = v.robot_id
+                   AND EXISTS (
+                     SELECT 1 FROM deployments d WHERE d.id = assignments.previous AND NOT EXISTS (
+                         SELECT 1 FROM packages p WHERE p.name = d.task AND p.package = d.package))",
+                values(1, group.len(), PAIR)
+            );
+            // What is next may be gone as well.
+            let mut changed = 1;
+            while changed > 0 {
+                let mut query = sqlx::query(AssertSqlSafe(sql.as_str()));
+                for (deployment, robot) in group {
+                    query = query.bind(deployment.as_str()).bind(robot.as_str());
+                }
+                changed = query.execute(self.connection()).await?.rows_affected();
+            }
         }
         Ok(())
     }

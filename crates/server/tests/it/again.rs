@@ -57,7 +57,8 @@ impl Fleet {
         view
     }
 
-    async fn unpublish(&self, version: &str) {
+    /// Deletes it, as crane can whoever has it.
+    pub async fn unpublish(&self, version: &str) {
         let digest = package(version, TaskKind::Service).package.manifest.digest;
         let repository = RepositoryName::of_package(&task());
         let gone = self.database.store.delete_manifest(&repository, &digest, None, self.clock.now_ms()).await;

@@ -21,6 +21,7 @@ on_both_databases! {
     racing_operators_leave_one_winner,
     a_newer_deployment_supersedes_and_a_cancel_puts_back,
     a_cancel_skips_what_was_cancelled_before,
+    a_cancel_passes_over_what_was_deleted,
     robots_that_are_to_poll_are_not_rung,
     batches_follow_each_other_and_failures_pause,
     what_is_not_done_in_time_expires,
@@ -202,6 +203,7 @@ async fn a_newer_deployment_supersedes_and_a_cancel_puts_back(database: TestData
 async fn a_cancel_skips_what_was_cancelled_before(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(1).await;
+    fleet.publish("1").await;
     let one = fleet.deploy("1", |_| ()).await;
     let two = fleet.deploy("2", |_| ()).await;
     let three = fleet.deploy("3", |_| ()).await;
@@ -212,6 +214,37 @@ async fn a_cancel_skips_what_was_cancelled_before(database: TestDatabase) {
     // Without anything to put back, the task goes.
     fleet.actions.cancel_deployment(&fleet.operator, &one).await.expect("cancelled");
     assert!(fleet.desired(&robots[0]).await.expect("state").tasks.is_empty());
+}
+
+async fn a_cancel_passes_over_what_was_deleted(database: TestDatabase) {
+    let fleet = Fleet::new(database).await;
+    let robots = fleet.enroll(2).await;
+    let mut orders = [Vec::new(), Vec::new()];
+    for version in ["1", "2", "3", "4", "5"] {
+        fleet.publish(version).await;
+        for (name, orders) in ["r0", "r1"].into_iter().zip(&mut orders) {
+            let id = fleet.deploy(version, |order| order.selector = name.parse().expect("valid")).await;
+            orders.push(id);
+        }
+    }
+    for version in ["2", "3"] {
+        fleet.unpublish(version).await;
+    }
+    // Their bytes may be gone: no robot should have them, and none would get them by one cancel.
+    for (robot, [first, second]) in [(0, [4, 3]), (1, [3, 4])] {
+        let orders = &orders[robot];
+        fleet.actions.cancel_deployment(&fleet.operator, &orders[first]).await.expect("cancelled");
+        let left = fleet.desired(&robots[robot]).await.expect("state").tasks;
+        assert_eq!(left[0].deployment, orders[second]);
+        fleet.actions.cancel_deployment(&fleet.operator, &orders[second]).await.expect("cancelled");
+        let left = fleet.desired(&robots[robot]).await.expect("state").tasks;
+        assert_eq!(left[0].deployment, orders[0]);
+    }
+    // What is replaced is kept for whoever takes that back, also if it is deleted.
+    let next = fleet.deploy("4", |_| ()).await;
+    fleet.unpublish("1").await;
+    fleet.actions.cancel_deployment(&fleet.operator, &next).await.expect("cancelled");
+    assert_eq!(fleet.desired(&robots[0]).await.expect("state").tasks[0].deployment, orders[0][0]);
 }
 
 async fn robots_that_are_to_poll_are_not_rung(database: TestDatabase) {

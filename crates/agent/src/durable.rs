@@ -6,6 +6,12 @@ use std::io::{self, Write};
 use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
+#[cfg(test)]
+pub(crate) mod own_mounts;
+mod removal;
+
+pub use removal::remove_dir_all;
+
 /// Replaces the file at `path` by one that holds `bytes` and has `mode`. One writer per path at a time.
 pub fn write(path: &Path, bytes: &[u8], mode: u32) -> io::Result<()> {
     let temporary = beside(path, ".tmp");
@@ -56,18 +62,6 @@ pub fn remove_file(path: &Path) -> io::Result<()> {
     absent_is_fine(fs::remove_file(path))
 }
 
-/// Removes a directory with all it holds, if it is there. Links in it are removed, never followed.
-pub fn remove_dir_all(path: &Path) -> io::Result<()> {
-    match fs::remove_dir_all(path) {
-        // A build may leave directories that even their owner can't change.
-        Err(error) if error.kind() == io::ErrorKind::PermissionDenied => {
-            unlock_dirs(path)?;
-            absent_is_fine(fs::remove_dir_all(path))
-        }
-        removed => absent_is_fine(removed),
-    }
-}
-
 /// Brings everything written on the file system that holds `path` to the disk. One call for a whole tree: syncing its
 /// files one by one takes many times as long.
 pub fn sync_file_system(path: &Path) -> io::Result<()> {
@@ -97,17 +91,6 @@ fn absent_is_fine(result: io::Result<()>) -> io::Result<()> {
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
         other => other,
     }
-}
-
-fn unlock_dirs(path: &Path) -> io::Result<()> {
-    if !fs::symlink_metadata(path)?.is_dir() {
-        return Ok(());
-    }
-    fs::set_permissions(path, fs::Permissions::from_mode(0o700))?;
-    for entry in fs::read_dir(path)? {
-        unlock_dirs(&entry?.path())?;
-    }
-    Ok(())
 }
 
 #[cfg(test)]

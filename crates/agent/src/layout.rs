@@ -117,15 +117,12 @@ impl DataDir {
     }
 
     /// Removes what an agent that died left half done: trees half unpacked or half removed. Only at start: a pull in
-    /// progress would lose its tree.
+    /// progress would lose its tree. What can't be removed keeps nothing else from it.
     pub fn clean_leftovers(&self) -> io::Result<()> {
-        durable::remove_dir_all(&self.staging())?;
         let tasks = entries(&self.tasks())?;
-        remove_marked(&tasks)?;
-        for task in tasks.iter().filter(|path| path.is_dir()) {
-            remove_marked(&entries(task)?)?;
-        }
-        Ok(())
+        let mut outcomes = vec![durable::remove_dir_all(&self.staging()), remove_marked(&tasks)];
+        outcomes.extend(tasks.iter().filter(|path| path.is_dir()).map(|task| remove_marked(&entries(task)?)));
+        outcomes.into_iter().collect()
     }
 
     /// Removes all gathered bytes except those of the blobs in `wanted`.
@@ -220,8 +217,9 @@ impl TaskDir {
         Ok(entries(&self.root)?.iter().filter_map(|path| digest_of(path)).collect())
     }
 
-    /// Removes every version except those in `kept` and the current one.
+    /// Removes every version except those in `kept` and the current one, and what is left of earlier ones.
     pub fn prune(&self, kept: &[Digest]) -> io::Result<()> {
+        remove_marked(&entries(&self.root)?)?;
         let current = self.current();
         for digest in self.versions()? {
             if !kept.contains(&digest) && current != Some(digest) {
@@ -280,18 +278,24 @@ impl VersionDir {
     }
 }
 
-/// Removes a directory so that it is there whole or not at all, at any moment.
+/// Removes a directory so that it is there whole or not at all, at any moment. It is not done while anything is left of it,
+/// also of an earlier try.
 fn remove_whole(dir: &Path) -> io::Result<()> {
-    let Some(name) = file_name(dir).filter(|_| dir.exists()) else { return Ok(()) };
+    let Some(name) = file_name(dir) else { return Ok(()) };
     let removed = dir.with_file_name(format!("{REMOVED}{name}"));
     durable::remove_dir_all(&removed)?;
+    if !dir.exists() {
+        return Ok(());
+    }
     durable::rename(dir, &removed)?;
     durable::remove_dir_all(&removed)
 }
 
+/// Removes what is marked as being removed, all that can be.
 fn remove_marked(paths: &[PathBuf]) -> io::Result<()> {
     let is_marked = |path: &&PathBuf| file_name(path).is_some_and(|name| name.starts_with(REMOVED));
-    paths.iter().filter(is_marked).try_for_each(|path| durable::remove_dir_all(path))
+    let outcomes: Vec<_> = paths.iter().filter(is_marked).map(|path| durable::remove_dir_all(path)).collect();
+    outcomes.into_iter().collect()
 }
 
 /// A directory's entries, sorted; none if it is not there.
@@ -315,7 +319,10 @@ fn digest_of(path: &Path) -> Option<Digest> {
 
 #[cfg(test)]
 mod tests {
+    use nix::mount::{MsFlags, mount, umount};
+
     use super::*;
+    use crate::durable::own_mounts::with_own_mounts;
 
     #[test]
     fn pruning_keeps_the_current_version_and_those_named() {
@@ -362,6 +369,30 @@ mod tests {
         data.clean_leftovers().unwrap();
         assert!(!marked.exists() && !data.staging().exists());
         assert_eq!(entries(&data.tasks()).unwrap(), [task.root()]);
+    }
+
+    #[test]
+    fn a_removal_that_fails_is_not_done_and_keeps_no_other_from_being_cleaned_up() {
+        let dir = tempfile::tempdir().unwrap();
+        let data = DataDir::new(dir.path()).unwrap();
+        let task = data.task(&"talker".parse().unwrap());
+        let marked = data.tasks().join(".removed-talker");
+        let other = data.tasks().join(".removed-zipper");
+        durable::create_dir_all(&task.root().join("busy")).unwrap();
+        durable::create_dir_all(&other).unwrap();
+        with_own_mounts(|| {
+            // Nobody can remove it while something is mounted there.
+            let busy = task.root().join("busy");
+            mount(Some("tmpfs"), &busy, Some("tmpfs"), MsFlags::empty(), None::<&str>).unwrap();
+            task.remove().unwrap_err();
+            assert!(marked.exists() && !task.root().exists());
+            task.remove().unwrap_err();
+            data.clean_leftovers().unwrap_err();
+            assert!(!other.exists());
+            umount(&marked.join("busy")).unwrap();
+            task.remove().unwrap();
+            assert!(!marked.exists());
+        });
     }
 
     #[test]

@@ -66,7 +66,9 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
     let config = Config::load(data.root(), std::env::vars_os())?;
     let _lock = lock(&data)?;
     let (ledger, lost) = open_ledger(&data)?;
-    data.clean_leftovers().context("cannot remove what an earlier agent left half done")?;
+    if let Err(error) = data.clean_leftovers() {
+        tracing::warn!(%error, "cannot remove all that an earlier agent left half done");
+    }
     let base = match &config.server {
         Some(server) => server.clone(),
         None => parse_server(&identity.server)?,

@@ -13,7 +13,7 @@ use task_proto::desired::{DesiredState, DesiredTask, Wanted};
 use task_proto::envelope::PublicKey;
 use task_proto::id::Labels;
 use task_proto::report::{Condition, Progress};
-use task_proto::{Digest, InstanceId, RobotId, RobotName, TaskName};
+use task_proto::{Digest, Generation, InstanceId, RobotId, RobotName, TaskName};
 use tokio::sync::{Notify, mpsc, watch};
 use tokio::task::{AbortHandle, JoinSet};
 use tokio::time::Instant;
@@ -122,6 +122,8 @@ pub struct Driver<E> {
     ledger: Ledger,
     /// The ledger has changes that are not on the disk.
     dirty: bool,
+    /// Of the accepted state that is on the disk: what was accepted and is forgotten by a power cut must be sent again.
+    observed: Generation,
     desired: Option<DesiredState>,
     views: BTreeMap<TaskName, View>,
     under_way: HashMap<(TaskName, Lane), UnderWay>,
@@ -190,6 +192,7 @@ impl<E: Effects> Driver<E> {
             shared,
             ledger,
             dirty: true,
+            observed: Generation(0),
             desired,
             views: BTreeMap::new(),
             under_way: HashMap::new(),
@@ -248,14 +251,17 @@ impl<E: Effects> Driver<E> {
                 wake = wake.min(Instant::now() + Duration::from_millis(wait_ms));
             }
         }
-        // Written before anything is done: if that fails nothing is, and the plan sees steps that never began.
-        if self.save() {
+        // Written before anything is done: if that fails the plan sees steps that never began.
+        let saved = self.save();
+        if saved {
             self.keep_ordered_parts();
-            for (task, step) in begin {
-                self.begin(task, step);
-            }
         } else {
             wake = wake.min(Instant::now() + LEDGER_RETRY);
+        }
+        for (task, step) in begin {
+            if saved || self.only_takes_away(&task, &step) {
+                self.begin(task, step);
+            }
         }
         for under_way in self.under_way.values() {
             wake = under_way.drop_at.map_or(wake, |at| wake.min(at));
@@ -263,6 +269,13 @@ impl<E: Effects> Driver<E> {
         self.watch_processes();
         self.publish_report();
         wake
+    }
+
+    /// Whether the step ends something and nothing is to come in its place. It is done also where nothing can be written:
+    /// it may be what makes room, and an agent that has forgotten it does it again.
+    fn only_takes_away(&self, task: &TaskName, step: &Step) -> bool {
+        let is_wanted = self.desired_task(task).is_some_and(|desired| desired.wanted == Wanted::Running);
+        matches!(step, Step::Stop(_) | Step::Remove) && !is_wanted
     }
 
     /// All tasks, in the order in which they get what not all can have at once.
@@ -463,12 +476,15 @@ impl<E: Effects> Driver<E> {
         match self.effects.write_ledger(&self.ledger) {
             Ok(()) => {
                 self.dirty = false;
+                self.observed = self.ledger.accepted.as_ref().map_or(Generation(0), |accepted| accepted.generation);
                 self.conditions.remove("ledger_unwritable");
             }
             Err(error) => {
                 let text = chain(&error);
                 if self.conditions.get("ledger_unwritable") != Some(&text) {
-                    tracing::error!("nothing is begun until the ledger can be written: {text}");
+                    tracing::error!(
+                        "nothing but what was ordered to end is done until the ledger can be written: {text}"
+                    );
                 }
                 self.conditions.insert("ledger_unwritable", text);
             }

@@ -153,11 +153,15 @@ impl RunDir {
     }
 
     /// Takes the start lock, waiting for a start in progress. The lock goes with the file, also into a child that
-    /// inherits it, so there is no moment at which a start is under way and the lock is free.
+    /// inherits it, so there is no moment at which a start is under way and the lock is free. Where nothing can be written
+    /// any more, what runs can still be looked at and stopped.
     pub fn lock(&self) -> Result<File, RunDirError> {
         let path = self.0.join("lock");
         let locked = || {
-            let file = OpenOptions::new().write(true).create(true).truncate(false).mode(0o600).open(&path)?;
+            let file = match OpenOptions::new().write(true).create(true).truncate(false).mode(0o600).open(&path) {
+                Err(error) if error.kind() == io::ErrorKind::ReadOnlyFilesystem => File::open(&path)?,
+                opened => opened?,
+            };
             file.lock()?;
             Ok(file)
         };
@@ -192,7 +196,26 @@ impl LogSpec {
 
 #[cfg(test)]
 mod tests {
+    use nix::mount::{MsFlags, mount};
+
     use super::*;
+    use crate::durable::own_mounts::with_own_mounts;
+
+    #[test]
+    fn a_run_on_a_disk_that_became_read_only_can_be_locked() {
+        let temp = tempfile::tempdir().expect("temp dir");
+        with_own_mounts(|| {
+            let mounted = |flags| mount(Some("tmpfs"), temp.path(), Some("tmpfs"), flags, None::<&str>);
+            mounted(MsFlags::empty()).expect("mounted");
+            let dir = RunDir::create(&temp.path().join("run")).expect("create");
+            drop(dir.lock().expect("locked"));
+            mounted(MsFlags::MS_REMOUNT | MsFlags::MS_RDONLY).expect("mounted anew");
+            let held = RunDir::create(dir.path()).expect("it is there").lock().expect("locked");
+            let other = File::open(dir.path().join("lock")).expect("opened");
+            assert!(other.try_lock().is_err());
+            drop(held);
+        });
+    }
 
     #[test]
     fn the_files_read_back_and_have_the_documented_shape() {

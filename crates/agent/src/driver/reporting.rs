@@ -2,8 +2,8 @@
 
 use std::sync::Arc;
 
+use task_proto::TaskName;
 use task_proto::report::{ActiveVersion, Condition, Failure, FailureCode, Phase, Report, TaskReport};
-use task_proto::{Generation, TaskName};
 use tokio::time::Instant;
 
 use super::{Driver, View};
@@ -40,7 +40,7 @@ impl<E: Effects> Driver<E> {
             instance: self.speaker.instance.clone(),
             boot_id: self.speaker.boot_id.clone(),
             seq: self.seq + 1,
-            observed_generation: self.ledger.accepted.as_ref().map_or(Generation(0), |accepted| accepted.generation),
+            observed_generation: self.observed,
             uptime_ms: u64::try_from(self.started.elapsed().as_millis()).unwrap_or(u64::MAX),
             host: self.effects.host_facts(),
             conditions: self.all_conditions(),

@@ -7,7 +7,7 @@ use task_proto::desired::{BlobRef, Delivery, Inline, PackageRef, Wanted};
 use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
 use task_proto::part::PartRange;
 use task_proto::report::{Failure, FailureCode, Phase, Report};
-use task_proto::{DeploymentId, Digest, Generation};
+use task_proto::{DeploymentId, Digest};
 
 use self::fake::Fake;
 use super::*;
@@ -371,6 +371,26 @@ async fn nothing_is_begun_until_the_ledger_can_be_written() {
     let report = bench.phase(Phase::Running).await;
     assert!(!has(&report, "ledger_unwritable"));
     assert_eq!(bench.fake.state(|state| state.started.len()), 1);
+}
+
+#[tokio::test]
+async fn what_is_ordered_to_end_ends_although_the_ledger_can_not_be_written() {
+    let bench = Bench::new().await;
+    bench.order(1, vec![order("1.0")]).await;
+    bench.phase(Phase::Running).await;
+    bench.fake.state(|state| state.held = true);
+    bench.order(2, vec![order("2.0")]).await;
+    bench.phase(Phase::Deferred).await;
+    bench.fake.state(|state| (state.disk_full, state.held) = (true, false));
+    // The new version's start would have to be written down: the old one is not stopped for what may never come.
+    bench.report(|report| has(report, "ledger_unwritable")).await;
+    assert_eq!(bench.fake.state(|state| (state.alive.len(), state.started.len())), (1, 1));
+    bench.order(3, Vec::new()).await;
+    let report = bench.report(|report| report.tasks.is_empty()).await;
+    assert!(has(&report, "ledger_unwritable") && bench.fake.state(|state| state.alive.is_empty()));
+    assert_eq!(report.observed_generation, Generation(2), "what a power cut would take was not observed");
+    bench.fake.state(|state| state.disk_full = false);
+    bench.report(|report| report.observed_generation == Generation(3)).await;
 }
 
 #[tokio::test]

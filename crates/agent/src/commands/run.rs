@@ -1,8 +1,9 @@
 //! `task-agent run`: puts the agent together and drives until a signal. Tasks go on running afterwards; under systemd
 //! that needs `KillMode=process`.
 
-use std::fs::{File, TryLockError};
+use std::fs::{File, OpenOptions, Permissions, TryLockError};
 use std::io::IsTerminal as _;
+use std::os::unix::fs::{OpenOptionsExt as _, PermissionsExt as _};
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
@@ -168,10 +169,15 @@ fn start_logging() {
     tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colours).with_writer(writer).init();
 }
 
-/// Keeps a second agent away from the data directory while this one lives.
+/// Keeps a second agent away from the data directory while this one lives. The file is this user's alone: whoever could
+/// open it could lock it, and so keep every agent from starting.
 fn lock(data: &Layout) -> anyhow::Result<File> {
     let path = data.root().join("lock");
-    let file = File::create(&path).with_context(|| format!("cannot make {}", path.display()))?;
+    let open = || {
+        let file = OpenOptions::new().write(true).create(true).truncate(false).mode(0o600).open(&path)?;
+        file.set_permissions(Permissions::from_mode(0o600)).map(|()| file)
+    };
+    let file = open().with_context(|| format!("cannot make {}", path.display()))?;
     match file.try_lock() {
         Ok(()) => Ok(file),
         Err(TryLockError::WouldBlock) => {
@@ -217,5 +223,25 @@ async fn cancel_on_signal(shutdown: CancellationToken) {
         (interrupt, terminate) => {
             tracing::error!(?interrupt, ?terminate, "signals can't be received: only SIGKILL ends this agent");
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_lock_is_for_nobody_else_whatever_an_earlier_agent_made() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let data = Layout::new(dir.path()).expect("a data directory");
+        let path = data.root().join("lock");
+        let mode = || path.metadata().expect("it is there").permissions().mode() & 0o7777;
+        drop(lock(&data).expect("locked"));
+        assert_eq!(mode(), 0o600);
+        std::fs::set_permissions(&path, Permissions::from_mode(0o644)).expect("set");
+        let _held = lock(&data).expect("locked");
+        assert_eq!(mode(), 0o600);
+        let second = lock(&data).expect_err("one at a time").to_string();
+        assert!(second.starts_with("another task-agent already runs"), "{second}");
     }
 }

@@ -6,6 +6,7 @@ use std::process::ExitCode;
 use anyhow::Context as _;
 
 use super::DataDir;
+use crate::durable;
 use crate::effects::HOLD_FILE;
 
 /// Arguments of `hold` and of `release`.
@@ -15,10 +16,10 @@ pub struct Arguments {
     data: DataDir,
 }
 
-/// From now on nothing is started or switched.
+/// From now on nothing is started or switched, also after a power cut.
 pub fn hold(arguments: Arguments) -> anyhow::Result<ExitCode> {
     let path = arguments.data.data.join(HOLD_FILE);
-    std::fs::write(&path, b"").with_context(|| format!("cannot write {}", path.display()))?;
+    durable::write(&path, b"", 0o644).with_context(|| format!("cannot write {}", path.display()))?;
     Ok(ExitCode::SUCCESS)
 }
 
@@ -29,5 +30,23 @@ pub fn release(arguments: Arguments) -> anyhow::Result<ExitCode> {
         Ok(()) => Ok(ExitCode::SUCCESS),
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(ExitCode::SUCCESS),
         Err(error) => Err(error).with_context(|| format!("cannot remove {}", path.display())),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn hold_is_written_as_what_survives_a_power_cut_and_release_takes_it_back() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let arguments = || Arguments { data: DataDir { data: dir.path().to_owned() } };
+        let path = dir.path().join(HOLD_FILE);
+        // What is written so that it lasts takes the place of what was there, and is not written into it.
+        std::os::unix::fs::symlink(dir.path().join("elsewhere"), &path).expect("linked");
+        hold(arguments()).expect("held");
+        assert!(path.symlink_metadata().expect("it is there").is_file() && !dir.path().join("elsewhere").exists());
+        release(arguments()).expect("released");
+        assert!(!path.exists());
     }
 }

@@ -12,6 +12,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use nix::sys::signal::Signal;
+use tokio_util::sync::CancellationToken;
 
 use crate::cgroup::Cgroups;
 use crate::containment::{ASSIGNMENT_VARIABLE, Containment, ContainmentError, RUN_DIR_VARIABLE};
@@ -99,10 +100,13 @@ impl Supervisor {
     }
 
     /// Starts `spec` in the run directory at `path`; a run that already runs there is left as it is. The run survives
-    /// the caller from the moment the shim exists: dropping this future does not take it back.
+    /// the caller from the moment the shim exists: dropping this future takes it back only before that. After
+    /// [`SupervisorError::NoAnswer`] it may be one or the other, and [`Self::observe`] tells which.
     pub async fn start(&self, path: &Path, spec: &RunSpec) -> Result<Started, SupervisorError> {
         let (program, cgroups) = (self.program.clone(), self.cgroups.clone());
         let (path, mut spec) = (path.to_owned(), spec.clone());
+        let given_up = CancellationToken::new();
+        let _when_dropped = given_up.clone().drop_guard();
         let begun = tokio::task::spawn_blocking(move || {
             let dir = RunDir::create(&path)?;
             let lock = dir.lock()?;
@@ -116,6 +120,10 @@ impl Supervisor {
             dir.write_spec(&spec)?;
             if let Some(cgroups) = cgroups {
                 cgroups.create(dir.path(), &spec.limits).map_err(failed("make the task's control group"))?;
+            }
+            // Whoever gave up and looks meanwhile finds the spec, and waits for the lock.
+            if given_up.is_cancelled() {
+                return Err(SupervisorError::NoAnswer);
             }
             let answer = process::spawn_shim(&program, dir.path(), lock).map_err(failed("start the shim"))?;
             let mut line = Vec::new();

@@ -47,6 +47,7 @@ mod graph;
 mod held;
 mod outcomes;
 mod ros;
+mod runs;
 mod signers;
 
 /// Written into a version's directory once it is built.
@@ -409,20 +410,23 @@ impl Effects for Robot {
         let record = serde_json::to_vec(run).map_err(|error| failed(&error))?;
         durable::create_dir_all(&run_dir).map_err(|error| failed(&error))?;
         durable::write(&run_dir.join(RUN_RECORD), &record, 0o600).map_err(|error| failed(&error))?;
-        // A start that seemed to fail may have come about after all: there are never two processes of a task.
-        for other in other_runs(&task_dir.run(), Some(&run_dir)) {
-            self.supervisor.stop(&other, Duration::ZERO).await.map_err(|error| failed(&error))?;
-        }
+        self.end_other_runs(&task_dir.run(), Some(&run_dir)).await.map_err(|error| failed(&error))?;
         let facts = self.ros_facts_in(&spec.environment);
         self.watcher.before_start(&Promise::of(&manifest), facts.as_ref()).await.map_err(|failure| {
             // Whoever has the name may go away: a run that was ready before waits for that.
             StepFailure { failure, retry_after_ms: run.ever_ready.then_some(0) }
         })?;
         let started = self.supervisor.start(&run_dir, &spec).await;
+        if matches!(started, Err(SupervisorError::NoAnswer))
+            && let Err(error) = self.supervisor.stop(&run_dir, Duration::ZERO).await
+        {
+            // It stays in the ledger until it is seen to be gone.
+            tracing::warn!(%task, error = %chain(&error), "cannot end what may have been started");
+        }
         let pid = started.map_err(|error| failed(&error))?.task.pid;
         // What earlier runs left is of no more use; that it can't be deleted is no reason not to run.
-        if let Err(error) = forget_runs(&task_dir.run(), Some(&run_dir)) {
-            tracing::warn!(%task, %error, "cannot delete what ended runs left");
+        if let Err(error) = self.forget_runs(&task_dir.run(), Some(&run_dir)).await {
+            tracing::warn!(%task, failure = %error.failure, "cannot delete what ended runs left");
         }
         Ok(pid)
     }
@@ -478,33 +482,16 @@ impl Effects for Robot {
     ) -> Result<(), StepFailure> {
         let (task, kept) = (self.data.task(task), kept.to_vec());
         let running = running.map(|process| task.run().join(&process.dir));
-        on_disk(move || {
-            task.prune(&kept)?;
-            forget_runs(&task.run(), running.as_deref())
-        })
-        .await
+        self.forget_runs(&task.run(), running.as_deref()).await?;
+        on_disk(move || task.prune(&kept)).await
     }
 
     async fn remove(&self, task: &TaskName) -> Result<(), StepFailure> {
         let task = self.data.task(task);
-        // As before a start: one that seemed to fail may have come about after all.
-        for run in other_runs(&task.run(), None) {
-            let stopped = self.supervisor.stop(&run, Duration::ZERO).await;
-            stopped.map_err(|error| later(FailureCode::IO_ERROR, &error, 0))?;
-        }
+        let ended = self.end_other_runs(&task.run(), None).await;
+        ended.map_err(|error| later(FailureCode::IO_ERROR, &error, 0))?;
         on_disk(move || task.remove()).await
     }
-}
-
-/// Deletes every run directory but one.
-fn forget_runs(runs: &Path, kept: Option<&Path>) -> std::io::Result<()> {
-    other_runs(runs, kept).iter().try_for_each(|dir| durable::remove_dir_all(dir))
-}
-
-/// Every run directory but one.
-fn other_runs(runs: &Path, kept: Option<&Path>) -> Vec<PathBuf> {
-    let entries = std::fs::read_dir(runs).into_iter().flatten().flatten();
-    entries.map(|entry| entry.path()).filter(|path| Some(path.as_path()) != kept).collect()
 }
 
 async fn on_disk(work: impl FnOnce() -> std::io::Result<()> + Send + 'static) -> Result<(), StepFailure> {

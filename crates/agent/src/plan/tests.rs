@@ -118,6 +118,27 @@ fn the_old_version_comes_back_after_a_reboot_while_the_new_one_is_pulled() {
 }
 
 #[test]
+fn a_start_that_seemed_to_fail_is_stopped_before_anything_is_made_of_it() {
+    let mut world = World::new(Run::default());
+    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+    while !matches!(world.steps[..], [(Step::Start(_), false)]) {
+        world.happen(Happening::Effect { well: true });
+        world.happen(Happening::Learn);
+    }
+    let (Step::Start(run), _) = world.steps[0].clone() else { panic!("looked for") };
+    // The shim did not answer in time, and has started it all the same.
+    world.alive.push(run.process.expect("begun").dir);
+    world.happen(Happening::Effect { well: false });
+    assert!(matches!(world.steps[..], [(Step::Stop(_), false)]), "{:?}", world.steps);
+    world.happen(Happening::Effect { well: true });
+    world.happen(Happening::Learn);
+    let active = |world: &World| world.record.as_ref().and_then(|record| record.active.clone()).expect("active");
+    assert_eq!((world.alive.len(), active(&world).restarts, active(&world).process), (0, 1, None));
+    world.settle();
+    assert_eq!((phase(&world), world.alive.len()), (Phase::Running, 1));
+}
+
+#[test]
 fn hold_starts_nothing_and_stops_nothing() {
     let mut world = running(Run::default());
     let old = world.alive.clone();

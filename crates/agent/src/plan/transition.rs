@@ -136,11 +136,11 @@ pub fn finished(s: &Situation<'_>, step: &Step, outcome: Result<Done, StepFailur
                 process.started_ms = s.now_ms;
             }
         }
-        (Step::Start(_), Err(error)) => {
-            if let Some(active) = &mut record.active {
-                active.process = None;
+        (Step::Start(_), Err(StepFailure { failure, retry_after_ms })) => {
+            // It may have come about after all: what is made of the failure waits until no process is there.
+            if let Some(process) = record.active.as_mut().and_then(|active| active.process.as_mut()) {
+                process.condemned = Some(Condemned { failure, again: retry_after_ms.is_some() });
             }
-            give_up_or_retry(&mut record, s, error.failure, error.retry_after_ms.is_some());
         }
         (Step::Stop(run), Ok(_)) => {
             let process = record.active.as_mut().and_then(|active| active.process.take());
@@ -281,11 +281,13 @@ pub(super) fn calm(record: &TaskRecord) -> TaskRecord {
     record
 }
 
-/// The record when it turns out that the process it announces was never started: as if it had not been tried.
+/// The record when it turns out that the process it announces was never started: as if it had not been tried, unless the
+/// start is known to have failed.
 pub(super) fn never_started(s: &Situation<'_>) -> TaskRecord {
     let mut record = s.record.clone();
-    if let Some(active) = &mut record.active {
-        active.process = None;
+    let process = record.active.as_mut().and_then(|active| active.process.take());
+    if let Some(condemned) = process.and_then(|process| process.condemned) {
+        give_up_or_retry(&mut record, s, condemned.failure, condemned.again);
     }
     record.settle_phase(s.now_ms);
     record

@@ -85,6 +85,27 @@ async fn a_run_is_started_once_however_often_it_is_asked_for() {
     assert!(matches!(again, Err(SupervisorError::Used(_))), "{again:?}");
 }
 
+#[tokio::test]
+async fn a_start_that_was_given_up_before_there_was_a_shim_starts_nothing() {
+    let run = TestRun::of("sleep 1000");
+    let dir = RunDir::create(&run.run_dir()).expect("dir");
+    let stalled = dir.lock().expect("locked");
+    let start = run.supervisor.start(dir.path(), &run.spec);
+    assert!(tokio::time::timeout(Duration::from_millis(50), start).await.is_err());
+    drop(stalled);
+    // It has the lock until it is over, with its spec written down.
+    eventually("the end of it", || {
+        let over = dir.lock().expect("locked");
+        let written = dir.spec().expect("readable").is_some();
+        drop(over);
+        written.then_some(())
+    })
+    .await;
+    assert_eq!(dir.started().expect("readable"), None);
+    assert_eq!(run.survivors(), Vec::<u32>::new());
+    assert_eq!(run.supervisor.observe(&run.run_dir()).await.expect("observed"), Observed::NeverStarted);
+}
+
 /// Not a test of its own: it is the agent that the next test runs as a process and kills.
 #[tokio::test]
 async fn starter() {

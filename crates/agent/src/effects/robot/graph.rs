@@ -7,6 +7,7 @@ use task_proto::desired::PackageRef;
 use task_proto::report::{Failure, RosFacts};
 
 use super::Robot;
+use super::runs::other_runs;
 use crate::graph::Graph;
 use crate::installation::RosVersion;
 use crate::{fetch, launch};
@@ -38,7 +39,7 @@ impl Robot {
         let mut processes = BTreeMap::new();
         for task in self.data.task_names().unwrap_or_default() {
             let mut pids = Vec::new();
-            for run in super::other_runs(&self.data.task(&task).run(), None) {
+            for run in other_runs(&self.data.task(&task).run(), None) {
                 // A run directory without a run has no processes.
                 pids.extend(self.supervisor.pids(&run).await.unwrap_or_default());
             }

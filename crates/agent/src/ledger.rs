@@ -10,15 +10,17 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use task_proto::desired::{Delivery, DesiredTask, PackageRef, Wanted};
 use task_proto::envelope::Envelope;
-use task_proto::manifest::{OnBoot, Restart, TaskKind, TaskManifest};
+use task_proto::manifest::TaskKind;
 use task_proto::report::{Failure, Phase};
 use task_proto::{DeploymentId, Digest, Generation, TaskName};
 
 use crate::durable;
 
 mod asked;
+mod rules;
 
 pub use asked::{GateAnswer, GateQuestion, GateRecord, GateStep};
+pub use rules::RunRules;
 
 /// The version of the file's format that this agent reads and writes.
 pub const FORMAT: u32 = 1;
@@ -131,6 +133,9 @@ pub struct ActiveRun {
     /// Whether one was started in this boot, so that the robot's gate need not be asked again.
     #[serde(default)]
     pub admitted: bool,
+    /// Whether one was ever started, so that it goes on and is not begun.
+    #[serde(default)]
+    pub ever_started: bool,
     /// Set once the run is over for good.
     pub end: Option<End>,
 }
@@ -160,31 +165,6 @@ pub struct Condemned {
     pub failure: Failure,
     /// Whether the restart policy may start another.
     pub again: bool,
-}
-
-/// What of a task manifest matters while the task runs.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct RunRules {
-    /// Service or job.
-    pub kind: TaskKind,
-    /// What a reboot does.
-    pub on_boot: OnBoot,
-    /// When a process that ended is started again.
-    pub restart: Restart,
-    /// Whether an interrupted job may be started again.
-    pub idempotent: bool,
-    /// Seconds between the signals of a stop.
-    pub stop_timeout_s: u32,
-    /// Seconds that all must hold before it is ready.
-    pub hold_s: u32,
-    /// Seconds in which a process must get ready, and for how long it may be degraded.
-    pub ready_timeout_s: u32,
-    /// Seconds a job may run.
-    #[serde(default)]
-    pub deadline_s: Option<u32>,
-    /// Whether files are to be brought back once it is over.
-    #[serde(default)]
-    pub has_outputs: bool,
 }
 
 /// A run that is over.
@@ -391,7 +371,7 @@ impl TaskRecord {
             priority: 0,
         };
         let mut record = Self::new(order, now_ms);
-        record.active = Some(run);
+        record.active = Some(ActiveRun { ever_started: true, ..run });
         record.settle_phase(now_ms);
         record
     }
@@ -516,6 +496,11 @@ impl ActiveRun {
     pub fn is_for(&self, order: &DesiredTask) -> bool {
         self.deployment == order.deployment && self.run == order.run && self.package == order.package
     }
+
+    /// Whether a process of it was started before. An earlier agent wrote down only that one was ready.
+    pub fn has_started(&self) -> bool {
+        self.ever_started || self.ever_ready
+    }
 }
 
 impl Collection {
@@ -531,25 +516,10 @@ impl Default for Preparation {
     }
 }
 
-impl From<&TaskManifest> for RunRules {
-    fn from(manifest: &TaskManifest) -> Self {
-        Self {
-            kind: manifest.run.kind,
-            on_boot: manifest.run.on_boot,
-            restart: manifest.run.restart,
-            idempotent: manifest.run.idempotent,
-            stop_timeout_s: manifest.run.stop_timeout_s,
-            hold_s: manifest.ready.hold_s,
-            ready_timeout_s: manifest.ready.timeout_s,
-            deadline_s: manifest.run.deadline_s,
-            has_outputs: !manifest.outputs.paths.is_empty(),
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use task_proto::desired::BlobRef;
+    use task_proto::manifest::TaskManifest;
 
     use super::*;
 
@@ -629,7 +599,7 @@ mod tests {
             keys.iter().for_each(|key| assert!(table.remove(*key).is_some(), "{at} has no {key}"));
         };
         drop("", &["fallback", "gate", "starts", "collections", "lost"]);
-        drop("/active", &["admitted"]);
+        drop("/active", &["admitted", "ever_started"]);
         drop("/active/process", &["condemned"]);
         drop("/active/rules", &["deadline_s", "has_outputs"]);
         assert_eq!(serde_json::from_value::<Ledger>(old).expect("read"), ledger);

@@ -44,6 +44,8 @@ pub enum Vouched {
 pub struct TrustFacts {
     /// Another number whenever a package may be judged otherwise than before.
     pub epoch: u64,
+    /// Whether the lifetime of the list of publishers is over, so that nothing new begins.
+    pub list_is_over: bool,
     /// Why the newest list of publishers that it was shown does not count, if it does not.
     pub refused_list: Option<String>,
 }

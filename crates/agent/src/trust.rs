@@ -177,12 +177,15 @@ impl Trust {
             return Err(Distrust::Withdrawn(list.version));
         }
         let counted = vouching(&list.publishers, package, envelopes)?;
-        // As with desired states: a clock that shows a time before this program existed is wrong and locks nobody out.
-        let is_over = wall_ms >= PROGRAM_EXISTS_SINCE_MS && list.is_expired(wall_ms);
-        if is_over && purpose == Use::Begin {
+        if purpose == Use::Begin && is_over(list, wall_ms) {
             return Err(Distrust::Expired { version: list.version });
         }
         Ok(counted)
+    }
+
+    /// Whether the lifetime of the list that counts is over.
+    pub fn is_over(&self, wall_ms: u64) -> bool {
+        self.list().as_ref().is_some_and(|Counting { list, .. }| is_over(list, wall_ms))
     }
 
     fn list(&self) -> RwLockReadGuard<'_, Option<Counting>> {
@@ -206,6 +209,11 @@ impl Kept {
         };
         Ok(list.map(|list| Counting { list, digest: self.digest }))
     }
+}
+
+/// As with desired states: a clock that shows a time before this program existed is wrong and locks nobody out.
+fn is_over(list: &PublisherList, wall_ms: u64) -> bool {
+    wall_ms >= PROGRAM_EXISTS_SINCE_MS && list.is_expired(wall_ms)
 }
 
 /// The envelopes kept about a package; none if there are none that can be read.

@@ -72,7 +72,11 @@ impl Vouching {
 
     /// What judgements depend on now.
     pub fn facts(&self) -> TrustFacts {
-        TrustFacts { epoch: self.epoch.load(Ordering::Acquire), refused_list: self.told().refused.clone() }
+        TrustFacts {
+            epoch: self.epoch.load(Ordering::Acquire),
+            list_is_over: self.trust.is_over(clock::wall_ms()),
+            refused_list: self.told().refused.clone(),
+        }
     }
 
     /// Notes what a desired state names, and begins to get what is new of it: lists of publishers, and signatures of what

@@ -162,12 +162,28 @@ async fn what_nobody_trusted_has_signed_fails_before_anything_is_pulled() {
     // Its publisher is revoked: it goes on, and the report says what that is worth.
     bench.fake.state(|state| {
         state.untrusted.insert(signed.package.manifest.digest);
-        state.trust = TrustFacts { epoch: 1, refused_list: Some("it is old".to_owned()) };
+        state.trust = TrustFacts { epoch: 1, refused_list: Some("it is old".to_owned()), ..TrustFacts::default() };
     });
     let report = bench.report(|report| report.tasks[0].degraded.is_some()).await;
     assert_eq!(report.tasks[0].phase, Phase::Running);
     assert_eq!(report.tasks[0].degraded.as_ref().expect("waited for").code, FailureCode::UNTRUSTED_PACKAGE);
     assert!(has(&report, "publishers_refused"));
+}
+
+#[tokio::test]
+async fn what_was_staged_waits_once_the_list_of_its_publishers_is_over() {
+    let bench = Bench::new().await;
+    let held = order("1.0");
+    bench.fake.state(|state| state.held = true);
+    bench.order(1, vec![held.clone()]).await;
+    bench.phase(Phase::Deferred).await;
+    bench.fake.state(|state| {
+        state.untrusted.insert(held.package.manifest.digest);
+        state.trust.list_is_over = true;
+    });
+    bench.phase(Phase::Failed).await;
+    let (checked, started) = bench.fake.state(|state| (state.checked.len(), state.started.len()));
+    assert_eq!((checked, started), (1, 0), "it is looked at again, and not started");
 }
 
 #[tokio::test]

@@ -385,7 +385,9 @@ impl Effects for Robot {
         let Some(process) = &run.process else {
             return Err(failed(&std::io::Error::other("the ledger names no process to start")));
         };
-        self.vouched(&run.package, Use::GoOn, &CancellationToken::new()).await?;
+        // What was staged long ago may have waited for a person or the gate until its publishers' list was over.
+        let purpose = if run.has_started() { Use::GoOn } else { Use::Begin };
+        self.vouched(&run.package, purpose, &CancellationToken::new()).await?;
         let manifest = self.manifest(&run.package).await?;
         let version = self.version(&run.package);
         let text = script::run_script(&manifest, &version, &self.setup_files(&manifest)?);

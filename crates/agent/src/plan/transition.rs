@@ -129,11 +129,12 @@ pub fn finished(s: &Situation<'_>, step: &Step, outcome: Result<Done, StepFailur
             }
         }
         (Step::Start(_), Ok(done)) => {
-            if let Some(process) = record.active.as_mut().and_then(|active| active.process.as_mut()) {
-                if let Done::Started(pid) = done {
-                    process.pid = Some(pid);
+            if let Some(active) = &mut record.active {
+                active.ever_started = true;
+                if let Some(process) = &mut active.process {
+                    process.started_ms = s.now_ms;
+                    process.pid = if let Done::Started(pid) = done { Some(pid) } else { process.pid };
                 }
-                process.started_ms = s.now_ms;
             }
         }
         (Step::Start(_), Err(StepFailure { failure, retry_after_ms })) => {
@@ -297,6 +298,7 @@ pub(super) fn never_started(s: &Situation<'_>) -> TaskRecord {
 pub(super) fn ended(s: &Situation<'_>, exit: &Exit) -> TaskRecord {
     let mut record = s.record.clone();
     let Some(active) = &mut record.active else { return record };
+    active.ever_started = true;
     let run = active.clone();
     let Some(process) = active.process.take() else { return record };
     let job_done = active.rules.kind == TaskKind::Job && exit.is_success();
@@ -447,6 +449,7 @@ impl ActiveRun {
             first_start_ms: now_ms,
             ever_ready: false,
             admitted: false,
+            ever_started: false,
             end: None,
         }
     }

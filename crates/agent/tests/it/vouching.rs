@@ -102,6 +102,19 @@ fn rules() -> RunRules {
     RunRules::from(&serde_json::from_value::<TaskManifest>(manifest).unwrap())
 }
 
+/// The first run of a package, before its start.
+fn first_run(package: &PackageRef) -> ActiveRun {
+    let process = ProcessRecord {
+        dir: "d.1.1.1".to_owned(),
+        boot_id: "boot".to_owned(),
+        started_ms: 1,
+        pid: None,
+        ready: false,
+        condemned: None,
+    };
+    ActiveRun { process: Some(process), ..ActiveRun::of(&order(package), rules(), 0) }
+}
+
 async fn answer(State(shelf): State<Arc<Mutex<Shelf>>>, Path(path): Path<String>) -> Response {
     let mut shelf = shelf.lock().unwrap();
     shelf.asked.push(path.clone());
@@ -136,6 +149,23 @@ impl Robot {
         let trusted = TrustSettings { publishers: role(&[1, 2, 3], 2), keepers: role(&[7], 1), requires_list: false };
         let trust = Trust::open(trusted, data.publishers());
         Arc::new(Vouching::new(trust, Arc::new(fetcher), data))
+    }
+
+    fn config(&self) -> Config {
+        let keys = [("TASK_AGENT_TRUSTED_PUBLISHERS_KEYS".into(), key(1).public_key().to_string().into())];
+        Config::load(self.dir.path(), keys.into_iter()).unwrap()
+    }
+
+    /// All of a robot, which trusts publisher 1.
+    fn body(&self) -> Body {
+        let data = DataDir::new(self.dir.path()).unwrap();
+        let client = reqwest::Client::builder().no_proxy().build().unwrap();
+        let (token, settings) = (Credential::from("token".to_owned()), FetchSettings::default());
+        let fetcher = Fetcher::new(client.clone(), self.server.clone(), token.clone(), data.clone(), settings);
+        let registry = Registry::new(client, self.server.clone(), token);
+        let mac = "02:00:00:00:00:01".parse().unwrap();
+        let parts = (fetcher, Listening::default());
+        Body::new(data, parts, registry, &self.config(), &RobotId::random(), mac)
     }
 
     fn restart(&mut self) {
@@ -303,28 +333,10 @@ async fn a_list_by_others_than_the_keepers_changes_nothing_and_is_told() {
 #[tokio::test]
 async fn a_step_that_is_under_way_when_its_publishers_are_not_trusted_does_nothing() {
     let (site, talker) = (Robot::new().await, package("talker"));
-    let data = DataDir::new(site.dir.path()).unwrap();
-    let keys = [("TASK_AGENT_TRUSTED_PUBLISHERS_KEYS".into(), key(1).public_key().to_string().into())];
-    let config = Config::load(site.dir.path(), keys.into_iter()).unwrap();
-    let client = reqwest::Client::builder().no_proxy().build().unwrap();
-    let (token, settings) = (Credential::from("token".to_owned()), FetchSettings::default());
-    let fetcher = Fetcher::new(client.clone(), site.server.clone(), token.clone(), data.clone(), settings);
-    let registry = Registry::new(client, site.server.clone(), token);
-    let mac = "02:00:00:00:00:01".parse().unwrap();
-    let robot = Body::new(data, (fetcher, Listening::default()), registry, &config, &RobotId::random(), mac);
+    let robot = site.body();
     let (cancel, progress) = (CancellationToken::new(), watch::Sender::new(Progress { done: 0, total: 0 }));
     let asks = watch::Sender::default();
-    let run = ActiveRun {
-        process: Some(ProcessRecord {
-            dir: "d.1.1.1".to_owned(),
-            boot_id: "boot".to_owned(),
-            started_ms: 1,
-            pid: None,
-            ready: false,
-            condemned: None,
-        }),
-        ..ActiveRun::of(&order(&talker), rules(), 0)
-    };
+    let run = first_run(&talker);
     let outcomes = [
         robot.check_signers(&talker, &cancel).await,
         robot.pull_manifest(&talker, &cancel).await.map(drop),
@@ -341,4 +353,31 @@ async fn a_step_that_is_under_way_when_its_publishers_are_not_trusted_does_nothi
     }
     assert_eq!(site.asked(), 0, "nothing was fetched");
     assert_eq!(robot.prepared(&talker).await.vouched, Vouched::No);
+}
+
+#[tokio::test]
+async fn a_first_start_is_not_made_by_a_list_that_is_over_and_a_restart_is() {
+    let (site, talker) = (Robot::new().await, package("talker"));
+    let data = DataDir::new(site.dir.path()).unwrap();
+    let over = PublisherList {
+        version: 1,
+        issued_at_ms: 1,
+        expires_at_ms: 2,
+        publishers: role(&[1], 1),
+        keepers: role(&[1], 1),
+        withdrawn: Vec::new(),
+    };
+    let over = over.seal(&key(1));
+    let trust = Trust::open(site.config().trust.unwrap(), data.publishers());
+    trust.take(&over, Digest::of(b"list")).unwrap();
+    let signatures = data.task(&talker.name).signatures(&talker.manifest.digest);
+    task_agent::trust::write_signatures(&signatures, &[&signature(1, &talker)]).unwrap();
+    let (robot, first) = (site.body(), first_run(&talker));
+    assert_eq!(robot.prepared(&talker).await.vouched, Vouched::Stale);
+    assert!(robot.trust_facts().list_is_over, "which is looked at again and again");
+    let start = async |run: &ActiveRun| robot.start(&talker.name, run).await.unwrap_err().failure.code;
+    assert_eq!(start(&first).await, FailureCode::PUBLISHERS_EXPIRED);
+    // A restart comes as far as the manifest, which nobody has here.
+    let again = ActiveRun { ever_started: true, ..first };
+    assert_eq!(start(&again).await, FailureCode::PACKAGE_UNAVAILABLE);
 }

@@ -38,6 +38,8 @@ pub enum Heard {
         envelope: Box<Envelope>,
         /// Blobs that came along, only reached by the digests it names.
         inline: Inline,
+        /// Whether it is the server's answer to this robot; what a broker brings may be anybody's.
+        was_asked_for: bool,
     },
     /// The server has nothing newer.
     Unchanged,
@@ -223,7 +225,9 @@ async fn next_poll(shared: &Shared, intervals: Intervals, least: Duration) -> bo
 
 fn heard_of(outcome: Result<Option<Sent>, ServerError>) -> Heard {
     match outcome {
-        Ok(Some(sent)) => Heard::Desired { envelope: Box::new(sent.envelope), inline: Inline::default() },
+        Ok(Some(sent)) => {
+            Heard::Desired { envelope: Box::new(sent.envelope), inline: Inline::default(), was_asked_for: true }
+        }
         Ok(None) => Heard::Unchanged,
         Err(ServerError::TokenRefused(why)) => Heard::TokenRefused(why),
         Err(ServerError::Refused { code, message }) => Heard::Withheld { code, text: message },

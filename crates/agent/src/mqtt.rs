@@ -431,7 +431,8 @@ impl Session<'_> {
         match serde_json::from_slice::<Doorbell>(payload) {
             Ok(Doorbell::State { envelope, inline }) => {
                 // The driver ends before this task: nobody listens only when the agent ends.
-                let _ = self.heard.send(Heard::Desired { envelope: Box::new(envelope), inline }).await;
+                let heard = Heard::Desired { envelope: Box::new(envelope), inline, was_asked_for: false };
+                let _ = self.heard.send(heard).await;
             }
             Ok(Doorbell::Notice { .. }) => self.shared.poll.notify_one(),
             Err(error) => tracing::warn!(%error, "the desired topic holds something else"),

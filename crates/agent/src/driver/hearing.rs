@@ -19,8 +19,10 @@ const MOST_REASON_CHARS: usize = 300;
 impl<E: Effects> Driver<E> {
     pub(super) fn hear(&mut self, message: Heard) {
         match message {
-            Heard::Desired { envelope, inline } => {
-                self.known_by_server();
+            Heard::Desired { envelope, inline, was_asked_for } => {
+                if was_asked_for {
+                    self.known_by_server();
+                }
                 self.consider(*envelope, &inline);
             }
             Heard::Unchanged => self.known_by_server(),
@@ -47,6 +49,7 @@ impl<E: Effects> Driver<E> {
         }
     }
 
+    /// The server has answered this robot, or signed something new for it: it has not removed it, or not for good.
     fn known_by_server(&mut self) {
         self.withheld = None;
         if self.ledger.removed {
@@ -62,6 +65,7 @@ impl<E: Effects> Driver<E> {
         match admission::admit(&envelope, server_key, robot_id, self.desired.as_ref(), wall_ms) {
             Ok(state) => {
                 self.conditions.remove("state_refused");
+                self.withheld = None;
                 if !inline.is_empty() {
                     let packages = state.tasks.iter().flat_map(|task| [task.package.config, task.package.content]);
                     let blobs = packages.chain(state.evidence.blobs());
@@ -70,6 +74,7 @@ impl<E: Effects> Driver<E> {
                 }
                 self.effects.heed(&state);
                 if self.desired.as_ref() != Some(&state) {
+                    self.known_by_server();
                     tracing::info!(generation = %state.generation, tasks = state.tasks.len(), "accepted a desired state");
                     self.ledger.accepted = Some(Accepted { generation: state.generation, envelope });
                     // The order may be for a label that the robot was given just before it: ask again.

@@ -1,6 +1,7 @@
 //! The driver's logic, with a robot whose effects only take notes.
 
 mod fake;
+mod removed;
 
 use task_proto::api::ReportReply;
 use task_proto::desired::{BlobRef, Delivery, Inline, PackageRef, Wanted};
@@ -78,7 +79,7 @@ impl Bench {
         };
         let payload = serde_json::to_vec(&state).expect("json");
         let envelope = Box::new(Envelope::seal(DESIRED_STATE_TYPE, &payload, key));
-        Heard::Desired { envelope, inline: Inline::default() }
+        Heard::Desired { envelope, inline: Inline::default(), was_asked_for: false }
     }
 
     async fn order(&self, generation: u64, tasks: Vec<DesiredTask>) {
@@ -330,38 +331,6 @@ async fn a_refused_state_is_named_and_the_old_one_stays() {
 }
 
 #[tokio::test]
-async fn a_removed_robot_goes_on_and_begins_nothing_new() {
-    let bench = Bench::new().await;
-    bench.order(1, vec![order("1.0")]).await;
-    bench.phase(Phase::Running).await;
-    bench.say(Heard::TokenRefused("this robot was revoked".to_owned())).await;
-    let report = bench.report(|report| has(report, "removed")).await;
-    assert_eq!(report.tasks[0].phase, Phase::Running);
-    assert!(report.conditions[0].text.contains("(this robot was revoked)"), "{:?}", report.conditions);
-    let ledger = bench.end().await;
-    assert!(ledger.removed, "it is remembered over a restart");
-}
-
-#[tokio::test]
-async fn a_removed_robot_begins_nothing_after_a_restart_until_it_is_known_again() {
-    let bench = Bench::new().await;
-    bench.fake.state(|state| state.held = true);
-    bench.order(1, vec![order("1.0")]).await;
-    bench.phase(Phase::Deferred).await;
-    bench.say(Heard::TokenRefused(String::new())).await;
-    bench.report(|report| has(report, "removed")).await;
-    let (fake, key, robot) = (bench.fake.clone(), SigningKey::from_bytes(bench.key.to_bytes()), bench.robot.clone());
-    let ledger = bench.end().await;
-
-    fake.state(|state| state.held = false);
-    let bench = Bench::with(fake, ledger, key, robot).await;
-    let report = bench.report(|report| has(report, "removed") && !has(report, "held")).await;
-    assert_eq!((report.start, bench.fake.state(|state| state.started.len())), (2, 0));
-    bench.say(Heard::Unchanged).await;
-    bench.phase(Phase::Running).await;
-}
-
-#[tokio::test]
 async fn a_restarted_agent_adopts_what_runs_and_what_was_ordered() {
     let bench = Bench::new().await;
     bench.order(1, vec![order("1.0")]).await;
@@ -478,7 +447,7 @@ async fn what_came_with_an_order_is_offered_if_the_order_is_accepted_and_names_i
     came.insert(Digest::of(b"content"), b"others".to_vec());
     came.insert(Digest::of(b"not asked for"), b"not asked for".to_vec());
     let rung = |heard: Heard| match heard {
-        Heard::Desired { envelope, .. } => Heard::Desired { envelope, inline: came.clone() },
+        Heard::Desired { envelope, .. } => Heard::Desired { envelope, inline: came.clone(), was_asked_for: false },
         other => other,
     };
     bench.say(rung(bench.sealed(1, vec![order.clone()], &SigningKey::random()))).await;

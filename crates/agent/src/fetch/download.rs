@@ -24,7 +24,7 @@ const MIN_PROGRESS_BYTES: u64 = 16 * 1024;
 /// stall timeout watches over it.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(7 * 24 * 3600);
 /// No server may keep a robot away for longer.
-const MAX_RETRY_AFTER: Duration = Duration::from_secs(3600);
+pub(crate) const MAX_RETRY_AFTER: Duration = Duration::from_secs(3600);
 
 /// An answer that is being read.
 pub(super) struct Download {

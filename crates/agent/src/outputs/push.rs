@@ -19,6 +19,7 @@ use tokio::sync::{Semaphore, watch};
 
 use super::{OutputError, OutputOrder};
 use crate::credential::Credential;
+use crate::fetch::MAX_RETRY_AFTER;
 use crate::task_user::{self, TaskUser};
 use crate::{durable, foreign_file};
 
@@ -270,7 +271,8 @@ async fn refusal(what: &str, mut response: Response) -> OutputError {
     let (code, text) = said(&body);
     let status = status.as_u16();
     if is_passing {
-        return OutputError::Busy { status, text, retry_after: seconds.map(Duration::from_secs) };
+        let retry_after = seconds.map(|seconds| Duration::from_secs(seconds).min(MAX_RETRY_AFTER));
+        return OutputError::Busy { status, text, retry_after };
     }
     OutputError::Refused { what: what.to_owned(), status, code, text }
 }
@@ -285,7 +287,14 @@ fn said(body: &[u8]) -> (String, String) {
 
 #[cfg(test)]
 mod tests {
-    use super::said;
+    use super::*;
+
+    #[tokio::test]
+    async fn no_server_keeps_files_back_for_long() {
+        let busy = http::Response::builder().status(503).header(RETRY_AFTER, u64::MAX.to_string()).body("");
+        let refused = refusal("a file", busy.expect("an answer").into()).await;
+        assert_eq!(refused.retry_after(), Some(MAX_RETRY_AFTER), "{refused}");
+    }
 
     #[test]
     fn a_refusal_is_told_in_the_servers_words() {

@@ -139,6 +139,15 @@ fn a_start_that_seemed_to_fail_is_stopped_before_anything_is_made_of_it() {
 }
 
 #[test]
+fn a_wait_beyond_all_numbers_is_the_longest_there_is() {
+    let mut world = World::new(Run::default());
+    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+    world.happen(Happening::ToldToWait { ms: u64::MAX });
+    assert_eq!(world.record.as_ref().expect("a record").preparation.retry_at_ms, u64::MAX);
+    assert!(world.steps.is_empty(), "{:?}", world.steps);
+}
+
+#[test]
 fn hold_starts_nothing_and_stops_nothing() {
     let mut world = running(Run::default());
     let old = world.alive.clone();

@@ -171,7 +171,7 @@ pub fn finished(s: &Situation<'_>, step: &Step, outcome: Result<Done, StepFailur
                 for files in record.collections.iter_mut().filter(|other| other.is_same(files)) {
                     files.attempts = files.attempts.saturating_add(1);
                     let wait_ms = backoff_ms(files.attempts, MAX_STEP_BACKOFF_MS, s.jitter).max(least_ms);
-                    files.retry_at_ms = s.now_ms + wait_ms.max(BACKOFF_BASE_MS);
+                    files.retry_at_ms = s.now_ms.saturating_add(wait_ms.max(BACKOFF_BASE_MS));
                     files.failure = Some(failure.clone());
                 }
             }
@@ -206,7 +206,8 @@ fn prepared(preparation: &mut Preparation, s: &Situation<'_>, outcome: Result<Do
         Ok(Done::ToldToWait { at_least_ms }) => {
             // Only the end of the order bounds how often: the server knows when it has room.
             preparation.failure = None;
-            preparation.retry_at_ms = s.now_ms + at_least_ms + wait_jitter_ms(at_least_ms, s.jitter);
+            let wait_ms = at_least_ms.saturating_add(wait_jitter_ms(at_least_ms, s.jitter));
+            preparation.retry_at_ms = s.now_ms.saturating_add(wait_ms);
         }
         Ok(_) => preparation.failure = None,
         Err(StepFailure { failure, retry_after_ms: None }) => {
@@ -217,7 +218,7 @@ fn prepared(preparation: &mut Preparation, s: &Situation<'_>, outcome: Result<Do
             preparation.failure = Some(failure);
             // Retries go on until the order ends: the server lets it expire.
             let wait_ms = backoff_ms(preparation.attempts, MAX_STEP_BACKOFF_MS, s.jitter).max(least_ms);
-            preparation.retry_at_ms = s.now_ms + wait_ms;
+            preparation.retry_at_ms = s.now_ms.saturating_add(wait_ms);
         }
     }
 }

@@ -339,7 +339,7 @@ impl World {
         let record = self.with_situation(|s| finished(s, &step, Ok(told)));
         let after = &record.preparation;
         assert_eq!((after.phase, after.attempts), (before.phase, before.attempts), "it counts as a try");
-        assert!(after.failure.is_none() && after.retry_at_ms >= self.now_ms + ms);
+        assert!(after.failure.is_none() && after.retry_at_ms >= self.now_ms.saturating_add(ms));
         self.record = Some(record);
     }
 

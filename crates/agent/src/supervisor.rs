@@ -88,6 +88,13 @@ pub enum SupervisorError {
     },
 }
 
+impl SupervisorError {
+    /// Whether a file of the run directory is there and can't be understood.
+    pub fn is_malformed(&self) -> bool {
+        matches!(self, Self::RunDir(RunDirError::Malformed { .. }))
+    }
+}
+
 impl Supervisor {
     /// A supervisor whose shims are `program shim`, and whose runs get their control groups from `cgroups`.
     pub fn new(program: impl Into<PathBuf>, cgroups: Option<Cgroups>) -> Self {

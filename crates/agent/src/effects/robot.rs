@@ -267,6 +267,7 @@ impl Effects for Robot {
             Ok(Observed::Exited(status)) => exit(Some(status), None),
             Ok(Observed::OutOfMemory { limit_bytes }) => exit(Some(ExitStatus::Signal(9)), Some(limit_bytes)),
             Ok(Observed::Gone) => exit(None, None),
+            Err(error) if error.is_malformed() && runs::went_down_with_its_boot(process) => exit(None, None),
             Err(error) => {
                 tracing::error!(%task, error = %chain(&error), "cannot tell what became of the process");
                 ProcessState::Unknown

@@ -6,10 +6,11 @@ use std::time::Duration;
 use task_proto::report::FailureCode;
 
 use super::outcomes::later;
-use super::{Robot, on_disk};
-use crate::durable;
+use super::{RUN_RECORD, Robot, on_disk};
+use crate::ledger::{ActiveRun, ProcessRecord};
 use crate::plan::StepFailure;
 use crate::supervisor::SupervisorError;
+use crate::{durable, process};
 
 impl Robot {
     /// Ends what runs of every run directory in `runs` but one: a start that seemed to fail may have come about after all,
@@ -21,7 +22,11 @@ impl Robot {
     ) -> Result<Vec<PathBuf>, SupervisorError> {
         let others = other_runs(runs, kept);
         for dir in &others {
-            self.supervisor.stop(dir, Duration::ZERO).await?;
+            match self.supervisor.stop(dir, Duration::ZERO).await {
+                Err(error)
+                    if error.is_malformed() && recorded(dir).is_some_and(|run| went_down_with_its_boot(&run)) => {}
+                stopped => drop(stopped?),
+            }
         }
         Ok(others)
     }
@@ -34,6 +39,16 @@ impl Robot {
     }
 }
 
+/// Whether the machine was started again since: then nothing is left of the process, whatever its files say.
+pub(super) fn went_down_with_its_boot(process: &ProcessRecord) -> bool {
+    process::boot_id().is_ok_and(|boot_id| boot_id != process.boot_id)
+}
+
+/// What the ledger said of the process of a run directory before its start.
+fn recorded(dir: &Path) -> Option<ProcessRecord> {
+    serde_json::from_slice::<ActiveRun>(&std::fs::read(dir.join(RUN_RECORD)).ok()?).ok()?.process
+}
+
 /// Every run directory but one.
 pub(super) fn other_runs(runs: &Path, kept: Option<&Path>) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(runs).into_iter().flatten().flatten();
@@ -44,21 +59,22 @@ pub(super) fn other_runs(runs: &Path, kept: Option<&Path>) -> Vec<PathBuf> {
 mod tests {
     use std::os::unix::process::ExitStatusExt as _;
 
-    use task_proto::DeploymentId;
+    use task_proto::desired::{BlobRef, DesiredTask, PackageRef, Wanted};
+    use task_proto::manifest::TaskManifest;
+    use task_proto::{DeploymentId, Digest};
 
     use super::super::tests::robot;
+    use super::*;
     use crate::cgroup::RunLimits;
     use crate::containment::RUN_DIR_VARIABLE;
     use crate::effects::Effects as _;
     use crate::launch::Interrupt;
+    use crate::ledger::RunRules;
+    use crate::observed::ProcessState;
     use crate::run_dir::{LogSpec, RunDir, RunSpec};
 
-    #[tokio::test]
-    async fn what_still_runs_of_an_old_run_is_ended_before_its_directory_goes() {
-        let temp = tempfile::tempdir().expect("a directory");
-        let robot = robot(temp.path(), "");
-        let talker = "talker".parse().expect("valid");
-        let run = RunDir::create(&robot.data.task(&talker).run().join("d.1.1.1")).expect("made");
+    fn run_dir(path: &Path) -> RunDir {
+        let run = RunDir::create(path).expect("made");
         let spec = RunSpec {
             assignment: DeploymentId::random(),
             script: "run.sh".into(),
@@ -71,6 +87,64 @@ mod tests {
             cgroup: None,
         };
         run.write_spec(&spec).expect("written");
+        run
+    }
+
+    fn run_of(boot_id: &str) -> ActiveRun {
+        let manifest = serde_json::json!({
+            "name": "talker", "version": "1.0", "run": { "exec": ["true"] },
+            "content": { "tar_digest": Digest::of(b""), "tar_size": 0, "entries": 0 },
+        });
+        let rules = RunRules::from(&serde_json::from_value::<TaskManifest>(manifest).expect("a manifest"));
+        let (name, version, blob) = ("talker".parse(), "1.0".parse().expect("valid"), BlobRef::of(b"1"));
+        let name: task_proto::TaskName = name.expect("valid");
+        let order = DesiredTask {
+            task: name.clone(),
+            deployment: DeploymentId::random(),
+            package: PackageRef { name, version, manifest: blob, config: blob, content: blob },
+            wanted: Wanted::Running,
+            run: 1,
+            delivery: Default::default(),
+            priority: 0,
+        };
+        let process = ProcessRecord {
+            dir: "d.1.1.1".to_owned(),
+            boot_id: boot_id.to_owned(),
+            started_ms: 1,
+            pid: Some(7),
+            ready: true,
+            condemned: None,
+        };
+        ActiveRun { process: Some(process), ..ActiveRun::of(&order, rules, 0) }
+    }
+
+    #[tokio::test]
+    async fn a_run_that_can_not_be_read_is_gone_once_the_machine_was_started_again() {
+        let temp = tempfile::tempdir().expect("a directory");
+        let robot = robot(temp.path(), "");
+        let talker = "talker".parse().expect("valid");
+        let (now, before) = (run_of(&process::boot_id().expect("a boot id")), run_of("an earlier boot"));
+        let [now_process, before_process] = [&now, &before].map(|run| run.process.clone().expect("a process"));
+        let dir = run_dir(&robot.run_dir(&talker, &now_process));
+        std::fs::write(dir.path().join("pid.json"), "{").expect("written");
+        let record = |run: &ActiveRun| {
+            std::fs::write(dir.path().join(RUN_RECORD), serde_json::to_vec(run).expect("json")).expect("written");
+        };
+        record(&now);
+        assert_eq!(robot.process(&talker, &now_process).await, ProcessState::Unknown);
+        robot.remove(&talker).await.expect_err("it may live");
+        record(&before);
+        assert!(matches!(robot.process(&talker, &before_process).await, ProcessState::Ended(_)));
+        robot.remove(&talker).await.expect("removed");
+        assert!(!dir.path().exists());
+    }
+
+    #[tokio::test]
+    async fn what_still_runs_of_an_old_run_is_ended_before_its_directory_goes() {
+        let temp = tempfile::tempdir().expect("a directory");
+        let robot = robot(temp.path(), "");
+        let talker = "talker".parse().expect("valid");
+        let run = run_dir(&robot.data.task(&talker).run().join("d.1.1.1"));
         #[expect(clippy::disallowed_methods, reason = "a process that a shim has started and not written down")]
         let mut command = std::process::Command::new("sleep");
         let mut process = command.arg("1000").env(RUN_DIR_VARIABLE, run.path()).spawn().expect("started");

@@ -25,7 +25,9 @@ impl Robot {
             match self.supervisor.stop(dir, Duration::ZERO).await {
                 Err(error)
                     if error.is_malformed() && recorded(dir).is_some_and(|run| went_down_with_its_boot(&run)) => {}
-                stopped => drop(stopped?),
+                stopped => {
+                    stopped?;
+                }
             }
         }
         Ok(others)

@@ -136,7 +136,11 @@ impl Gatekeeper for Door {
     fn admit(&self, login: Login) -> BoxFuture<'_, Result<Principal, Refusal>> {
         let robot = ROBOT.parse().expect("valid");
         let known = login.user_name.as_deref() == Some(ROBOT);
-        let answer = if known { Ok(Principal::Robot { robot, token_number: 0 }) } else { Err(Refusal::BadCredentials) };
+        let answer = if known {
+            Ok(Principal::Robot { robot, token_number: 0, is_first_use: false })
+        } else {
+            Err(Refusal::BadCredentials)
+        };
         async { answer }.boxed()
     }
 }

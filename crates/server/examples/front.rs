@@ -29,7 +29,7 @@ struct Open;
 impl Gatekeeper for Open {
     fn admit(&self, login: Login) -> BoxFuture<'_, Result<Principal, Refusal>> {
         let robot = login.client_id.parse().map_err(|_| Refusal::BadCredentials);
-        async move { Ok(Principal::Robot { robot: robot?, token_number: 0 }) }.boxed()
+        async move { Ok(Principal::Robot { robot: robot?, token_number: 0, is_first_use: false }) }.boxed()
     }
 }
 

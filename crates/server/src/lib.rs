@@ -45,4 +45,5 @@ pub mod store;
 pub mod tls;
 pub mod transfers;
 pub mod uplink;
+pub mod visits;
 pub mod web;

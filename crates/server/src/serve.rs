@@ -44,6 +44,7 @@ use crate::store::{Store, StoreError, sqlite_url};
 use crate::tls::{Tls, TlsError};
 use crate::transfers::Transfers;
 use crate::uplink::Uplink;
+use crate::visits::Visits;
 
 /// How long requests under way may take to end; the whole stop is to take less than ten seconds.
 const REQUEST_PATIENCE: Duration = Duration::from_secs(5);
@@ -128,15 +129,15 @@ impl Server {
         let http_address = http.local_addr().map_err(|source| ServeError::Listen { address: config.http, source })?;
 
         let (changes, presence) = (Changes::new(), Arc::new(Presence::new(milliseconds(config.presence_timeout))));
-        let load = Arc::new(ServerLoad::default());
+        let (load, visits) = (Arc::<ServerLoad>::default(), Arc::<Visits>::default());
         let chooser = Chooser::new(&config.delivery, presence.clone(), load.clone());
         let settings = action_settings(&config, tls.as_ref());
         let actions = Actions::new(store.clone(), clock.clone(), changes.clone(), key, settings, chooser.clone());
         let (writer, reports) = ReportWriter::start(store.clone(), clock.clone(), changes.clone(), chooser);
         let (requests, logs, vitals) = (Requests::default(), RobotLogs::new(), RobotVitals::default());
-        let (heard, said, done) = (requests.clone(), logs.clone(), vitals.clone());
+        let (heard, said, done, told) = (requests.clone(), logs.clone(), vitals.clone(), changes.clone());
         let uplink = Uplink::new(writer.clone(), heard, said, done, presence.clone(), changes.clone(), clock.clone());
-        let gatekeeper = StoreGatekeeper { store: store.clone(), clock: clock.clone() };
+        let gatekeeper = StoreGatekeeper::new(store.clone(), clock.clone(), presence.clone(), visits.clone(), told);
         let conduct = Conduct::new(config.robots);
         let broker = broker_config(&config, tls.clone(), conduct.clone());
         let (broker, mqtt) =
@@ -163,7 +164,7 @@ impl Server {
             transfers,
             uploads: UploadSpace::new(data.fresh_directory("incoming")?, config.max_upload_bytes),
             sessions: Arc::default(),
-            visits: Arc::default(),
+            visits,
             conduct,
             provider,
             attempts: Arc::default(),

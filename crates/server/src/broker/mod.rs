@@ -57,6 +57,8 @@ pub enum Principal {
         robot: RobotId,
         /// Which of its tokens it showed; comes back with its messages.
         token_number: u64,
+        /// Whether that has just ended its other tokens: who came in by those has to leave.
+        is_first_use: bool,
     },
     /// A person, or a program with a person's token: may listen below the prefix.
     Operator(UserName),

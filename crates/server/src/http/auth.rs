@@ -22,10 +22,11 @@ use tokio::time::{Instant, timeout_at};
 use super::App;
 use super::conduct::hold_up;
 use super::error::{ApiError, ROBOT_REVOKED};
-use super::visits::Line;
+use crate::gatekeeper::ended_others;
 use crate::person::Person;
 use crate::store::{Admitted, TokenHolder};
 use crate::tls::ClientProof;
+use crate::visits::Line;
 
 /// Who may call a route.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -244,7 +245,7 @@ async fn identify_on_line(app: &App, showing: &Showing<'_>) -> Result<(Caller, T
 
 /// Who sent this request. `Anyone` if it does not say; an error if it says it wrongly.
 async fn identify(app: &App, showing: &Showing<'_>) -> Result<(Caller, TokenNumber), ApiError> {
-    let &Showing { method, headers, proof, .. } = showing;
+    let &Showing { method, headers, proof, line } = showing;
     let now_ms = app.clock.now_ms();
     let token = if let Some(value) = headers.get(header::AUTHORIZATION) {
         token_of(value)?
@@ -268,9 +269,12 @@ async fn identify(app: &App, showing: &Showing<'_>) -> Result<(Caller, TokenNumb
         TokenHolder::Pending { .. } => return Err(ApiError::awaits_approval()),
         TokenHolder::Robot { robot, token_number, .. } => {
             if is_first_use {
-                // Whoever is connected came in by the token that has just ended.
+                // Whoever is connected came in by the token that has just ended; this request's own connection stays.
                 app.broker.disconnect(&robot);
-                app.presence.ended_others(&robot);
+                if let Some(line) = line {
+                    line.leave();
+                }
+                ended_others(&app.presence, &app.visits, &app.changes, &robot);
             }
             (Caller::Robot(robot), TokenNumber(token_number))
         }

@@ -28,9 +28,9 @@ use tokio_util::task::TaskTracker;
 use tower::ServiceExt as _;
 
 use super::traffic::HttpTotals;
-use super::visits::Line;
 use crate::anteroom::{Anteroom, Place};
 use crate::tls::{ClientProof, Tls};
+use crate::visits::Line;
 
 /// How long a request's head may take, also the first one of a connection, and how long one is kept without a request.
 const HEAD_TIMEOUT: Duration = Duration::from_secs(20);

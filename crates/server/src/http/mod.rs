@@ -33,7 +33,6 @@ mod tasks;
 pub mod traffic;
 pub mod upload;
 mod views;
-pub mod visits;
 mod vitals;
 
 use std::net::IpAddr;
@@ -72,6 +71,7 @@ use crate::robot_vitals::RobotVitals;
 use crate::server_facts::ServerFacts;
 use crate::store::Store;
 use crate::transfers::Transfers;
+use crate::visits::Visits;
 use crate::web;
 use auth::{Access, Gate, guard};
 use error::ApiError;
@@ -112,7 +112,7 @@ pub struct AppParts {
     /// Who is signed in at the page.
     pub sessions: Arc<session::Sessions>,
     /// Robots' requests that are under way.
-    pub visits: Arc<visits::Visits>,
+    pub visits: Arc<Visits>,
     /// How robots behave.
     pub conduct: Arc<Conduct>,
     /// By whom people may sign in, if there is such a provider.

@@ -51,10 +51,12 @@ impl Gatekeeper for Door {
                     self.asked.notify_one();
                     self.go_on.notified().await;
                     let robot = user.parse().expect("a robot's id");
-                    Ok(Principal::Robot { robot, token_number: 0 })
+                    Ok(Principal::Robot { robot, token_number: 0, is_first_use: false })
                 }
                 password => match password.strip_prefix("pw-").map(str::parse) {
-                    Some(Ok(robot)) if !user.is_empty() => Ok(Principal::Robot { robot, token_number: 0 }),
+                    Some(Ok(robot)) if !user.is_empty() => {
+                        Ok(Principal::Robot { robot, token_number: 0, is_first_use: false })
+                    }
                     _ => Err(Refusal::BadCredentials),
                 },
             }

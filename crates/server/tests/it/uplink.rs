@@ -9,6 +9,8 @@ use serde_json::{Value, json};
 use task_proto::api::{RobotToken, ServerInfo};
 use task_proto::desired::{DesiredState, Doorbell};
 use task_proto::report::Phase;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
 
 use crate::harness::{TestRobot, TestServer, answer, opened, refusal};
 
@@ -260,6 +262,38 @@ async fn two_instances_that_displace_each_other_get_no_more_work() {
     assert_eq!(server.robot(&robot).await.conditions[0].code, "duplicate_identity");
     server.clock.advance_ms(10 * 60 * 1000);
     assert_eq!(server.ask_desired(&robot).await.status(), 200);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_token_that_is_first_used_over_mqtt_ends_what_came_by_the_old_one() {
+    let server = TestServer::start().await;
+    let mut robot = server.enroll("atlas").await;
+    let mut clone = TestRobot::new(robot.id.clone(), robot.token.clone());
+    let state = server.desired(&robot).await;
+    for _ in 0..3 {
+        server.report(&mut robot, &state, Phase::Running).await;
+        server.report(&mut clone, &state, Phase::Running).await;
+    }
+    let path = format!("/api/v1/robots/{}", robot.id);
+    let request =
+        format!("GET {path}/desired HTTP/1.1\r\nHost: taskd\r\nAuthorization: Bearer {}\r\n\r\n", clone.token);
+    let mut line = TcpStream::connect(&server.server.addresses().http).await.expect("listens");
+    line.write_all(request.as_bytes()).await.expect("sent");
+    let mut status = [0; 12];
+    line.read_exact(&mut status).await.expect("an answer");
+    assert_eq!(&status, b"HTTP/1.1 409");
+
+    let next: RobotToken = answer(server.bare(Method::POST, &format!("{path}/token")).bearer_auth(&robot.token)).await;
+    robot.token = next.token;
+    let mut session = Session::open(&server, &robot).await;
+    session.told(&server, 0).await;
+    // A reset is an end as well.
+    let _ = tokio::time::timeout(PATIENCE, line.read_to_end(&mut Vec::new())).await.expect("the old connection is cut");
+    assert_eq!(server.ask_desired(&clone).await.status(), 401);
+    assert_eq!(server.ask_desired(&robot).await.status(), 200);
+    assert!(server.robot(&robot).await.conditions.iter().all(|condition| condition.code != "duplicate_identity"));
+    // Nobody has put the newcomer out meanwhile.
+    session.publish("status", b"{}".to_vec()).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -51,7 +51,7 @@ impl Guest {
         let before = match &self.visitor {
             Visitor::Operator(user) => Principal::Operator(user.clone()),
             Visitor::Robot { robot, token_number } if context.seats.put_out() != self.put_out => {
-                Principal::Robot { robot: robot.clone(), token_number: *token_number }
+                Principal::Robot { robot: robot.clone(), token_number: *token_number, is_first_use: false }
             }
             Visitor::Robot { .. } | Visitor::Canary => return Ok(()),
         };
@@ -241,6 +241,10 @@ async fn admit(context: &Context, connect: &Connect, login: Login) -> Result<Vis
         };
     }
     let principal = timeout(context.limits.admit_timeout, context.gatekeeper.admit(login)).await;
+    if let Ok(Ok(Principal::Robot { robot, is_first_use: true, .. })) = &principal {
+        // Nobody who came by a token that has ended keeps a seat, or gets one; this guest has none yet.
+        context.seats.ask_to_leave(robot);
+    }
     match principal.unwrap_or(Err(Refusal::Unavailable)) {
         Err(Refusal::BadCredentials) => {
             Err(answer(ConnectReturnCode::BadUserNamePassword, "a bad user name or password"))
@@ -262,7 +266,7 @@ async fn admit(context: &Context, connect: &Connect, login: Login) -> Result<Vis
         {
             Err(answer(ConnectReturnCode::NotAuthorized, "a client id or user name that is not the token's robot id"))
         }
-        Ok(Principal::Robot { robot, token_number }) => Ok(Visitor::Robot { robot, token_number }),
+        Ok(Principal::Robot { robot, token_number, .. }) => Ok(Visitor::Robot { robot, token_number }),
     }
 }
 

@@ -1,6 +1,7 @@
 //! Watches the router: every few seconds a canary logs in through the real listener, publishes and must hear itself.
 //! A router that is dead or stuck is started anew; what that does not cure is given up on, and the server told.
 
+use std::io;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::sync::Arc;
 
@@ -55,12 +56,35 @@ enum Lost {
     /// Nothing helps, if it lasts.
     #[error("the MQTT listener does not accept connections")]
     Listener(#[source] DialError),
+    /// Time helps: the watchdog has no connection of its own, as when too many files are open. That says nothing of the
+    /// listener.
+    #[error("the watchdog can't open a connection to the MQTT listener")]
+    Dial(#[source] DialError),
     /// Time helps: too many connections, too much to do. A new router would only make it worse.
     #[error("the MQTT front did not let the watchdog in: {0}")]
     Front(&'static str),
     /// A new router helps.
     #[error("the message router does not work: {0}")]
     Router(&'static str),
+}
+
+impl Lost {
+    /// What a failed attempt to connect says.
+    fn by(error: DialError) -> Self {
+        let refused = io::ErrorKind::ConnectionRefused;
+        let is_refused = matches!(&error, DialError::Connect { source, .. } if source.kind() == refused);
+        match error {
+            error if is_refused => Self::Listener(error),
+            // As when the front closes a connection that it has no place for.
+            DialError::Tls { .. } => Self::Front("the connection broke"),
+            error => Self::Dial(error),
+        }
+    }
+
+    /// Whether it may mean the end of the server, if it lasts.
+    fn is_grave(&self) -> bool {
+        matches!(self, Self::Listener(_) | Self::Router(_))
+    }
 }
 
 impl Watchdog {
@@ -77,7 +101,7 @@ impl Watchdog {
                 continue;
             };
             let seen = lost.to_string();
-            if !matches!(lost, Lost::Front(_)) {
+            if lost.is_grave() {
                 failures += 1;
             }
             if failures > MAX_REMEDIES {
@@ -120,11 +144,7 @@ struct Bird {
 
 impl Bird {
     async fn enter(route: &Route, password: String) -> Result<Self, Lost> {
-        let stream = dial(route).await.map_err(|error| match error {
-            // As when the front closes a connection that it has no place for.
-            DialError::Tls { .. } => Lost::Front("the connection broke"),
-            error => Lost::Listener(error),
-        })?;
+        let stream = dial(route).await.map_err(Lost::by)?;
         let mut bird = Self { stream, input: BytesMut::new() };
         let connect = Connect { keep_alive: 30, client_id: CANARY_ID.to_owned(), clean_session: true };
         let login = Login { username: CANARY_ID.to_owned(), password };
@@ -279,6 +299,18 @@ mod tests {
             .await;
         drop(crowd);
         until(&mut health, |health| *health == Health::Serving).await;
+    }
+
+    #[test]
+    fn only_a_listener_that_refuses_is_gone() {
+        let lost = |errno| {
+            let source = io::Error::from_raw_os_error(errno);
+            Lost::by(DialError::Connect { host: "127.0.0.1".to_owned(), port: 1883, source })
+        };
+        assert!(matches!(lost(libc::ECONNREFUSED), Lost::Listener(_)));
+        for errno in [libc::EMFILE, libc::ENFILE, libc::EADDRNOTAVAIL, libc::ENOBUFS] {
+            assert!(!lost(errno).is_grave(), "{errno}");
+        }
     }
 
     #[tokio::test]

@@ -28,6 +28,8 @@ const MAX_HEADERS: usize = 64;
 const FRAME_BYTES: usize = 16 * 1024;
 /// Encoded and not written yet, before nothing more is taken.
 const MAX_UNWRITTEN_BYTES: usize = 32 * 1024;
+/// Frames in a row that carry no byte of MQTT: pings, pongs, empty ones. They cost time, and nobody else counts them.
+const MAX_VAIN_FRAMES: usize = 64;
 /// What is read at once.
 const READ_BYTES: usize = 8 * 1024;
 
@@ -94,6 +96,8 @@ pub struct WebSocket<S> {
     unread: BytesMut,
     /// Whether the other end has said that nothing follows.
     is_over: bool,
+    /// Frames without a byte since the last byte.
+    vain_frames: usize,
     output: BytesMut,
     /// Whether this end has said so.
     is_closed: bool,
@@ -137,6 +141,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
             input,
             unread: BytesMut::new(),
             is_over: false,
+            vain_frames: 0,
             output: BytesMut::new(),
             is_closed: false,
         }
@@ -164,8 +169,13 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
     /// Acts on the frames that are here; `unread` has what there is to read.
     fn act_on_input(&mut self) -> io::Result<()> {
         while self.unread.is_empty() && !self.is_over {
-            let piece = self.decoder.decode(&mut self.input);
-            match piece.map_err(|violation| io::Error::new(io::ErrorKind::InvalidData, violation))? {
+            let piece = self.decoder.decode(&mut self.input).map_err(invalid)?;
+            let has_data = matches!(&piece, Some(Piece::Data(bytes)) if !bytes.is_empty());
+            self.vain_frames = if has_data { 0 } else { self.vain_frames + usize::from(piece.is_some()) };
+            if self.vain_frames > MAX_VAIN_FRAMES {
+                return Err(invalid("too many frames that carry nothing"));
+            }
+            match piece {
                 Some(Piece::Data(bytes)) => self.unread = bytes,
                 // Who asks without reading the answers gets no more of them.
                 Some(Piece::Ping(bytes)) if !self.is_closed && self.output.len() < MAX_UNWRITTEN_BYTES => {
@@ -183,6 +193,10 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         }
         Ok(())
     }
+}
+
+fn invalid(reason: impl Into<Box<dyn std::error::Error + Send + Sync>>) -> io::Error {
+    io::Error::new(io::ErrorKind::InvalidData, reason)
 }
 
 /// The length of the answer's head if it grants the WebSocket; `None` until it has come whole.
@@ -342,6 +356,28 @@ mod tests {
             read = stream.read_exact(&mut answer) => { read.expect("a pong"); }
         }
         assert_eq!(&answer, b"\x8a\x06there?");
+    }
+
+    fn masked(opcode: Opcode, payload: &[u8]) -> BytesMut {
+        let mut frame = BytesMut::new();
+        encode(opcode, payload, Some([1, 2, 3, 4]), &mut frame);
+        frame
+    }
+
+    #[tokio::test]
+    async fn frames_that_carry_nothing_end_the_connection() {
+        for opcode in [Opcode::Ping, Opcode::Pong, Opcode::Binary] {
+            let (client, mut server) = pair(1 << 16).await;
+            let WebSocket { mut stream, .. } = client;
+            for _ in 0..3 {
+                stream.write_all(&masked(opcode, b"").repeat(MAX_VAIN_FRAMES)).await.expect("written");
+                stream.write_all(&masked(Opcode::Binary, b"x")).await.expect("written");
+                assert_eq!(server.read_u8().await.expect("a byte"), b'x');
+            }
+            stream.write_all(&masked(opcode, b"").repeat(MAX_VAIN_FRAMES + 1)).await.expect("written");
+            let ended = tokio::time::timeout(std::time::Duration::from_secs(10), server.read_u8()).await;
+            assert_eq!(ended.expect("in time").expect_err("no byte").kind(), io::ErrorKind::InvalidData, "{opcode:?}");
+        }
     }
 
     #[tokio::test]

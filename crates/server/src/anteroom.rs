@@ -1,9 +1,10 @@
 //! Connections whose client has not said anything yet, by where they come from. Each address has a number of places: when
 //! they are taken, a newcomer gets the place of whoever has been silent for longest there, unless nobody has been for long.
+//! A listener that is full as a whole may ask the one of all who has.
 //! So a crowd of silent connections pushes out itself, while a fleet that comes back at once from behind one address, whose
 //! robots speak within moments, is let in whole. It never touches a socket.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::net::{IpAddr, Ipv6Addr};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -23,13 +24,19 @@ pub struct Anteroom {
 struct Waiting {
     last_number: u64,
     /// In the order of their coming.
-    by_address: HashMap<IpAddr, BTreeMap<u64, (Instant, CancellationToken)>>,
+    everybody: BTreeMap<u64, Silent>,
+    by_address: HashMap<IpAddr, BTreeSet<u64>>,
+}
+
+struct Silent {
+    address: IpAddr,
+    since: Instant,
+    leave: CancellationToken,
 }
 
 /// A place, given back by dropping it: the client has spoken, or is gone.
 pub struct Place {
     room: Arc<Anteroom>,
-    address: IpAddr,
     number: u64,
     leave: CancellationToken,
 }
@@ -45,22 +52,52 @@ impl Anteroom {
         let address = network(address);
         let leave = CancellationToken::new();
         let mut waiting = self.waiting();
+        let neighbours = waiting.by_address.get(&address).filter(|neighbours| neighbours.len() >= self.places);
+        if let Some(oldest) = neighbours.and_then(|neighbours| neighbours.first().copied()) {
+            waiting.send_away(oldest, now);
+        }
         waiting.last_number += 1;
         let number = waiting.last_number;
-        let neighbours = waiting.by_address.entry(address).or_default();
-        if neighbours.len() >= self.places
-            && let Some(oldest) = neighbours.first_entry()
-            && now.duration_since(oldest.get().0) >= PATIENCE
-        {
-            oldest.remove().1.cancel();
-        }
-        neighbours.insert(number, (now, leave.clone()));
-        Place { room: self.clone(), address, number, leave }
+        waiting.by_address.entry(address).or_default().insert(number);
+        waiting.everybody.insert(number, Silent { address, since: now, leave: leave.clone() });
+        Place { room: self.clone(), number, leave }
+    }
+
+    /// Whoever has been here for longest has to leave, wherever it is from; false if nobody has been here for long.
+    pub fn make_room(&self, now: Instant) -> bool {
+        let mut waiting = self.waiting();
+        let oldest = waiting.everybody.keys().next().copied();
+        oldest.is_some_and(|oldest| waiting.send_away(oldest, now))
     }
 
     fn waiting(&self) -> MutexGuard<'_, Waiting> {
         // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing half-done.
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Waiting {
+    /// Asks this one to leave; false if it has not been here for long.
+    fn send_away(&mut self, number: u64, now: Instant) -> bool {
+        let is_long = |silent: &Silent| now.duration_since(silent.since) >= PATIENCE;
+        if !self.everybody.get(&number).is_some_and(is_long) {
+            return false;
+        }
+        self.remove(number).is_some_and(|silent| {
+            silent.leave.cancel();
+            true
+        })
+    }
+
+    fn remove(&mut self, number: u64) -> Option<Silent> {
+        let silent = self.everybody.remove(&number)?;
+        if let Some(neighbours) = self.by_address.get_mut(&silent.address) {
+            neighbours.remove(&number);
+            if neighbours.is_empty() {
+                self.by_address.remove(&silent.address);
+            }
+        }
+        Some(silent)
     }
 }
 
@@ -73,13 +110,7 @@ impl Place {
 
 impl Drop for Place {
     fn drop(&mut self) {
-        let mut waiting = self.room.waiting();
-        if let Some(neighbours) = waiting.by_address.get_mut(&self.address) {
-            neighbours.remove(&self.number);
-            if neighbours.is_empty() {
-                waiting.by_address.remove(&self.address);
-            }
-        }
+        self.room.waiting().remove(self.number);
     }
 }
 
@@ -119,6 +150,17 @@ mod tests {
     }
 
     #[test]
+    fn the_oldest_of_all_makes_room_after_a_while() {
+        let (room, start) = (Anteroom::new(9), Instant::now());
+        let [oldest, next] = [1, 2].map(|last| room.enter([192, 0, 2, last].into(), start));
+        assert!(!room.make_room(start + PATIENCE / 2));
+        assert!(room.make_room(start + PATIENCE));
+        assert!(oldest.leave().is_cancelled() && !next.leave().is_cancelled());
+        drop(next);
+        assert!(!room.make_room(start + PATIENCE), "the first has been asked, the second has spoken");
+    }
+
+    #[test]
     fn an_ipv6_network_is_one_address() {
         let (room, start) = (Anteroom::new(1), Instant::now());
         let first = room.enter("2001:db8::1".parse().expect("an address"), start);
@@ -135,5 +177,6 @@ mod tests {
         let same = room.enter([192, 0, 2, 0].into(), start + PATIENCE);
         drop((places, same));
         assert!(room.waiting().by_address.is_empty());
+        assert!(room.waiting().everybody.is_empty());
     }
 }

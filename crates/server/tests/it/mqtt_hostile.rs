@@ -330,6 +330,53 @@ async fn there_are_as_many_places_as_configured() {
     assert_eq!(broker.broker.connected_count(), 6);
 }
 
+/// What clients wait for who are not to be shown out for their slowness.
+const HOUR: Duration = Duration::from_secs(3600);
+
+#[tokio::test(flavor = "multi_thread")]
+async fn silent_connections_give_way_when_all_places_are_taken() {
+    let broker = TestBroker::with(|limits| (limits.max_connections, limits.connect_timeout) = (2, HOUR)).await;
+    let mut spoken = broker.robot(&RobotId::random()).await;
+    let mut silent = broker.raw().await;
+    // Nobody has to leave in its first seconds: until then newcomers are turned away.
+    let mut ticks = tokio::time::interval(Duration::from_millis(100));
+    let mut newcomer = timeout(PATIENCE, async {
+        loop {
+            ticks.tick().await;
+            let mut raw = broker.raw_with(&Connect::robot(&RobotId::random()).packet()).await;
+            if raw.stream.read_exact(&mut [0; 4]).await.is_ok() {
+                return raw;
+            }
+        }
+    })
+    .await
+    .expect("a place should be free");
+    silent.expect_close().await;
+    newcomer.expect_nothing().await;
+    spoken.expect_nothing().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_silence_of_one_address_fills_a_quarter_of_the_places() {
+    let broker = TestBroker::with(|limits| (limits.max_connections, limits.connect_timeout) = (400, HOUR)).await;
+    let mut oldest = broker.raw().await;
+    let mut crowd = Vec::new();
+    for _ in 0..100 {
+        crowd.push(broker.raw().await);
+    }
+    let newcomers = async {
+        let mut ticks = tokio::time::interval(Duration::from_millis(100));
+        loop {
+            ticks.tick().await;
+            crowd.push(broker.raw().await);
+        }
+    };
+    tokio::select! {
+        () = oldest.expect_close() => {}
+        () = newcomers => unreachable!("they go on coming"),
+    }
+}
+
 #[test]
 fn random_bytes_and_mutated_packets_break_nothing() {
     let runtime = tokio::runtime::Runtime::new().unwrap();

@@ -11,11 +11,13 @@ use rumqttd::protocol::{ConnAck, ConnectReturnCode, Packet};
 use subtle::ConstantTimeEq;
 use task_proto::RobotId;
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
+use tokio::sync::OwnedSemaphorePermit;
 use tokio::time::{timeout, timeout_at};
 
 use super::Context;
 use super::access::{Visitor, may_publish};
 use super::codec::{Connect, DecodeError, Received, Will, decode, encode};
+use super::places::Claim;
 use super::takeover::SeatName;
 use crate::anteroom::Place;
 use crate::broker::{Login, Principal, Refusal};
@@ -100,8 +102,14 @@ impl Arrival {
     ) -> Result<T, Rejection> {
         tokio::select! {
             done = timeout_at(self.deadline, step) => done.unwrap_or(Err(Rejection::Silent(late))),
-            () = self.place.leave().cancelled() => Err(Rejection::Silent("gives way to a newcomer from its address")),
+            () = self.place.leave().cancelled() => Err(Rejection::Silent("gives way to a newcomer")),
         }
+    }
+
+    /// Waits for whoever has to leave for this one, if somebody has.
+    pub(super) async fn find_place(&self, claim: Claim) -> Result<OwnedSemaphorePermit, Rejection> {
+        let place = async { claim.place().await.ok_or(Rejection::Silent("comes when there is no place")) };
+        self.step("comes when there is no place", place).await
     }
 
     /// The handshake of a client that has to speak TLS.

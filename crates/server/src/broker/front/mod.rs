@@ -13,6 +13,7 @@ mod listener;
 mod outgoing;
 mod output;
 mod parts;
+mod places;
 mod session;
 mod takeover;
 mod traffic;
@@ -27,7 +28,6 @@ use task_proto::api::{MqttTraffic, Subscription, Traffic};
 use task_proto::topic::TopicPrefix;
 use task_proto::{RobotId, UserName};
 use tokio::io::{AsyncRead, AsyncWrite};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
@@ -37,10 +37,11 @@ use crate::anteroom::Anteroom;
 use crate::backlog::listen;
 use crate::conduct::Conduct;
 use crate::tls::{ClientProof, Tls};
-use entrance::Arrival;
+use entrance::{Arrival, Rejection};
 pub(super) use entrance::{CANARY_ID, CanaryPass};
 use parts::Grants;
 pub(super) use parts::{Grant, NotGranted};
+use places::{Claim, Places};
 use takeover::Seats;
 use traffic::Totals;
 
@@ -66,7 +67,7 @@ struct Context {
     /// Who has not sent CONNECT yet.
     anteroom: Arc<Anteroom>,
     /// How many connections there may be.
-    places: Arc<Semaphore>,
+    places: Places,
     /// What the listener speaks, if it encrypts.
     tls: Option<Tls>,
     stop: CancellationToken,
@@ -83,10 +84,11 @@ impl Front {
         let failed = |source| BrokerError::Listen { address: config.listen, source };
         let listener = listen(config.listen).map_err(failed)?;
         let local_addr = listener.local_addr().map_err(failed)?;
-        let anteroom = Anteroom::new(config.limits.max_silent_per_address);
+        let limits = &config.limits;
+        let anteroom = Anteroom::new(limits.max_silent_per_address.min(limits.max_connections / 4));
         let context = Arc::new(Context {
             prefix: config.prefix,
-            places: Arc::new(Semaphore::new(config.limits.max_connections)),
+            places: Places::new(config.limits.max_connections),
             limits: config.limits,
             tls: config.tls,
             conduct: config.conduct,
@@ -168,18 +170,24 @@ impl Front {
     where
         S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
     {
-        let Ok(place) = self.context.places.clone().try_acquire_owned() else {
-            self.context.totals.refuse(None);
-            return false;
-        };
-        self.attend(peer, place, handshake);
+        let Some(claim) = self.claim() else { return false };
+        self.attend(peer, claim, handshake);
         true
+    }
+
+    /// A place for one more connection, if there is one.
+    fn claim(&self) -> Option<Claim> {
+        let claim = self.context.places.claim(&self.context.anteroom);
+        if claim.is_none() {
+            self.context.totals.refuse(None);
+        }
+        claim
     }
 
     fn attend<S>(
         &self,
         peer: SocketAddr,
-        place: OwnedSemaphorePermit,
+        claim: Claim,
         handshake: impl Future<Output = io::Result<(S, ClientProof)>> + Send + 'static,
     ) where
         S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
@@ -187,21 +195,26 @@ impl Front {
         let context = self.context.clone();
         let mut arrival = Arrival::new(&context, peer);
         self.sessions.spawn(async move {
-            let shaken = tokio::select! {
-                shaken = arrival.shake_hands(handshake) => shaken,
+            let entering = async {
+                let place = arrival.find_place(claim).await?;
+                let (stream, proof) = arrival.shake_hands(handshake).await?;
+                Ok::<_, Rejection>((place, stream, proof))
+            };
+            let entered = tokio::select! {
+                entered = entering => entered,
                 () = context.stop.cancelled() => return,
             };
-            match shaken {
-                Ok((stream, proof)) => {
+            match entered {
+                Ok((place, stream, proof)) => {
                     arrival.proof = proof;
                     session::serve(context, stream, arrival).await;
+                    drop(place);
                 }
                 Err(rejection) => {
                     tracing::debug!(%peer, "MQTT client turned away: {rejection}");
                     context.totals.refuse(None);
                 }
             }
-            drop(place);
         });
     }
 

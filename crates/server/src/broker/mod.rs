@@ -152,6 +152,8 @@ pub struct Limits {
     pub max_silent_per_address: usize,
     /// Operators among them.
     pub max_operators: usize,
+    /// Sessions of one person among those.
+    pub max_sessions_per_person: usize,
     /// The largest packet of an admitted client, in bytes after the fixed header.
     pub max_packet_bytes: usize,
     /// Filters in one SUBSCRIBE or UNSUBSCRIBE, and subscriptions of one client.
@@ -178,6 +180,7 @@ impl Default for Limits {
             max_connections: 20_000,
             max_silent_per_address: 2048,
             max_operators: 256,
+            max_sessions_per_person: 16,
             max_packet_bytes: 256 * 1024,
             max_filters: 64,
             connect_timeout: Duration::from_secs(10),

@@ -25,7 +25,7 @@ use tokio::time::timeout;
 /// More than anything here takes, unless it hangs.
 pub const PATIENCE: Duration = Duration::from_secs(10);
 
-/// Lets robots in with `pw-<robot id>` and operators with `operator`; some passwords meet other ends.
+/// Lets robots in with `pw-<robot id>`, and operators with `operator` or `operator-<name>`; some passwords meet other ends.
 #[derive(Default)]
 pub struct Door {
     /// Says that somebody with `once-<robot id>` is being let in, for the first time, which [`Door::go_on`] ends. The second
@@ -41,6 +41,9 @@ impl Gatekeeper for Door {
             let user = login.user_name.unwrap_or_default();
             match login.password.as_deref().ok_or(Refusal::NotAuthorised)? {
                 "operator" => Ok(Principal::Operator("alice".parse().expect("a name"))),
+                password if password.starts_with("operator-") => {
+                    Ok(Principal::Operator(password["operator-".len()..].parse().expect("a name")))
+                }
                 "revoked" => Err(Refusal::NotAuthorised),
                 "outage" => Err(Refusal::Unavailable),
                 "slow" => std::future::pending().await,

@@ -190,7 +190,7 @@ async fn a_client_that_comes_byte_by_byte_but_in_time_is_served() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn resets_and_storms_on_one_client_id_do_no_harm() {
-    let broker = TestBroker::start().await;
+    let broker = TestBroker::with(|limits| limits.max_sessions_per_person = 256).await;
     let robot = RobotId::random();
     let packet = Connect::robot(&robot).packet();
     for _ in 0..50 {
@@ -328,6 +328,29 @@ async fn there_are_as_many_places_as_configured() {
     let mut seventh = broker.raw_with(&Connect::robot(&RobotId::random()).packet()).await;
     seventh.expect_close().await;
     assert_eq!(broker.broker.connected_count(), 6);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn one_person_does_not_take_all_places_of_people() {
+    let broker = TestBroker::start().await;
+    let mut sessions = Vec::new();
+    for _ in 0..16 {
+        sessions.push(broker.operator("taskd/v1/#", 0).await);
+    }
+    let mut further = broker.raw_with(&Connect::operator("").packet()).await;
+    further.expect(&[0x20, 2, 0, 3]).await;
+    further.expect_close().await;
+    let bob = Connect { password: Some("operator-bob".to_owned()), ..Connect::operator("") };
+    let mut other = broker.raw_with(&bob.packet()).await;
+    other.expect(&[0x20, 2, 0, 0]).await;
+    for raw in &mut sessions {
+        raw.expect_nothing().await;
+    }
+    drop(sessions);
+    // No filter is longer than what a session should keep of it.
+    let longest = format!("taskd/v1/{}", "x".repeat(1024 - "taskd/v1/".len()));
+    other.send(&subscribe(1, &[(&longest, 0), (&format!("{longest}x"), 0)])).await;
+    other.expect(&[0x90, 4, 0, 1, 0, 0x80]).await;
 }
 
 /// What clients wait for who are not to be shown out for their slowness.

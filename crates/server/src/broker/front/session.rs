@@ -117,21 +117,19 @@ where
     S: AsyncRead + AsyncWrite + Unpin,
 {
     let guest = welcome(context, stream, arrival).await?;
+    let unavailable = |reason| Rejection::Answered { code: ConnectReturnCode::ServiceUnavailable, reason };
     let seat = context.seats.take(guest.seat_name.clone(), meter.clone()).await;
+    let seat = seat.ok_or(unavailable("the person has as many sessions as there may be"))?;
     guest.check_again(context).await?;
     let listening = match guest.visitor {
         Visitor::Robot { .. } => return Ok((guest, seat, None)),
         Visitor::Operator(_) => Listening::Everything,
         Visitor::Canary => Listening::Canary,
     };
-    let unavailable = |error| Rejection::Answered {
-        code: ConnectReturnCode::ServiceUnavailable,
-        reason: match error {
-            RouterError::Full => "there are as many operators as there may be",
-            RouterError::Gone | RouterError::Stuck => "the router does not answer",
-        },
-    };
-    let listener = context.router.listen(listening).await.map_err(unavailable)?;
+    let listener = context.router.listen(listening).await.map_err(|error| match error {
+        RouterError::Full => unavailable("there are as many operators as there may be"),
+        RouterError::Gone | RouterError::Stuck => unavailable("the router does not answer"),
+    })?;
     Ok((guest, seat, Some(listener)))
 }
 

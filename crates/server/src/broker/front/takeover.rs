@@ -1,5 +1,5 @@
-//! Who has which seat: one session for each robot, and for each of a person's client ids. A newcomer takes the seat over only
-//! after the session before it has fully ended. It never touches a socket.
+//! Who has which seat: one session for each robot, and for each of a person's client ids, of which one person has only so
+//! many. A newcomer takes the seat over only after the session before it has fully ended. It never touches a socket.
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -22,10 +22,19 @@ pub(super) enum SeatName {
     Canary,
 }
 
+impl SeatName {
+    fn person(&self) -> Option<&UserName> {
+        match self {
+            Self::Operator(person, _) | Self::Unnamed(person, _) => Some(person),
+            Self::Robot(_) | Self::Canary => None,
+        }
+    }
+}
+
 /// All seats that are taken.
-#[derive(Default)]
 pub(super) struct Seats {
     table: Mutex<Table>,
+    most_of_a_person: usize,
     /// How often a robot was put out.
     put_out: AtomicU64,
 }
@@ -34,6 +43,7 @@ pub(super) struct Seats {
 struct Table {
     occupants: HashMap<SeatName, Arc<Occupant>>,
     robots: usize,
+    people: HashMap<UserName, usize>,
     last_number: u64,
 }
 
@@ -54,19 +64,28 @@ pub(super) struct Seat {
 }
 
 impl Seats {
+    /// Free ones, of which a person gets so many.
+    pub(super) fn new(most_of_a_person: usize) -> Arc<Self> {
+        Arc::new(Self { table: Mutex::default(), most_of_a_person, put_out: AtomicU64::new(0) })
+    }
+
     /// Asks whoever has the seat to leave, waits until they have, and sits down. Sessions that want the same seat get it
-    /// one after another in the order of their arrival; all but the last find that they should leave again.
-    pub(super) async fn take(self: &Arc<Self>, name: SeatName, meter: Arc<Meter>) -> Seat {
-        let (seat, before) = self.claim(name, meter);
+    /// one after another in the order of their arrival; all but the last find that they should leave again. `None`: the
+    /// person has as many others as there may be.
+    pub(super) async fn take(self: &Arc<Self>, name: SeatName, meter: Arc<Meter>) -> Option<Seat> {
+        let (seat, before) = self.claim(name, meter)?;
         if let Some(before) = before {
             before.leave.cancel();
             before.left.cancelled().await;
         }
-        seat
+        Some(seat)
     }
 
-    fn claim(self: &Arc<Self>, name: SeatName, meter: Arc<Meter>) -> (Seat, Option<Arc<Occupant>>) {
+    fn claim(self: &Arc<Self>, name: SeatName, meter: Arc<Meter>) -> Option<(Seat, Option<Arc<Occupant>>)> {
         let mut table = self.table();
+        if !table.occupants.contains_key(&name) && table.of_person(&name) >= self.most_of_a_person {
+            return None;
+        }
         table.last_number += 1;
         let occupant = Arc::new(Occupant {
             number: table.last_number,
@@ -77,10 +96,10 @@ impl Seats {
             subscriptions: Mutex::default(),
         });
         let before = table.occupants.insert(name.clone(), occupant.clone());
-        if before.is_none() && matches!(name, SeatName::Robot(_)) {
-            table.robots += 1;
+        if before.is_none() {
+            table.taken(&name);
         }
-        (Seat { seats: self.clone(), name, occupant }, before)
+        Some((Seat { seats: self.clone(), name, occupant }, before))
     }
 
     /// The doorbell of the robot's session.
@@ -115,7 +134,7 @@ impl Seats {
     /// Asks all of a person's sessions to leave.
     pub(super) fn ask_person_to_leave(&self, person: &UserName) {
         for (name, occupant) in &self.table().occupants {
-            if matches!(name, SeatName::Operator(user, _) | SeatName::Unnamed(user, _) if user == person) {
+            if name.person() == Some(person) {
                 occupant.leave.cancel();
             }
         }
@@ -129,6 +148,33 @@ impl Seats {
     fn table(&self) -> MutexGuard<'_, Table> {
         // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing half-done.
         self.table.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Table {
+    /// The seats that the person has whose seat this is; none of a robot.
+    fn of_person(&self, name: &SeatName) -> usize {
+        name.person().and_then(|person| self.people.get(person)).copied().unwrap_or_default()
+    }
+
+    /// There is one more of them.
+    fn taken(&mut self, name: &SeatName) {
+        self.robots += usize::from(matches!(name, SeatName::Robot(_)));
+        if let Some(person) = name.person() {
+            *self.people.entry(person.clone()).or_default() += 1;
+        }
+    }
+
+    /// There is one fewer.
+    fn given_back(&mut self, name: &SeatName) {
+        self.robots -= usize::from(matches!(name, SeatName::Robot(_)));
+        let Some(person) = name.person() else { return };
+        if let Some(seats) = self.people.get_mut(person) {
+            *seats -= 1;
+            if *seats == 0 {
+                self.people.remove(person);
+            }
+        }
     }
 }
 
@@ -172,11 +218,40 @@ impl Drop for Seat {
         let mut table = self.seats.table();
         if table.occupants.get(&self.name).is_some_and(|occupant| occupant.number == self.occupant.number) {
             table.occupants.remove(&self.name);
-            if matches!(self.name, SeatName::Robot(_)) {
-                table.robots -= 1;
-            }
+            table.given_back(&self.name);
         }
         drop(table);
         self.occupant.left.cancel();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_person_has_so_many_seats_and_the_others_theirs() {
+        let seats = Seats::new(2);
+        let [alice, bob]: [UserName; 2] = ["alice", "bob"].map(|name| name.parse().expect("a name"));
+        let take = async |name: SeatName| seats.take(name, Arc::default()).await;
+        let named = SeatName::Operator(alice.clone(), "one".to_owned());
+        let first = take(named.clone()).await.expect("room");
+        let second = take(SeatName::Unnamed(alice.clone(), 1)).await.expect("room");
+        assert!(take(SeatName::Unnamed(alice.clone(), 2)).await.is_none());
+        for other in [SeatName::Unnamed(bob, 3), SeatName::Robot(RobotId::random()), SeatName::Canary] {
+            assert!(take(other).await.is_some());
+        }
+        // A seat that is taken over is the same one.
+        let (again, ()) = tokio::join!(take(named), async {
+            first.leave().cancelled().await;
+            drop(first);
+        });
+        let again = again.expect("its own");
+        drop(second);
+        let third = take(SeatName::Unnamed(alice.clone(), 2)).await.expect("room again");
+        assert!(take(SeatName::Unnamed(alice, 4)).await.is_none());
+        drop((again, third));
+        assert!(seats.table().people.is_empty());
+        assert!(seats.table().occupants.is_empty());
     }
 }

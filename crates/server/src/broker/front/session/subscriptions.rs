@@ -10,6 +10,9 @@ use crate::broker::front::access::{Hearing, Visitor, matches, may_subscribe};
 use crate::broker::front::parts::Member;
 use crate::broker::router::Heard;
 
+/// The longest filter: far longer than any topic, and a session may keep as many as there may be.
+const MAX_FILTER_BYTES: usize = 1024;
+
 impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
     pub(super) fn subscribe(&mut self, pkid: u16, filters: Vec<(String, QoS)>) -> Result<(), End> {
         if filters.len() > self.context.limits.max_filters {
@@ -18,7 +21,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         let mut return_codes = Vec::with_capacity(filters.len());
         for (filter, qos) in filters {
             let has_room = self.hearing.len() < self.context.limits.max_filters || self.hearing.contains_key(&filter);
-            let hearing = may_subscribe(&self.visitor, &self.context.prefix, &filter).filter(|_| has_room);
+            let fits = has_room && filter.len() <= MAX_FILTER_BYTES;
+            let hearing = may_subscribe(&self.visitor, &self.context.prefix, &filter).filter(|_| fits);
             let is_heard = match hearing {
                 Some(Hearing::Package(digest)) => self.join(digest),
                 Some(_) => true,

@@ -41,18 +41,32 @@ pub(super) struct Hold {
     settled_at: Instant,
     settled_total: Duration,
     behind_since: Option<Instant>,
+    /// How long it was behind before, without a step forward since.
+    stuck: Duration,
 }
 
 impl Hold {
     /// One that has just come.
     pub(super) fn new(waiting: &Waiting, now: Instant) -> Self {
-        Self { balance: Duration::ZERO, settled_at: now, settled_total: waiting.total(now), behind_since: None }
+        let (balance, settled_total) = (Duration::ZERO, waiting.total(now));
+        Self { balance, settled_at: now, settled_total, behind_since: None, stuck: Duration::ZERO }
     }
 
-    /// From now on the listener is behind, or is not.
+    /// From now on the listener is behind, or has come forward.
     pub(super) fn set(&mut self, is_behind: bool, waiting: &Waiting, now: Instant) {
-        let balance = self.balance(waiting, now);
-        *self = Self { balance, behind_since: is_behind.then_some(now), ..Self::new(waiting, now) };
+        let (balance, behind_since) = (self.balance(waiting, now), is_behind.then_some(now));
+        let stuck = if is_behind { self.stuck } else { Duration::ZERO };
+        *self = Self { balance, behind_since, stuck, ..Self::new(waiting, now) };
+    }
+
+    /// It leaves, and may come back: that is no step forward.
+    pub(super) fn leave(&mut self, waiting: &Waiting, now: Instant) {
+        let (balance, stuck) = (self.balance(waiting, now), self.stuck(now));
+        *self = Self { balance, stuck, ..Self::new(waiting, now) };
+    }
+
+    fn stuck(&self, now: Instant) -> Duration {
+        self.stuck + self.behind_since.map_or(Duration::ZERO, |since| now.saturating_duration_since(since))
     }
 
     fn balance(&self, waiting: &Waiting, now: Instant) -> Duration {
@@ -66,10 +80,12 @@ impl Hold {
 
     /// Whether the listener should go; `all` is as if one of them had always been behind.
     pub(super) fn is_too_long(&self, all: &Self, waiting: &Waiting, now: Instant) -> bool {
-        let Some(since) = self.behind_since else { return false };
+        if self.behind_since.is_none() {
+            return false;
+        }
         let is_impatient = all.balance(waiting, now) > PATIENCE_WITH_ALL;
         let patience = if is_impatient { LITTLE_PATIENCE } else { PATIENCE };
-        self.balance(waiting, now) >= patience || now.saturating_duration_since(since) >= LONGEST
+        self.balance(waiting, now) >= patience || self.stuck(now) >= LONGEST
     }
 }
 
@@ -118,6 +134,32 @@ mod tests {
         };
         assert!(lasts(100, 100));
         assert!(!lasts(90, 100));
+    }
+
+    #[test]
+    fn who_leaves_and_comes_back_starts_from_where_it_was() {
+        let start = Instant::now();
+        let (mut waiting, quiet) = (Waiting::default(), Waiting::default());
+        let (mut hold, all) = (Hold::new(&waiting, start), Hold::new(&waiting, start));
+        let mut alone = hold;
+        // Nobody waits: what counts is that it has not moved.
+        for round in [0, 10_000, 20_000] {
+            alone.set(true, &quiet, start + ms(round));
+            assert!(!alone.is_too_long(&all, &quiet, start + ms(round + 9_999)));
+            alone.leave(&quiet, start + ms(round + 10_000));
+        }
+        alone.set(true, &quiet, start + ms(40_000));
+        assert!(alone.is_too_long(&all, &quiet, start + ms(40_000)));
+        alone.set(false, &quiet, start + ms(40_000));
+        alone.set(true, &quiet, start + ms(40_001));
+        assert!(!alone.is_too_long(&all, &quiet, start + ms(70_000)), "it has come forward");
+        // Others wait: it has cost them 1,500 before it left, and costs them 500 more.
+        waiting.set(true, start);
+        hold.set(true, &waiting, start);
+        hold.leave(&waiting, start + ms(1_500));
+        hold.set(true, &waiting, start + ms(1_500));
+        assert!(!hold.is_too_long(&all, &waiting, start + ms(1_999)));
+        assert!(hold.is_too_long(&all, &waiting, start + ms(2_000)));
     }
 
     #[test]

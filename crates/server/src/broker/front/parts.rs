@@ -39,8 +39,8 @@ struct Progress {
     sent: u64,
     /// The last of them, up to a window.
     parts: VecDeque<Part>,
-    /// Who may listen; `None`: and does not.
-    robots: HashMap<RobotId, Option<Listening>>,
+    /// Who may listen.
+    robots: HashMap<RobotId, Permit>,
     listeners: usize,
     /// Listeners that are a whole window behind.
     behind: usize,
@@ -52,6 +52,15 @@ struct Progress {
     all: Hold,
     /// Who was put out and not asked for yet.
     put_out: Vec<RobotId>,
+}
+
+/// That a robot may listen.
+#[derive(Default)]
+struct Permit {
+    /// If it does.
+    listening: Option<Listening>,
+    /// How long it had held up the others when it last left: whoever comes back goes on from there.
+    held: Option<Hold>,
 }
 
 /// How far a listener has come.
@@ -111,7 +120,7 @@ impl Grants {
         lock(&self.0).remove(&grant.digest);
         let mut progress = grant.progress();
         progress.parts.clear();
-        for listening in std::mem::take(&mut progress.robots).into_values().flatten() {
+        for listening in std::mem::take(&mut progress.robots).into_values().filter_map(|permit| permit.listening) {
             listening.news.notify_one();
         }
         (progress.listeners, progress.behind, progress.idle) = (0, 0, 0);
@@ -158,7 +167,7 @@ impl Grant {
 
     /// Whether the robot listens now.
     pub(in crate::broker) fn is_listening(&self, robot: &RobotId) -> bool {
-        self.progress().robots.get(robot).is_some_and(Option::is_some)
+        self.progress().robots.get(robot).is_some_and(|permit| permit.listening.is_some())
     }
 
     /// The bytes of the parts that are held for listeners.
@@ -201,7 +210,7 @@ impl Grant {
         progress.parts.push_back(part);
         let Progress { sent, waiting, .. } = *progress;
         let mut behind = 0;
-        for listening in progress.robots.values_mut().flatten() {
+        for listening in progress.robots.values_mut().filter_map(|permit| permit.listening.as_mut()) {
             listening.news.notify_one();
             if listening.lacks(sent) >= self.window {
                 listening.hold.set(true, &waiting, now);
@@ -217,8 +226,8 @@ impl Grant {
         let mut progress = self.progress();
         let Progress { all, waiting, .. } = *progress;
         let is_laggard = |listening: &Listening| listening.hold.is_too_long(&all, &waiting, now);
-        let listening = progress.robots.iter().filter(|(_, listening)| listening.as_ref().is_some_and(is_laggard));
-        let laggards: Vec<RobotId> = listening.map(|(robot, _)| robot.clone()).collect();
+        let slow = progress.robots.iter().filter(|(_, permit)| permit.listening.as_ref().is_some_and(is_laggard));
+        let laggards: Vec<RobotId> = slow.map(|(robot, _)| robot.clone()).collect();
         for robot in &laggards {
             progress.remove(robot, self.window, now);
         }
@@ -244,7 +253,7 @@ impl Progress {
         Self {
             sent: 0,
             parts: VecDeque::new(),
-            robots: robots.into_iter().map(|robot| (robot, None)).collect(),
+            robots: robots.into_iter().map(|robot| (robot, Permit::default())).collect(),
             listeners: 0,
             behind: 0,
             idle: 0,
@@ -254,16 +263,30 @@ impl Progress {
         }
     }
 
+    fn listening(&mut self, robot: &RobotId) -> Option<&mut Listening> {
+        self.robots.get_mut(robot)?.listening.as_mut()
+    }
+
     /// Takes the robot's right away and tells its session.
     fn remove(&mut self, robot: &RobotId, window: u64, now: Instant) {
-        if let Some(listening) = self.robots.remove(robot).flatten() {
+        if let Some(listening) = self.robots.remove(robot).and_then(|permit| permit.listening) {
             listening.news.notify_one();
-            self.leave(&listening, window, now);
+            self.discount(&listening, window, now);
         }
     }
 
+    /// The robot listens no longer, if it did. It may come back.
+    fn leave(&mut self, robot: &RobotId, window: u64, now: Instant) {
+        let waiting = self.waiting;
+        let Some(permit) = self.robots.get_mut(robot) else { return };
+        let Some(mut listening) = permit.listening.take() else { return };
+        listening.hold.leave(&waiting, now);
+        permit.held = Some(listening.hold);
+        self.discount(&listening, window, now);
+    }
+
     /// The listener counts no longer.
-    fn leave(&mut self, listening: &Listening, window: u64, now: Instant) {
+    fn discount(&mut self, listening: &Listening, window: u64, now: Instant) {
         let lacks = listening.lacks(self.sent);
         self.listeners -= 1;
         self.behind -= usize::from(lacks >= window);
@@ -298,13 +321,13 @@ impl Member {
     /// The robot hears everything from now on; `news` tells its session. `None` if the grant was withdrawn meanwhile.
     pub(super) fn join(grant: Arc<Grant>, robot: &RobotId, news: Arc<Notify>) -> Option<Self> {
         let (now, mut progress) = (Instant::now(), grant.progress());
-        let hold = Hold::new(&progress.waiting, now);
-        let listening = Listening { taken: progress.sent, open: BTreeSet::new(), hold, news };
-        let before = progress.robots.get_mut(robot)?.replace(listening);
+        progress.leave(robot, grant.window, now);
+        let Progress { sent, waiting, .. } = *progress;
+        let permit = progress.robots.get_mut(robot)?;
+        let hold = permit.held.take().unwrap_or_else(|| Hold::new(&waiting, now));
+        permit.listening = Some(Listening { taken: sent, open: BTreeSet::new(), hold, news });
         (progress.listeners, progress.idle) = (progress.listeners + 1, progress.idle + 1);
-        if let Some(before) = before {
-            progress.leave(&before, grant.window, now);
-        }
+        progress.measure(now);
         drop(progress);
         grant.joined.notify_one();
         Some(Self { grant, robot: robot.clone() })
@@ -317,7 +340,8 @@ impl Member {
     /// What comes next. It changes nothing.
     pub(super) fn due(&self) -> Due {
         let progress = self.grant.progress();
-        let Some(listening) = progress.robots.get(&self.robot).and_then(Option::as_ref) else { return Due::End };
+        let permit = progress.robots.get(&self.robot);
+        let Some(listening) = permit.and_then(|permit| permit.listening.as_ref()) else { return Due::End };
         let number = listening.taken + 1;
         let from_the_end = progress.sent.checked_sub(number).and_then(|distance| usize::try_from(distance).ok());
         let part = from_the_end.and_then(|distance| progress.parts.iter().rev().nth(distance));
@@ -326,7 +350,7 @@ impl Member {
 
     /// The session sends the part of this number.
     pub(super) fn take(&self, number: u64) {
-        if let Some(listening) = self.grant.progress().robots.get_mut(&self.robot).and_then(Option::as_mut) {
+        if let Some(listening) = self.grant.progress().listening(&self.robot) {
             listening.taken = number;
             listening.open.insert(number);
         }
@@ -336,7 +360,7 @@ impl Member {
     pub(super) fn acknowledged(&self, number: u64) {
         let (now, mut progress) = (Instant::now(), self.grant.progress());
         let (window, sent, waiting) = (self.grant.window, progress.sent, progress.waiting);
-        let Some(listening) = progress.robots.get_mut(&self.robot).and_then(Option::as_mut) else { return };
+        let Some(listening) = progress.listening(&self.robot) else { return };
         let before = listening.lacks(sent);
         listening.open.remove(&number);
         let after = listening.lacks(sent);
@@ -344,7 +368,7 @@ impl Member {
             return;
         }
         let caught_up = before >= window && after < window;
-        if caught_up {
+        if after < window {
             listening.hold.set(false, &waiting, now);
         }
         progress.behind -= usize::from(caught_up);
@@ -359,11 +383,7 @@ impl Member {
 
 impl Drop for Member {
     fn drop(&mut self) {
-        let mut progress = self.grant.progress();
-        if let Some(listening) = progress.robots.get_mut(&self.robot).and_then(Option::take) {
-            progress.leave(&listening, self.grant.window, Instant::now());
-        }
-        drop(progress);
+        self.grant.progress().leave(&self.robot, self.grant.window, Instant::now());
         self.grant.moved.notify_one();
     }
 }
@@ -427,6 +447,29 @@ mod tests {
         grants.close(&grant);
         assert!(grants.of(&digest, &quick).is_none());
         assert_eq!(grants.queued_bytes(), 0);
+    }
+
+    #[test]
+    fn who_subscribes_again_is_as_far_behind_as_before() {
+        let seconds = std::time::Duration::from_secs;
+        let (grants, now, robot) = (Grants::default(), Instant::now(), RobotId::random());
+        let long_ago = now.checked_sub(seconds(20)).expect("the machine has run for that long");
+        let digest = Digest::of(b"package");
+        let grant = grants.open(digest, 64 * 1024, QoS::AtLeastOnce, vec![robot.clone()], long_ago).expect("room");
+        let join = || Member::join(grant.clone(), &robot, Arc::default()).expect("granted");
+        let fill = |now| {
+            for _ in 0..WINDOW_PARTS {
+                grant.send(Part { header: Default::default(), bytes: Default::default() }, now);
+            }
+        };
+        let member = join();
+        fill(long_ago);
+        drop(member);
+        let _member = join();
+        fill(now);
+        assert!(grant.put_out_laggards(now + seconds(5)).is_empty());
+        assert_eq!(grant.put_out_laggards(now + seconds(11)), [robot.clone()]);
+        assert!(grants.of(&digest, &robot).is_none(), "it has to get the rest in another way");
     }
 
     #[test]

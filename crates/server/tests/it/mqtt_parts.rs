@@ -5,6 +5,7 @@ use rumqttc::{AsyncClient, Event, MqttOptions, Packet, QoS, SubscribeReasonCode}
 use task_proto::topic::{Topic, TopicPrefix};
 use task_proto::{Digest, RobotId};
 use taskd::broker::{FanOut, FanOutError, FanOutSettings, MAX_PART_BYTES, Part, PartQos};
+use tokio::io::AsyncReadExt;
 use tokio::sync::Notify;
 use tokio::time::timeout;
 
@@ -102,6 +103,34 @@ async fn parts_are_heard_by_whom_they_are_granted_to_and_only_as_long() {
     let fan_outs: Vec<_> = (0u8..).map_while(|n| begin(&broker, Digest::of(&[n]), &[]).ok()).collect();
     assert_eq!(fan_outs.len(), 3, "four at a time");
     broker.assert_serves().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_a_robot_may_no_longer_hear_is_not_listed_however_it_ends() {
+    let broker = TestBroker::start().await;
+    let (robot, digest) = (RobotId::random(), Digest::of(b"package"));
+    let mut raw = broker.robot(&robot).await;
+    let unlisted = async || {
+        while !broker.broker.subscriptions_of(&robot).is_empty() {
+            tokio::task::yield_now().await;
+        }
+    };
+    for round in 0..50 {
+        let fan_out = begin(&broker, digest, std::slice::from_ref(&robot)).expect("room");
+        listen(&mut raw, digest, 1).await;
+        assert_eq!(broker.broker.subscriptions_of(&robot).len(), 1);
+        if round % 2 == 0 {
+            fan_out.withdraw(&robot);
+        } else {
+            // It asks again while its right ends: either may come first.
+            raw.send(&subscribe(9, &[(&name_of(digest), 1)])).await;
+            fan_out.withdraw(&robot);
+            let mut answer = [0; 5];
+            raw.stream.read_exact(&mut answer).await.expect("an answer");
+            assert_eq!(&answer[..4], &[0x90, 3, 0, 9]);
+        }
+        timeout(PATIENCE, unlisted()).await.expect("it is listed no longer");
+    }
 }
 
 /// Hears part `number`, which is the session's message of that packet id, and acknowledges it.

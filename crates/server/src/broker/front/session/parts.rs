@@ -101,6 +101,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
                 let was_heard = self.parts.last == Some(digest);
                 self.parts.leave(&digest);
                 self.hearing.retain(|_, (hearing, _)| *hearing != Hearing::Package(digest));
+                self.note_subscriptions();
                 if was_heard && self.output.shared_bytes() > MAX_VAIN_BYTES {
                     return Err(End::Withdrawn);
                 }

@@ -36,7 +36,11 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
                     self.hearing.insert(filter, (hearing, qos));
                     SubscribeReasonCode::Success(qos)
                 }
-                _ => SubscribeReasonCode::Failure,
+                _ => {
+                    // What it was granted before it asked again, if that has ended meanwhile.
+                    self.hearing.remove(&filter);
+                    SubscribeReasonCode::Failure
+                }
             });
         }
         self.note_subscriptions();
@@ -44,7 +48,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         Ok(())
     }
 
-    fn note_subscriptions(&self) {
+    pub(super) fn note_subscriptions(&self) {
         let subscription = |(filter, (_, qos)): (&String, &(Hearing, QoS))| Subscription {
             topic_filter: filter.clone(),
             qos: *qos as u8,

@@ -156,7 +156,7 @@ pub struct Limits {
     pub max_sessions_per_person: usize,
     /// The largest packet of an admitted client, in bytes after the fixed header.
     pub max_packet_bytes: usize,
-    /// Filters in one SUBSCRIBE or UNSUBSCRIBE, and subscriptions of one client.
+    /// Filters in one SUBSCRIBE that are looked at, and subscriptions of one client.
     pub max_filters: usize,
     /// From accepting a connection until its CONNECT must be complete.
     pub connect_timeout: Duration,

@@ -174,6 +174,30 @@ async fn qos_2_arrives_exactly_once() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn what_mqtt_permits_is_no_offence() {
+    let broker = TestBroker::start().await;
+    let robot = RobotId::random();
+    let (report, desired) = (topic(&robot, RobotTopic::Report), topic(&robot, RobotTopic::Desired));
+    let mut raw = broker.robot(&robot).await;
+    // It may release none of its messages before it has sent them all.
+    for id in 1..=1000_u16 {
+        let [high, low] = id.to_be_bytes();
+        raw.send(&publish(&report, 2, id, b"x")).await;
+        raw.expect(&[0x50, 2, high, low]).await;
+    }
+    for id in 1..=1000_u16 {
+        let [high, low] = id.to_be_bytes();
+        raw.send(&[0x62, 2, high, low]).await;
+        raw.expect(&[0x70, 2, high, low]).await;
+    }
+    // And ask for more at once than it gets.
+    raw.send(&subscribe(1, &[(desired.as_str(), 1); 100])).await;
+    raw.expect(&[&[0x90_u8, 102, 0, 1][..], &[1; 64], &[0x80; 36]].concat()).await;
+    broker.broker.ring(&robot, Bytes::from_static(b"ding")).unwrap();
+    raw.expect(&publish(&desired, 1, 1, b"ding")).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_slow_robot_hears_the_newest_word_only() {
     let broker = TestBroker::start().await;
     let robot = RobotId::random();

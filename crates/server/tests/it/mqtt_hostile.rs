@@ -244,15 +244,7 @@ async fn a_burst_and_a_goodbye_do_no_harm() {
 async fn floods_are_capped() {
     let broker = TestBroker::with(|limits| limits.write_timeout = Duration::from_millis(500)).await;
     let robot = RobotId::random();
-    let (own, report) = (topic(&robot, RobotTopic::Desired), topic(&robot, RobotTopic::Report));
-
-    let mut unreleased = broker.robot(&robot).await;
-    for id in 1..=1000 {
-        unreleased.send(&publish(&report, 2, id, b"x")).await;
-    }
-    let mut answers = Vec::new();
-    let _ = timeout(PATIENCE, unreleased.stream.read_to_end(&mut answers)).await.expect("the broker should close");
-    assert!(answers.len() <= 4 * 64);
+    let own = topic(&robot, RobotTopic::Desired);
 
     let mut wide = broker.robot(&robot).await;
     wide.send(&subscribe(1, &vec![(own.as_str(), 1); 10_000])).await;

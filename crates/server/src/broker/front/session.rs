@@ -1,7 +1,7 @@
 //! One client's session, from its seat to its end: a single task that reads, acts, answers and keeps the time.
 //! Everything it holds is bounded; it stops reading while a message is being stored or answers are not read.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashMap;
 use std::io;
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -35,14 +35,14 @@ use crate::conduct::Watched;
 mod conduct;
 mod parts;
 mod subscriptions;
+mod unreleased;
 
 use conduct::until;
 use parts::{Parts, due};
+use unreleased::Unreleased;
 
 /// Answers a client may leave unread before nothing more is read from it.
 const MAX_UNREAD_BYTES: usize = 64 * 1024;
-/// QoS 2 messages a client may leave unreleased.
-const MAX_UNRELEASED: usize = 64;
 /// How long a connection is kept open for the client to read what was said last.
 const LINGER: Duration = Duration::from_secs(1);
 
@@ -170,7 +170,7 @@ where
         refused_filters: 0,
         parts: Parts::default(),
         outgoing: Outgoing::default(),
-        unreleased: HashSet::new(),
+        unreleased: Unreleased::default(),
         storing: None,
         keep_alive: guest.keep_alive.unwrap_or(context.limits.max_silence),
         heard_at: now,
@@ -221,7 +221,7 @@ struct Session<'a, S> {
     refused_filters: u32,
     parts: Parts,
     outgoing: Outgoing,
-    unreleased: HashSet<u16>,
+    unreleased: Unreleased,
     storing: Option<Storing<'a>>,
     keep_alive: Duration,
     /// When the last packet came.
@@ -386,7 +386,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
                 self.send(Packet::PubRel(PubRel { pkid, reason: PubRelReason::Success }, None));
             }
             Received::PubRel(pkid) => {
-                self.unreleased.remove(&pkid);
+                self.unreleased.remove(pkid);
                 self.send(Packet::PubComp(PubComp { pkid, reason: PubCompReason::Success }, None));
             }
             Received::PubComp(id) => {
@@ -409,14 +409,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
             self.context.totals.refuse_message();
             return Err(End::Violation("publishes where it may not"));
         };
-        if publish.qos == QoS::ExactlyOnce {
-            if self.unreleased.contains(&publish.packet_id) {
-                self.acknowledge(&publish);
-                return Ok(());
-            }
-            if self.unreleased.len() >= MAX_UNRELEASED {
-                return Err(End::Violation("leaves too many QoS 2 messages unreleased"));
-            }
+        if publish.qos == QoS::ExactlyOnce && self.unreleased.contains(publish.packet_id) {
+            self.acknowledge(&publish);
+            return Ok(());
         }
         match (route, &self.visitor) {
             (Route::Inbox(topic), &Visitor::Robot { ref robot, token_number }) => {

@@ -15,12 +15,11 @@ const MAX_FILTER_BYTES: usize = 1024;
 
 impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
     pub(super) fn subscribe(&mut self, pkid: u16, filters: Vec<(String, QoS)>) -> Result<(), End> {
-        if filters.len() > self.context.limits.max_filters {
-            return Err(End::Violation("subscribes to too many filters at a time"));
-        }
-        let mut return_codes = Vec::with_capacity(filters.len());
-        for (filter, qos) in filters {
-            let has_room = self.hearing.len() < self.context.limits.max_filters || self.hearing.contains_key(&filter);
+        // No client can know the bound, so what is beyond it is refused and no offence.
+        let (count, max_filters) = (filters.len(), self.context.limits.max_filters);
+        let mut return_codes = Vec::with_capacity(count);
+        for (filter, qos) in filters.into_iter().take(max_filters) {
+            let has_room = self.hearing.len() < max_filters || self.hearing.contains_key(&filter);
             let fits = has_room && filter.len() <= MAX_FILTER_BYTES;
             let hearing = may_subscribe(&self.visitor, &self.context.prefix, &filter).filter(|_| fits);
             let is_heard = match hearing {
@@ -43,6 +42,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
                 }
             });
         }
+        return_codes.resize(count, SubscribeReasonCode::Failure);
         self.note_subscriptions();
         self.send(Packet::SubAck(SubAck { pkid, return_codes }, None));
         Ok(())

@@ -14,7 +14,7 @@ use http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use sha1::{Digest as _, Sha1};
 use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _, ReadBuf};
 
-use self::frame::{Decoder, Opcode, Piece, Role, encode};
+use self::frame::{Decoder, NORMAL, Opcode, Piece, Role, Violation, encode};
 
 /// The subprotocol's name.
 pub const MQTT: &str = "mqtt";
@@ -94,12 +94,14 @@ pub struct WebSocket<S> {
     input: BytesMut,
     /// Taken apart and not handed out yet.
     unread: BytesMut,
-    /// Whether the other end has said that nothing follows.
+    /// Whether the other end has said that nothing follows, or what nobody may say.
     is_over: bool,
     /// Frames without a byte since the last byte.
     vain_frames: usize,
     output: BytesMut,
-    /// Whether this end has said so.
+    /// What this end says when it closes: the code, or nothing to whoever gave none.
+    closing: Option<u16>,
+    /// Whether it has.
     is_closed: bool,
 }
 
@@ -143,6 +145,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
             is_over: false,
             vain_frames: 0,
             output: BytesMut::new(),
+            closing: Some(NORMAL),
             is_closed: false,
         }
     }
@@ -150,6 +153,12 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
     fn queue(&mut self, opcode: Opcode, payload: &[u8]) {
         let mask = (self.role == Role::Client).then(rand::random);
         encode(opcode, payload, mask, &mut self.output);
+    }
+
+    /// Nothing more is read of the other end, which is told why when this one closes.
+    fn refuse(&mut self, violation: Violation) -> io::Error {
+        (self.is_over, self.closing) = (true, Some(violation.code()));
+        io::Error::new(io::ErrorKind::InvalidData, violation)
     }
 
     /// Writes what waits to be written.
@@ -169,11 +178,11 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
     /// Acts on the frames that are here; `unread` has what there is to read.
     fn act_on_input(&mut self) -> io::Result<()> {
         while self.unread.is_empty() && !self.is_over {
-            let piece = self.decoder.decode(&mut self.input).map_err(invalid)?;
+            let piece = self.decoder.decode(&mut self.input).map_err(|violation| self.refuse(violation))?;
             let has_data = matches!(&piece, Some(Piece::Data(bytes)) if !bytes.is_empty());
             self.vain_frames = if has_data { 0 } else { self.vain_frames + usize::from(piece.is_some()) };
             if self.vain_frames > MAX_VAIN_FRAMES {
-                return Err(invalid("too many frames that carry nothing"));
+                return Err(self.refuse(Violation::new("another one that carries nothing")));
             }
             match piece {
                 Some(Piece::Data(bytes)) => self.unread = bytes,
@@ -182,7 +191,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
                     self.queue(Opcode::Pong, &bytes);
                 }
                 Some(Piece::Ping(_) | Piece::Pong) => {}
-                Some(Piece::Close) => self.is_over = true,
+                Some(Piece::Close(code)) => (self.is_over, self.closing) = (true, code),
                 None => {
                     if self.input.is_empty() {
                         self.input = BytesMut::new();
@@ -193,10 +202,6 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         }
         Ok(())
     }
-}
-
-fn invalid(reason: impl Into<Box<dyn std::error::Error + Send + Sync>>) -> io::Error {
-    io::Error::new(io::ErrorKind::InvalidData, reason)
 }
 
 /// The length of the answer's head if it grants the WebSocket; `None` until it has come whole.
@@ -277,7 +282,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> AsyncWrite for WebSocket<S> {
     fn poll_shutdown(self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
         let this = self.get_mut();
         if !this.is_closed {
-            this.queue(Opcode::Close, &[]);
+            let code = this.closing.map(u16::to_be_bytes);
+            this.queue(Opcode::Close, code.as_ref().map_or(&[][..], |code| &code[..]));
             this.is_closed = true;
         }
         ready!(this.poll_drain(context))?;
@@ -362,6 +368,27 @@ mod tests {
         let mut frame = BytesMut::new();
         encode(opcode, payload, Some([1, 2, 3, 4]), &mut frame);
         frame
+    }
+
+    #[tokio::test]
+    async fn whoever_is_closed_is_told_why() {
+        for (frame, answer) in [
+            (masked(Opcode::Continuation, b"x"), &b"\x88\x02\x03\xea"[..]),
+            (BytesMut::from(&b"\x81\x80\0\0\0\0"[..]), b"\x88\x02\x03\xeb"),
+            (masked(Opcode::Close, b"\x03\xe9going"), b"\x88\x02\x03\xe9"),
+            (masked(Opcode::Close, b""), b"\x88\x00"),
+            (masked(Opcode::Binary, b"x"), b"\x88\x02\x03\xe8"),
+        ] {
+            let (client, mut server) = pair(1024).await;
+            let WebSocket { mut stream, .. } = client;
+            stream.write_all(&frame).await.expect("written");
+            // Whether it is data, the end or an error.
+            let _ = server.read(&mut [0; 8]).await;
+            server.shutdown().await.expect("closed");
+            let mut came = Vec::new();
+            stream.read_to_end(&mut came).await.expect("read");
+            assert_eq!(came, answer, "{frame:x?}");
+        }
     }
 
     #[tokio::test]

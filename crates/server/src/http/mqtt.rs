@@ -6,10 +6,10 @@ use std::net::SocketAddr;
 
 use axum::body::Body;
 use axum::extract::{ConnectInfo, Request, State};
-use axum::response::Response;
-use http::StatusCode;
+use axum::response::{IntoResponse as _, Response};
+use http::{HeaderValue, StatusCode, header};
 use hyper_util::rt::TokioIo;
-use task_transport::websocket::{WebSocket, grant};
+use task_transport::websocket::{WebSocket, WebSocketError, grant};
 
 use super::App;
 use super::error::ApiError;
@@ -25,8 +25,10 @@ pub(super) async fn upgrade(
     ConnectInfo(peer): ConnectInfo<SocketAddr>,
     mut request: Request,
 ) -> Result<Response, ApiError> {
-    let headers = grant(request.headers())
-        .map_err(|error| ApiError::new(StatusCode::UPGRADE_REQUIRED, "upgrade_required", error.to_string()))?;
+    let headers = match grant(request.headers()) {
+        Ok(headers) => headers,
+        Err(error) => return Ok(upgrade_required(&error)),
+    };
     let proof = request.extensions().get::<ClientProof>().cloned().unwrap_or_default();
     let upgrade = hyper::upgrade::on(&mut request);
     let handshake = async move {
@@ -40,4 +42,16 @@ pub(super) async fn upgrade(
     *response.status_mut() = StatusCode::SWITCHING_PROTOCOLS;
     response.headers_mut().extend(headers);
     Ok(response)
+}
+
+/// Says as well what the request should have asked for.
+fn upgrade_required(error: &WebSocketError) -> Response {
+    let error = ApiError::new(StatusCode::UPGRADE_REQUIRED, "upgrade_required", error.to_string());
+    let mut response = error.into_response();
+    response.headers_mut().extend([
+        (header::CONNECTION, HeaderValue::from_static("Upgrade")),
+        (header::UPGRADE, HeaderValue::from_static("websocket")),
+        (header::SEC_WEBSOCKET_VERSION, HeaderValue::from_static("13")),
+    ]);
+    response
 }

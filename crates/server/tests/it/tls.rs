@@ -176,6 +176,8 @@ async fn the_websocket_has_the_doors_of_mqtts_own_port() {
     assert_eq!(nothing, b"");
     let plain = server.bare(Method::GET, "/mqtt").send().await.expect("an answer");
     assert_eq!(plain.status(), StatusCode::UPGRADE_REQUIRED);
+    assert_eq!(plain.headers()["upgrade"], "websocket");
+    assert_eq!(plain.headers()["sec-websocket-version"], "13");
 }
 
 #[tokio::test(flavor = "multi_thread")]

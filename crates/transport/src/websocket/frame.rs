@@ -7,6 +7,10 @@ use bytes::{Buf as _, BufMut as _, BytesMut};
 const MAX_CONTROL_BYTES: usize = 125;
 /// The most an encoded header takes.
 const MAX_HEADER_BYTES: usize = 14;
+/// Why a connection is closed: all is said, the protocol was broken, or this is not what is exchanged here.
+pub(super) const NORMAL: u16 = 1000;
+const PROTOCOL_ERROR: u16 = 1002;
+const UNSUPPORTED_DATA: u16 = 1003;
 const FIN: u8 = 0x80;
 const RESERVED: u8 = 0x70;
 const MASKED: u8 = 0x80;
@@ -44,14 +48,28 @@ pub enum Piece {
     Ping(BytesMut),
     /// An answer, which nobody has asked for.
     Pong,
-    /// Nothing follows.
-    Close,
+    /// Nothing follows. With why, if the other end says so (RFC 6455, section 7.4).
+    Close(Option<u16>),
 }
 
 /// The other end does not keep to the protocol.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("not a WebSocket frame that may stand there: {0}")]
-pub struct Violation(&'static str);
+#[error("not a WebSocket frame that may stand there: {reason}")]
+pub struct Violation {
+    reason: &'static str,
+    code: u16,
+}
+
+impl Violation {
+    pub(super) const fn new(reason: &'static str) -> Self {
+        Self { reason, code: PROTOCOL_ERROR }
+    }
+
+    /// What the frame that closes the connection says of it.
+    pub fn code(&self) -> u16 {
+        self.code
+    }
+}
 
 /// Takes frames apart as their bytes come.
 #[derive(Debug)]
@@ -105,7 +123,7 @@ impl Decoder {
             Opcode::Binary | Opcode::Continuation => Piece::Data(payload),
             Opcode::Ping => Piece::Ping(payload),
             Opcode::Pong => Piece::Pong,
-            Opcode::Close => Piece::Close,
+            Opcode::Close => Piece::Close(close_code(&payload)?),
         }))
     }
 }
@@ -113,7 +131,7 @@ impl Decoder {
 fn read_header(role: Role, is_in_message: &mut bool, input: &mut BytesMut) -> Result<Option<Frame>, Violation> {
     let &[first, second, ..] = &input[..] else { return Ok(None) };
     if first & RESERVED != 0 {
-        return Err(Violation("an extension that was not agreed on"));
+        return Err(Violation::new("an extension that was not agreed on"));
     }
     let opcode = match first & 0x0f {
         0 => Opcode::Continuation,
@@ -121,12 +139,12 @@ fn read_header(role: Role, is_in_message: &mut bool, input: &mut BytesMut) -> Re
         8 => Opcode::Close,
         9 => Opcode::Ping,
         10 => Opcode::Pong,
-        1 => return Err(Violation("text, where MQTT is bytes")),
-        _ => return Err(Violation("an unknown opcode")),
+        1 => return Err(Violation { reason: "text, where MQTT is bytes", code: UNSUPPORTED_DATA }),
+        _ => return Err(Violation::new("an unknown opcode")),
     };
     let is_masked = second & MASKED != 0;
     if is_masked != (role == Role::Server) {
-        return Err(Violation("clients mask what they send, servers do not"));
+        return Err(Violation::new("clients mask what they send, servers do not"));
     }
     let short = second & !MASKED;
     let length_bytes = match short {
@@ -139,11 +157,11 @@ fn read_header(role: Role, is_in_message: &mut bool, input: &mut BytesMut) -> Re
     }
     let is_last = first & FIN != 0;
     match opcode {
-        Opcode::Binary if *is_in_message => return Err(Violation("a new message inside of another")),
-        Opcode::Continuation if !*is_in_message => return Err(Violation("the rest of no message")),
+        Opcode::Binary if *is_in_message => return Err(Violation::new("a new message inside of another")),
+        Opcode::Continuation if !*is_in_message => return Err(Violation::new("the rest of no message")),
         Opcode::Binary | Opcode::Continuation => *is_in_message = !is_last,
         _ if !is_last || usize::from(short) > MAX_CONTROL_BYTES => {
-            return Err(Violation("a frame of control that is long or in parts"));
+            return Err(Violation::new("a frame of control that is long or in parts"));
         }
         _ => {}
     }
@@ -154,13 +172,24 @@ fn read_header(role: Role, is_in_message: &mut bool, input: &mut BytesMut) -> Re
         _ => u64::from(short),
     };
     if left > u64::MAX >> 1 {
-        return Err(Violation("a length of more than 63 bits"));
+        return Err(Violation::new("a length of more than 63 bits"));
     }
     let mut mask = [0; 4];
     if is_masked {
         input.copy_to_slice(&mut mask);
     }
     Ok(Some(Frame { opcode, mask, passed: 0, left }))
+}
+
+/// Why the other end closes the connection; it need not say.
+fn close_code(payload: &[u8]) -> Result<Option<u16>, Violation> {
+    let &[high, low, ..] = payload else {
+        return if payload.is_empty() { Ok(None) } else { Err(Violation::new("half of a code")) };
+    };
+    let code = u16::from_be_bytes([high, low]);
+    // The others are reserved, or never sent.
+    let is_one = matches!(code, 1000..=1003 | 1007..=1014 | 3000..=4999);
+    if is_one { Ok(Some(code)) } else { Err(Violation::new("a code that nobody sends")) }
 }
 
 /// Appends a whole frame to `output`. `mask` is random where a client sends.
@@ -251,9 +280,15 @@ mod tests {
             (&[0x89, 0x7e, 0x00, 0x7e], Role::Client),
             (&[0x02, 0x00, 0x82, 0x00], Role::Client),
             (&[0x82, 0x7f, 0x80, 0, 0, 0, 0, 0, 0, 0], Role::Client),
+            (&[0x88, 0x01, 3], Role::Client),
+            (&[0x88, 0x02, 0x03, 0xed], Role::Client),
         ] {
-            assert!(pieces(role, bytes, 99).is_err(), "{bytes:x?}");
+            let code = pieces(role, bytes, 99).expect_err("refused").code();
+            assert_eq!(code, if bytes[0] == 0x81 { 1003 } else { 1002 }, "{bytes:x?}");
         }
+        let close = [0x88, 0x05, 0x03, 0xe9, b'b', b'y', b'e'];
+        assert_eq!(pieces(Role::Client, &close, 1), Ok(vec![Piece::Close(Some(1001))]));
+        assert_eq!(pieces(Role::Client, &[0x88, 0], 1), Ok(vec![Piece::Close(None)]));
     }
 
     #[test]
@@ -300,7 +335,7 @@ mod tests {
             for role in [Role::Client, Role::Server] {
                 let handed_out: usize = pieces(role, &bytes, step).unwrap_or_default().iter().map(|piece| match piece {
                     Piece::Data(bytes) | Piece::Ping(bytes) => bytes.len(),
-                    Piece::Pong | Piece::Close => 0,
+                    Piece::Pong | Piece::Close(_) => 0,
                 }).sum();
                 prop_assert!(handed_out <= bytes.len());
             }

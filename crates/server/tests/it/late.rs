@@ -72,9 +72,9 @@ async fn a_restart_that_comes_too_late_leaves_what_runs(database: TestDatabase) 
 async fn what_was_stopped_stays_so(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(2).await;
-    let stop = async || {
+    let order = async |order| {
         let (task, of) = ("talker".parse().expect("valid"), "r1".parse().expect("valid"));
-        fleet.actions.order_task(&fleet.operator, &random_key(), TaskOrder::Stop, &task, &of).await.expect("ordered");
+        fleet.actions.order_task(&fleet.operator, &random_key(), order, &task, &of).await.expect("ordered");
     };
     let old = fleet.deploy("1", |_| ()).await;
     for robot in &mut robots {
@@ -82,13 +82,15 @@ async fn what_was_stopped_stays_so(database: TestDatabase) {
     }
     // Though a later batch would have brought another version of it.
     fleet.deploy("2", |order| order.batch = Some(1)).await;
-    stop().await;
+    order(TaskOrder::Stop).await;
     fleet.follow(&mut robots[0], Phase::Running).await;
     let desired = fleet.desired(&robots[1]).await.expect("state").tasks.remove(0);
     assert_eq!((desired.deployment, desired.wanted), (old.clone(), Wanted::Stopped));
     // Though what it was stopped in is taken back.
+    order(TaskOrder::Start).await;
+    fleet.follow(&mut robots[1], Phase::Running).await;
     fleet.deploy("3", |order| order.selector = "r1".parse().expect("valid")).await;
-    stop().await;
+    order(TaskOrder::Stop).await;
     fleet.clock.advance_ms(8 * 24 * 3_600_000);
     fleet.actions.expire().await.expect("done");
     let desired = fleet.desired(&robots[1]).await.expect("state").tasks.remove(0);

@@ -504,8 +504,13 @@ async fn on_disk(work: impl FnOnce() -> std::io::Result<()> + Send + 'static) ->
 
 #[cfg(test)]
 mod tests {
+    use task_proto::DeploymentId;
+
     use super::*;
+    use crate::cgroup::RunLimits;
     use crate::fetch::FetchSettings;
+    use crate::launch::Interrupt;
+    use crate::run_dir::RunDir;
 
     /// A robot whose data is in `dir` and whose own settings are `file`. Nobody is its server.
     pub(super) fn robot(dir: &Path, file: &str) -> Robot {
@@ -520,5 +525,23 @@ mod tests {
         let registry = Registry::new(client, server, "tskr_x".to_owned());
         let mac = "02:00:00:00:00:01".parse().expect("an address");
         Robot::new(data, (fetcher, Listening::default()), registry, &config, &RobotId::random(), mac)
+    }
+
+    /// The directory of a run in that environment, of which nothing but what it is was written yet.
+    pub(super) fn run_dir(path: &Path, environment: BTreeMap<String, String>) -> RunDir {
+        let run = RunDir::create(path).expect("made");
+        let spec = RunSpec {
+            assignment: DeploymentId::random(),
+            script: "run.sh".into(),
+            directory: "/".into(),
+            environment,
+            interrupt: Interrupt::default(),
+            log: LogSpec::at("log".into()),
+            limits: RunLimits::default(),
+            user: None,
+            cgroup: None,
+        };
+        run.write_spec(&spec).expect("written");
+        run
     }
 }

@@ -144,11 +144,9 @@ pub(super) async fn guard(
         Err(error) if is_oci => return error.into_oci_response(),
         Err(error) => return error.into_response(),
     }
-    match gate.deadline {
-        Some(deadline) => tokio::time::timeout(deadline, answered(request, next, Some(deadline))).await,
-        None => Ok(answered(request, next, None).await),
-    }
-    .unwrap_or_else(|_| {
+    let answer = answered(request, next, gate.deadline);
+    let Some(deadline) = gate.deadline else { return answer.await };
+    tokio::time::timeout(deadline, answer).await.unwrap_or_else(|_| {
         let message = "the request took too long to arrive or to be answered";
         ApiError::new(StatusCode::REQUEST_TIMEOUT, "timeout", message).into_response()
     })

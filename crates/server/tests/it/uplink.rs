@@ -245,9 +245,8 @@ async fn a_new_token_leaves_the_old_session_alone_until_it_is_used() {
     assert!(server.report(&mut robot, &state, Phase::Running).await.status().is_success());
 }
 
-#[tokio::test(flavor = "multi_thread")]
-async fn two_instances_that_displace_each_other_get_no_more_work() {
-    let server = TestServer::start().await;
+/// A robot and another machine with its identity, which displace each other.
+async fn two_of_one(server: &TestServer) -> (TestRobot, TestRobot) {
     let mut robot = server.enroll("atlas").await;
     let mut clone = TestRobot::new(robot.id.clone(), robot.token.clone());
     let state = server.desired(&robot).await;
@@ -255,6 +254,13 @@ async fn two_instances_that_displace_each_other_get_no_more_work() {
         server.report(&mut robot, &state, Phase::Running).await;
         server.report(&mut clone, &state, Phase::Running).await;
     }
+    (robot, clone)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn two_instances_that_displace_each_other_get_no_more_work() {
+    let server = TestServer::start().await;
+    let (robot, _clone) = two_of_one(&server).await;
     let refused = server.ask_desired(&robot).await;
     assert_eq!(refused.status(), 409);
     let body: serde_json::Value = refused.json().await.expect("json");
@@ -267,13 +273,7 @@ async fn two_instances_that_displace_each_other_get_no_more_work() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_token_that_is_first_used_over_mqtt_ends_what_came_by_the_old_one() {
     let server = TestServer::start().await;
-    let mut robot = server.enroll("atlas").await;
-    let mut clone = TestRobot::new(robot.id.clone(), robot.token.clone());
-    let state = server.desired(&robot).await;
-    for _ in 0..3 {
-        server.report(&mut robot, &state, Phase::Running).await;
-        server.report(&mut clone, &state, Phase::Running).await;
-    }
+    let (mut robot, clone) = two_of_one(&server).await;
     let path = format!("/api/v1/robots/{}", robot.id);
     let request =
         format!("GET {path}/desired HTTP/1.1\r\nHost: taskd\r\nAuthorization: Bearer {}\r\n\r\n", clone.token);

@@ -81,15 +81,11 @@ mod tests {
     use std::os::unix::fs::PermissionsExt as _;
 
     use serde_json::json;
-    use task_proto::DeploymentId;
     use task_proto::settings::RobotSettings;
 
-    use super::super::tests::robot;
+    use super::super::tests::{robot, run_dir};
     use super::*;
-    use crate::cgroup::RunLimits;
     use crate::effects::Effects as _;
-    use crate::launch::Interrupt;
-    use crate::run_dir::{LogSpec, RunSpec};
 
     fn setup(dir: &Path, name: &str, text: &str) -> (PathBuf, RobotSettings) {
         let path = dir.join(name);
@@ -128,19 +124,7 @@ mod tests {
         let robot = robot(temp.path(), "");
         let set = |id| robot.adopt(&RobotSettings { ros_domain_id: Some(id), ..settings.clone() });
         set(7);
-        let run = RunDir::create(&temp.path().join("run")).expect("made");
-        let spec = RunSpec {
-            assignment: DeploymentId::random(),
-            script: "run.sh".into(),
-            directory: "/".into(),
-            environment: robot.held().environment.clone(),
-            interrupt: Interrupt::default(),
-            log: LogSpec::at("log".into()),
-            limits: RunLimits::default(),
-            user: None,
-            cgroup: None,
-        };
-        run.write_spec(&spec).expect("written");
+        let run = run_dir(&temp.path().join("run"), robot.held().environment.clone());
         set(9);
         let domain = |facts: Option<RosFacts>| facts.and_then(|facts| facts.domain_id);
         assert_eq!(domain(robot.ros_facts_of(run.path())), Some(7));

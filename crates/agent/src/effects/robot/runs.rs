@@ -59,38 +59,19 @@ pub(super) fn other_runs(runs: &Path, kept: Option<&Path>) -> Vec<PathBuf> {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
     use std::os::unix::process::ExitStatusExt as _;
 
     use task_proto::desired::{BlobRef, DesiredTask, PackageRef, Wanted};
     use task_proto::manifest::TaskManifest;
     use task_proto::{DeploymentId, Digest};
 
-    use super::super::tests::robot;
+    use super::super::tests::{robot, run_dir};
     use super::*;
-    use crate::cgroup::RunLimits;
     use crate::containment::RUN_DIR_VARIABLE;
     use crate::effects::Effects as _;
-    use crate::launch::Interrupt;
     use crate::ledger::RunRules;
     use crate::observed::ProcessState;
-    use crate::run_dir::{LogSpec, RunDir, RunSpec};
-
-    fn run_dir(path: &Path) -> RunDir {
-        let run = RunDir::create(path).expect("made");
-        let spec = RunSpec {
-            assignment: DeploymentId::random(),
-            script: "run.sh".into(),
-            directory: "/".into(),
-            environment: Default::default(),
-            interrupt: Interrupt::default(),
-            log: LogSpec::at("log".into()),
-            limits: RunLimits::default(),
-            user: None,
-            cgroup: None,
-        };
-        run.write_spec(&spec).expect("written");
-        run
-    }
 
     fn run_of(boot_id: &str) -> ActiveRun {
         let manifest = serde_json::json!({
@@ -127,7 +108,7 @@ mod tests {
         let talker = "talker".parse().expect("valid");
         let (now, before) = (run_of(&process::boot_id().expect("a boot id")), run_of("an earlier boot"));
         let [now_process, before_process] = [&now, &before].map(|run| run.process.clone().expect("a process"));
-        let dir = run_dir(&robot.run_dir(&talker, &now_process));
+        let dir = run_dir(&robot.run_dir(&talker, &now_process), BTreeMap::new());
         std::fs::write(dir.path().join("pid.json"), "{").expect("written");
         let record = |run: &ActiveRun| {
             std::fs::write(dir.path().join(RUN_RECORD), serde_json::to_vec(run).expect("json")).expect("written");
@@ -146,7 +127,7 @@ mod tests {
         let temp = tempfile::tempdir().expect("a directory");
         let robot = robot(temp.path(), "");
         let talker = "talker".parse().expect("valid");
-        let run = run_dir(&robot.data.task(&talker).run().join("d.1.1.1"));
+        let run = run_dir(&robot.data.task(&talker).run().join("d.1.1.1"), BTreeMap::new());
         #[expect(clippy::disallowed_methods, reason = "a process that a shim has started and not written down")]
         let mut command = std::process::Command::new("sleep");
         let mut process = command.arg("1000").env(RUN_DIR_VARIABLE, run.path()).spawn().expect("started");

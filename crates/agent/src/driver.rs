@@ -79,6 +79,8 @@ struct View {
     progress: BTreeMap<Lane, Progress>,
     /// What the step that gathers parts says of those that are lacking.
     asked: Option<watch::Receiver<Asks>>,
+    /// What was last not stopped or deleted, and why. It is tried again.
+    undone: Option<String>,
 }
 
 /// The watchers of one process. Dropping it ends the one that asks ROS.

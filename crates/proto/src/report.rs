@@ -42,6 +42,18 @@ pub struct Report {
     pub tasks: Vec<TaskReport>,
 }
 
+impl Report {
+    /// The condition of a robot that was sent the generation it obeys with other content.
+    pub const STATE_CONTRADICTED: &str = "state_contradicted";
+
+    /// How far the robot has come. Of two states with one generation the one that it obeys counts as the later: the other
+    /// is by a server whose database was put back to an older copy.
+    pub fn reached_generation(&self) -> Generation {
+        let is_contradicted = self.conditions.iter().any(|condition| condition.code == Self::STATE_CONTRADICTED);
+        Generation(self.observed_generation.0.saturating_add(u64::from(is_contradicted)))
+    }
+}
+
 /// What earlier transfers have shown of a robot's way to the server.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
@@ -130,7 +142,7 @@ pub enum Isolation {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Condition {
-    /// For programs: `held`, `state_refused`, `settings_differ`, …
+    /// For programs: `held`, `state_refused`, `step_failed`, …
     pub code: String,
     /// For people: what and where.
     pub text: String,

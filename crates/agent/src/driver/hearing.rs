@@ -5,14 +5,18 @@ use task_proto::api::ReportReply;
 use task_proto::desired::Inline;
 use task_proto::envelope::Envelope;
 use task_proto::id::Labels;
-use task_proto::report::Condition;
+use task_proto::report::{Condition, Report};
 
 use super::{Driver, Speaker, requires_labels};
-use crate::admission;
+use crate::admission::{self, Refused};
 use crate::effects::{Effects, chain};
 use crate::ledger::Accepted;
 use crate::link::Heard;
 
+/// The condition of a robot that does not obey what it was sent.
+const STATE_REFUSED: &str = "state_refused";
+/// The conditions that end once a state is accepted.
+pub(super) const REFUSALS: [&str; 2] = [STATE_REFUSED, Report::STATE_CONTRADICTED];
 /// How much of the server's reason for refusing the token is kept.
 const MOST_REASON_CHARS: usize = 300;
 
@@ -64,7 +68,7 @@ impl<E: Effects> Driver<E> {
         let wall_ms = self.effects.now().wall_ms;
         match admission::admit(&envelope, server_key, robot_id, self.desired.as_ref(), wall_ms) {
             Ok(state) => {
-                self.conditions.remove("state_refused");
+                REFUSALS.iter().for_each(|code| drop(self.conditions.remove(code)));
                 self.withheld = None;
                 if !inline.is_empty() {
                     let packages = state.tasks.iter().flat_map(|task| [task.package.config, task.package.content]);
@@ -90,7 +94,8 @@ impl<E: Effects> Driver<E> {
             Err(refused) => {
                 let text = format!("a desired state was refused: {}", chain(&refused));
                 tracing::warn!("{text}");
-                self.conditions.insert("state_refused", text);
+                let is_other = matches!(refused, Refused::Contradicts(_));
+                self.conditions.insert(if is_other { Report::STATE_CONTRADICTED } else { STATE_REFUSED }, text);
             }
         }
     }

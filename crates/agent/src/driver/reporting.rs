@@ -6,6 +6,7 @@ use task_proto::TaskName;
 use task_proto::report::{ActiveVersion, Condition, Failure, FailureCode, Phase, Report, TaskReport};
 use tokio::time::Instant;
 
+use super::hearing::REFUSALS;
 use super::{Driver, View};
 use crate::effects::Effects;
 use crate::ledger::{LostFiles, TaskRecord};
@@ -73,6 +74,10 @@ impl<E: Effects> Driver<E> {
         if let Some(text) = &self.trust.refused_list {
             conditions.push(condition("publishers_refused", text));
         }
+        let undone: Vec<&str> = self.views.values().filter_map(|view| view.undone.as_deref()).collect();
+        if !undone.is_empty() {
+            conditions.push(condition("step_failed", &undone.join("; ")));
+        }
         conditions.extend(self.withheld.clone());
         conditions
     }
@@ -82,7 +87,7 @@ impl<E: Effects> Driver<E> {
     fn is_settled(&self) -> bool {
         let Some(state) = &self.desired else { return false };
         let half_ms = state.issued_at_ms + state.expires_at_ms.saturating_sub(state.issued_at_ms) / 2;
-        let refused = self.conditions.contains_key("state_refused");
+        let refused = REFUSALS.iter().any(|code| self.conditions.contains_key(code));
         !refused && self.effects.now().wall_ms < half_ms
     }
 }

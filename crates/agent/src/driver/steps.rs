@@ -125,8 +125,15 @@ impl<E: Effects> Driver<E> {
             self.kept_parts = None;
             return;
         }
-        if let Err(error) = &outcome {
-            tracing::warn!(failure = %error.failure, "{} failed", plan::describe(&task, &under_way.step));
+        let failed = outcome
+            .as_ref()
+            .err()
+            .map(|error| format!("{}: {}", plan::describe(&task, &under_way.step), error.failure));
+        if let Some(text) = &failed {
+            tracing::warn!("failed to {text}");
+        }
+        if matches!(under_way.step, Step::Stop(_) | Step::Prune { .. } | Step::Remove) {
+            view.undone = failed;
         }
         self.finish(&task, &under_way.step, outcome);
     }

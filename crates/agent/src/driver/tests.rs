@@ -328,6 +328,35 @@ async fn a_refused_state_is_named_and_the_old_one_stays() {
     bench.order(4, Vec::new()).await;
     let report = bench.report(|report| has(report, "state_refused")).await;
     assert_eq!((report.observed_generation, report.tasks.len()), (Generation(6), 1));
+    assert_eq!(report.reached_generation(), Generation(6));
+    // What a server orders that was put back to an older copy and has forgotten its sixth.
+    bench.order(6, Vec::new()).await;
+    let report = bench.report(|report| has(report, Report::STATE_CONTRADICTED)).await;
+    assert_eq!((report.reached_generation(), report.tasks.len()), (Generation(7), 1));
+    bench.order(8, Vec::new()).await;
+    bench.report(|report| report.conditions.is_empty() && report.reached_generation() == Generation(8)).await;
+}
+
+#[tokio::test]
+async fn what_is_not_stopped_or_deleted_is_said_until_it_is() {
+    let bench = Bench::new().await;
+    bench.order(1, vec![order("1.0")]).await;
+    bench.phase(Phase::Running).await;
+    let failing =
+        |text: &str| StepFailure { failure: Failure::new(FailureCode::IO_ERROR, text), retry_after_ms: Some(0) };
+    bench.fake.state(|state| {
+        state.stop = Some(failing("it does not end"));
+        state.removal = Some(failing("read-only file system"));
+    });
+    bench.order(2, Vec::new()).await;
+    let said = |report: &Report, text: &str| {
+        report.conditions.iter().any(|condition| condition.code == "step_failed" && condition.text == text)
+    };
+    bench.report(|report| said(report, "stop talker: io_error: it does not end")).await;
+    bench.fake.state(|state| state.stop = None);
+    bench.report(|report| said(report, "remove talker: io_error: read-only file system")).await;
+    bench.fake.state(|state| state.removal = None);
+    bench.report(|report| report.tasks.is_empty() && report.conditions.is_empty()).await;
 }
 
 #[tokio::test]

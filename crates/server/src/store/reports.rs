@@ -117,7 +117,7 @@ impl Write {
                     .bind(report.robot_id.as_str())
                     .bind(stored(report.start))
                     .bind(stored(report.seq))
-                    .bind(stored(report.observed_generation.min(MAX_GENERATION).0))
+                    .bind(stored(report.reached_generation().min(MAX_GENERATION).0))
                     .bind(json(report))
                     .bind(report.link.as_ref().map(json))
                     .bind(report.host.battery_percent.map(|percent| i64::from(percent.min(100))));
@@ -144,7 +144,7 @@ impl Write {
                     .bind(report.robot_id.as_str())
                     .bind(stored(report.start))
                     .bind(stored(report.seq))
-                    .bind(stored(report.observed_generation.min(MAX_GENERATION).0));
+                    .bind(stored(report.reached_generation().min(MAX_GENERATION).0));
             }
             query.execute(self.connection()).await?;
         }

@@ -469,7 +469,7 @@ fn robot_view(row: &sqlx::any::AnyRow, mut tasks: Vec<RobotTask>) -> Result<Robo
     }
     if observed_generation > generation {
         let text = format!(
-            "it reports generation {observed_generation}, the server knows {generation}; left alone until its next order"
+            "it has come to generation {observed_generation}, this server to {generation}; left alone until its next order"
         );
         conditions.push(Condition { code: "diverged".to_owned(), text });
     }

@@ -4,7 +4,7 @@
 use task_proto::Generation;
 use task_proto::desired::Wanted;
 use task_proto::manifest::TaskKind;
-use task_proto::report::Phase;
+use task_proto::report::{Condition, Phase, Report};
 use taskd::actions::TaskOrder;
 
 use crate::database::{TestDatabase, on_both_databases};
@@ -19,6 +19,7 @@ on_both_databases! {
     a_robots_word_opens_no_blob,
     what_was_taken_over_can_be_rolled_back_to,
     an_order_for_a_robot_that_diverged_since_expires,
+    a_robot_that_obeys_another_state_of_the_same_generation_has_diverged,
 }
 
 /// What is ordered of a task that has run, and does not reach its robot in time, takes nothing away from it.
@@ -177,4 +178,30 @@ async fn an_order_for_a_robot_that_diverged_since_expires(database: TestDatabase
     assert_eq!(fleet.phases(&id).await, [Phase::Expired]);
     let view = fleet.view(&robots[0]).await;
     assert_eq!((view.generation, view.conditions[0].code.as_str()), (Generation(1), "diverged"));
+}
+
+async fn a_robot_that_obeys_another_state_of_the_same_generation_has_diverged(database: TestDatabase) {
+    let (fleet, mut robots) = restored(database, 1).await;
+    // As if it had not reported yet. One order was lost, and one is made before it does.
+    let robot = &mut robots[0];
+    (robot.start, robot.observed) = (2, Generation(0));
+    let tasks = std::mem::take(&mut robot.tasks);
+    fleet.report(robot).await;
+    let late = fleet.deploy("2", |_| ()).await;
+    (robot.tasks, robot.observed) = (tasks, Generation(1));
+    fleet.report(robot).await;
+    assert_eq!(fleet.version(robot).await, "2");
+    let contradicted = Condition { code: Report::STATE_CONTRADICTED.to_owned(), text: "it is not the same".to_owned() };
+    let report = Report { conditions: vec![contradicted], ..robot.next_report() };
+    fleet.writer.submit(report, 0).await.expect("stored");
+    let view = fleet.view(robot).await;
+    assert_eq!((view.generation, view.conditions[0].code.as_str()), (Generation(1), "diverged"));
+    assert_eq!(code(fleet.desired(robot).await), "diverged");
+    // The next order starts from what it has.
+    let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
+    fleet.actions.order_task(&fleet.operator, &random_key(), TaskOrder::Stop, &task, &everyone).await.expect("ordered");
+    let desired = fleet.desired(robot).await.expect("not withheld any more");
+    assert_eq!((desired.generation, desired.tasks[0].wanted), (Generation(3), Wanted::Stopped));
+    assert_eq!(desired.tasks[0].package.version.as_str(), "1");
+    assert_eq!(fleet.phases(&late).await, [Phase::Stopped]);
 }

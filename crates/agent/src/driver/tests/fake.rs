@@ -47,6 +47,9 @@ pub(super) struct State {
     /// What the robot's clock shows, if it is wrong.
     pub(super) wall_ms: Option<u64>,
     pub(super) disk_full: bool,
+    /// What comes of a stop and of a removal, if they fail.
+    pub(super) stop: Option<StepFailure>,
+    pub(super) removal: Option<StepFailure>,
     /// What packages say they need, what the robot has, and what of it was seen.
     pub(super) exec_depends: Vec<String>,
     pub(super) ros_packages: BTreeSet<String>,
@@ -282,8 +285,13 @@ impl Effects for Fake {
 
     async fn stop(&self, _task: &TaskName, run: &ActiveRun) -> Result<(), StepFailure> {
         let process = run.process.as_ref().expect("a process to stop");
-        self.state(|state| state.alive.remove(&process.dir));
-        Ok(())
+        self.state(|state| match &state.stop {
+            Some(failure) => Err(failure.clone()),
+            None => {
+                state.alive.remove(&process.dir);
+                Ok(())
+            }
+        })
     }
 
     async fn collect(
@@ -313,7 +321,7 @@ impl Effects for Fake {
 
     async fn remove(&self, _task: &TaskName) -> Result<(), StepFailure> {
         assert!(self.state(|state| state.alive.is_empty()), "removed while it runs");
-        Ok(())
+        self.state(|state| state.removal.clone()).map_or(Ok(()), Err)
     }
 }
 

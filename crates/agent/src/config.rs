@@ -1,6 +1,7 @@
 //! The robot's property file, `agent.toml` in the data directory, and the `TASK_AGENT_*` variables above it:
 //! environment > file > defaults. Unknown keys are refused by name. It is read once, at start; it never holds a secret.
 
+use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -10,6 +11,7 @@ use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
 use task_proto::RobotName;
 use task_proto::envelope::PublicKey;
+use task_proto::expected::in_file_words;
 use task_proto::id::Labels;
 use task_proto::log::LogLevel;
 use task_proto::publisher::{InvalidRole, Role};
@@ -292,6 +294,7 @@ impl Config {
         // The file first, alone, so that an error names where it is.
         let _: Settings = deserialize(table.clone(), &path.display().to_string())?;
         let mut ros_domain_id = None;
+        let mut given = BTreeSet::new();
         for (name, value) in variables {
             // Others may hold any bytes. In a setting's value a wrong character becomes one that its type refuses.
             let (name, value) = (name.to_string_lossy(), value.to_string_lossy());
@@ -303,10 +306,18 @@ impl Config {
             }
             override_by(&mut table, &name, &value)?;
             let _: Settings = deserialize(table.clone(), &name)?;
+            given.insert(name.into_owned());
         }
         let mut settings: Settings = deserialize(table, "the settings")?;
         settings.ros_domain_id = settings.ros_domain_id.or(ros_domain_id);
-        Self::from_settings(settings)
+        Self::from_settings(settings).map_err(|error| match error {
+            ConfigError::Invalid { origin: key, reason } => {
+                let variable = format!("{VARIABLE_PREFIX}{}", key.replace('.', "_").to_ascii_uppercase());
+                let in_file = || format!("{key} in {}", path.display());
+                ConfigError::Invalid { origin: given.take(&variable).unwrap_or_else(in_file), reason }
+            }
+            other => other,
+        })
     }
 
     fn from_settings(settings: Settings) -> Result<Self, ConfigError> {
@@ -405,11 +416,9 @@ fn trust(settings: PublisherSettings) -> Result<TrustSettings, ConfigError> {
 /// A server's URL as people write it.
 pub fn parse_server(text: &str) -> Result<reqwest::Url, ConfigError> {
     let fault = |reason: String| ConfigError::Invalid { origin: "server".to_owned(), reason };
-    let url: reqwest::Url = text.parse().map_err(|error| fault(format!("{text:?} is no URL: {error}")))?;
-    if !matches!(url.scheme(), "http" | "https") || url.host_str().is_none() {
-        return Err(fault(format!("{text:?} is no URL of a server like http://server:8080")));
-    }
-    Ok(url)
+    let is_servers = |url: &reqwest::Url| matches!(url.scheme(), "http" | "https") && url.host_str().is_some();
+    let url = text.parse().ok().filter(is_servers);
+    url.ok_or_else(|| fault(format!("{text:?} is no URL of a server like https://server:8080")))
 }
 
 /// Puts one variable's value where its key is: `TASK_AGENT_LIMITS_LOG_BYTES` is `limits.log_bytes`.
@@ -470,7 +479,8 @@ fn deserialize(table: Table, origin: &str) -> Result<Settings, ConfigError> {
 }
 
 fn invalid(origin: &str, error: &dyn std::fmt::Display) -> ConfigError {
-    ConfigError::Invalid { origin: origin.to_owned(), reason: error.to_string().trim_end().to_owned() }
+    let lines: Vec<String> = error.to_string().trim_end().lines().map(in_file_words).collect();
+    ConfigError::Invalid { origin: origin.to_owned(), reason: lines.join("\n") }
 }
 
 #[cfg(test)]
@@ -530,10 +540,34 @@ mod tests {
         assert!(text("ros_domain_id = 400\n", &[]).contains("ros_domain_id"));
         assert!(text("", &[("ROS_DOMAIN_ID", "233")]).contains("ROS_DOMAIN_ID: \"233\""));
         assert!(text("poll_interval_s = 0\n", &[]).contains("poll_interval_s"));
-        assert!(text("[limits]\nlog_bytes = 1\n", &[]).starts_with("limits.log_bytes: 1 is not between 4096 and "));
-        assert!(text("", &[("TASK_AGENT_LIMITS_PARALLEL_TASKS", "65")]).starts_with("limits.parallel_tasks: 65"));
+        let low = text("[limits]\nlog_bytes = 1\n", &[]);
+        assert!(
+            low.starts_with("limits.log_bytes in /") && low.contains("agent.toml: 1 is not between 4096 and "),
+            "{low}"
+        );
+        let variable = "TASK_AGENT_LIMITS_PARALLEL_TASKS";
+        assert!(text("", &[(variable, "65")]).starts_with("TASK_AGENT_LIMITS_PARALLEL_TASKS: 65 is not between"));
+        let typed = text("poll_interval_s = \"soon\"\n", &[]);
+        assert!(typed.contains("expected a whole number\nin `poll_interval_s`"), "{typed}");
+        assert!(text("server = \"foo\"\n", &[]).contains("agent.toml: \"foo\" is no URL of a server like https://"));
         assert!(text("[logs]\nforward_level = \"loud\"\n", &[]).contains("forward_level"));
-        assert!(text("", &[("TASK_AGENT_LOGS_FORWARD_LINES_PER_S", "100000")]).contains("logs.forward_lines_per_s"));
+        let variable = "TASK_AGENT_LOGS_FORWARD_LINES_PER_S";
+        assert!(text("", &[(variable, "100000")]).starts_with("TASK_AGENT_LOGS_FORWARD_LINES_PER_S: 100000 is not"));
+    }
+
+    #[test]
+    fn every_setting_is_in_its_table() {
+        let table = include_str!("../../../docs/agent.md");
+        let missing = load("unknown = 1\n", &[]).expect_err("refused").to_string();
+        let (_, keys) = missing.split_once("expected one of ").expect("all are named");
+        let keys = keys.lines().next().unwrap_or_default().split(", ").map(|key| key.trim_matches('`').to_owned());
+        let limits = RobotLimits::default().bounds().map(|(key, ..)| key.trim_start_matches("limits.").to_owned());
+        let mut count = 0;
+        for key in keys.chain(limits) {
+            assert!(table.contains(&format!("`{key}`")) || table.contains(&format!("`[{key}]`")), "{key}");
+            count += 1;
+        }
+        assert!(count > 20, "{missing}");
     }
 
     #[test]
@@ -569,9 +603,14 @@ mod tests {
         let trust = load("", &variables).expect("valid").trust.expect("given");
         assert_eq!((trust.publishers.threshold(), trust.keepers.keys().len(), trust.requires_list), (1, 1, true));
         let text = |file: &str| load(file, &[]).expect_err("refused").to_string();
-        assert!(text("[trusted_publishers]\n").starts_with("trusted_publishers.keys: 0 keys"));
-        assert!(text(&table("threshold = 3\n")).starts_with("trusted_publishers.threshold: a threshold of 3"));
-        assert!(text(&table("keeper_threshold = 1\n")).starts_with("trusted_publishers.keeper_keys: 0 keys"));
+        for (file, key, reason) in [
+            ("[trusted_publishers]\n", "keys", "0 keys"),
+            (&table("threshold = 3\n"), "threshold", "a threshold of 3"),
+            (&table("keeper_threshold = 1\n"), "keeper_keys", "0 keys"),
+        ] {
+            let text = text(file);
+            assert!(text.starts_with(&format!("trusted_publishers.{key} in ")) && text.contains(reason), "{text}");
+        }
         assert!(text("[trusted_publishers]\nkeys = [\"ssh-ed25519 AAAA\"]\n").contains("not an ed25519 public key"));
         assert!(text(&table("treshold = 1\n")).contains("treshold"));
     }

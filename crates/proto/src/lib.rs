@@ -7,6 +7,7 @@ pub mod checkup;
 pub mod desired;
 pub mod digest;
 pub mod envelope;
+pub mod expected;
 pub mod id;
 pub mod line;
 pub mod log;

@@ -123,6 +123,12 @@ impl InvalidSetting {
 }
 
 impl RobotSettings {
+    /// Whether there is a setting of this key, like `workspace` or `limits.log_bytes`.
+    pub fn has(key: &str) -> bool {
+        ["underlays", "workspace", "ros_domain_id", "forward_level"].contains(&key)
+            || RobotLimits::default().bounds().iter().any(|(known, ..)| *known == key)
+    }
+
     /// Whether nothing is set.
     pub fn is_empty(&self) -> bool {
         *self == Self::default()

@@ -301,9 +301,8 @@ impl Config {
         }
         config.apply_environment(&environment)?;
         for (name, text) in &flags.settings {
-            // A broker's URL always has a password. A file's name may hold an '@', but is no one else's secret.
-            let has_password = text.split_once("://").is_some_and(|(_, rest)| rest.contains('@'));
-            if *name == "broker" && text != "embedded" || *name == "database" && has_password {
+            // A broker's URL always has a password.
+            if *name == "broker" && text != "embedded" || *name == "database" && has_password(text) {
                 return Err(ConfigError::PasswordInSight { name });
             }
             config.apply(&name.replace('-', "_"), text, Origin::Flag(format!("--{name}")))?;
@@ -476,6 +475,11 @@ pub fn lifetime(text: &str) -> Result<Duration, String> {
     }
 }
 
+/// Reads how many, which is at least one.
+pub fn at_least_one(text: &str) -> Result<u64, String> {
+    text.parse().ok().filter(|count| *count > 0).ok_or_else(|| "expected a whole number, 1 or more".to_owned())
+}
+
 /// Reads a whole number with a unit of time: `ms`, `s`, `m`, `h` or `d`. A number alone means seconds.
 pub fn parse_duration(text: &str) -> Option<Duration> {
     let split = text.find(|c: char| !c.is_ascii_digit()).unwrap_or(text.len());
@@ -499,6 +503,14 @@ fn nearest(key: &str) -> String {
         Some(best) if shared(&best) >= 3 => format!("; {best} is the closest one"),
         _ => String::new(),
     }
+}
+
+/// Whether a database's URL has a password: `user:password@`, or in its query. A file's name may hold an `@`.
+fn has_password(url: &str) -> bool {
+    let Some(("postgres" | "postgresql", rest)) = url.split_once("://") else { return false };
+    let (place, query) = rest.split_once('?').unwrap_or((rest, ""));
+    let user = place.rsplit_once('@').map_or("", |(user, _)| user);
+    user.contains(':') || query.split('&').any(|pair| pair.starts_with("password="))
 }
 
 #[cfg(test)]
@@ -624,6 +636,14 @@ mod tests {
 
     #[test]
     fn a_database_password_is_not_repeated() {
+        for (url, is_secret) in [
+            ("postgres://ada:secret@host/db", true),
+            ("postgresql://host/db?user=ada&password=secret", true),
+            ("postgres://ada@host/db?sslmode=require", false),
+            ("sqlite:///var/lib/a:b@c/taskd.sqlite", false),
+        ] {
+            assert_eq!(load(&[("database", url)], &[], None).is_err(), is_secret, "{url}");
+        }
         let message = load(&[("database", "mysql://ada:secret@host/db")], &[], None).expect_err("refused");
         assert!(!message.contains("secret"), "{message}");
     }

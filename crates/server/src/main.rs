@@ -62,8 +62,9 @@ async fn serve(flags: &ServeFlags) -> anyhow::Result<ExitCode> {
     // Installed before anything is started, so that an early signal stops it softly as well.
     let mut signals = Signals::install().context("signals can't be caught")?;
     let mut hangup = signal(SignalKind::hangup()).context("signals can't be caught")?;
+    let has_own_broker = config.broker.is_none();
     let server = Server::start(config, Clock::system()).await?;
-    say_what_next(&server);
+    say_what_next(&server, has_own_broker);
     let code = loop {
         tokio::select! {
             () = signals.next() => break ExitCode::SUCCESS,
@@ -110,20 +111,23 @@ fn fit_to(config: &mut Config, files: usize) {
 }
 
 /// On stdout: where the server is, and the first three things to do with it.
-fn say_what_next(server: &Server) {
+fn say_what_next(server: &Server, has_own_broker: bool) {
     let addresses = server.addresses();
     let url = addresses.url();
     let data = server.data().path().display();
     let token = server.data().operator_token_path();
     let text = format!(
-        "taskd serves HTTP on {url} and MQTT on {mqtt}, all its state is in {data}\n\
+        "taskd serves HTTP on {url} {mqtt}, all its state is in {data}\n\
          \n\
          The page:        {url}/   (sign in with the token in {token})\n\
          A robot:         taskd enroll-token create --data {data}\n\
          \x20                task-agent enroll --server {url} --token TOKEN\n\
          A first package: taskd push DIR --to '*' --wait --data {data}\n\
          {elsewhere}",
-        mqtt = addresses.mqtt,
+        mqtt = match has_own_broker {
+            true => format!("and MQTT on {}", addresses.mqtt),
+            false => format!("and uses the broker at {}", addresses.mqtt),
+        },
         elsewhere = addresses
             .ca_pin
             .map(|pin| format!("Commands from elsewhere: taskd --pin {pin} --server …\n"))

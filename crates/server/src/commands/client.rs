@@ -1,6 +1,7 @@
 //! The server's API as the commands see it: one call, one method. It retries what may pass (a lost connection, a 5xx),
 //! always with the same idempotency key, and turns every refusal into an error with the server's own words.
 
+use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -14,7 +15,7 @@ use task_proto::token::{InvalidToken, Token};
 use task_proto::{CaPin, RobotName};
 use task_transport::Trust;
 
-use super::login::{kept_pin, kept_token};
+use super::login::{kept_pin, kept_token, last_server};
 use super::output::printable;
 use super::{CommandError, Connection, Outcome};
 use crate::clock::Clock;
@@ -43,10 +44,12 @@ pub enum ClientError {
         message: String,
     },
     /// It could not be reached, or went away.
-    #[error("can't reach the server at {url}")]
+    #[error("can't reach the server at {url}{hint}")]
     Unreachable {
         /// Where it should be.
         url: String,
+        /// What to try instead, if that can be told; in brackets.
+        hint: &'static str,
         /// Why.
         source: reqwest::Error,
     },
@@ -60,10 +63,13 @@ pub enum ClientError {
     },
     /// No token was given.
     #[error(
-        "no token: sign in with taskd login NAME, give --token or --token-file, set TASKD_TOKEN, or point --data at the \
-         server's data directory"
+        "no token for {url}: sign in with taskd login NAME, give --token or --token-file, set TASKD_TOKEN, or, where the \
+         server runs, point --data at its data directory"
     )]
-    NoToken,
+    NoToken {
+        /// Of which server.
+        url: String,
+    },
     /// The token file can't be read.
     #[error("can't read the token file {}", path.display())]
     TokenFile {
@@ -86,6 +92,12 @@ pub enum ClientError {
         /// What was given.
         url: String,
     },
+    /// A pin for a server that would be spoken to unencrypted.
+    #[error("--pin: {url} does not encrypt, so nothing there can be recognised by a pin; use https://")]
+    PinInPlainText {
+        /// What was given.
+        url: String,
+    },
 }
 
 impl ClientError {
@@ -94,10 +106,11 @@ impl ClientError {
         match self {
             Self::Refused { status: StatusCode::UNAUTHORIZED | StatusCode::FORBIDDEN, .. } => Outcome::NotAllowed,
             Self::Refused { status: StatusCode::BAD_REQUEST | StatusCode::UNPROCESSABLE_ENTITY, .. }
-            | Self::NoToken
+            | Self::NoToken { .. }
             | Self::TokenFile { .. }
             | Self::Token { .. }
-            | Self::Url { .. } => Outcome::Usage,
+            | Self::Url { .. }
+            | Self::PinInPlainText { .. } => Outcome::Usage,
             Self::Refused { code, .. } if code == "no_robots_match" => Outcome::Usage,
             Self::Refused { .. } | Self::Unreachable { .. } | Self::NotTheServer { .. } => Outcome::Failed,
         }
@@ -140,12 +153,17 @@ impl Client {
         let data = data_directory(connection);
         let (base, known_pin) = match &connection.server {
             Some(url) => (url.trim_end_matches('/').to_owned(), None),
-            None => local_server(data.as_deref()).unwrap_or_else(|| ("http://127.0.0.1:8080".to_owned(), None)),
+            None => local_server(data.as_deref())
+                // What was signed in to elsewhere is not meant by who names a directory here.
+                .or_else(|| connection.data.is_none().then(last_server).flatten().map(|base| (base, None)))
+                .unwrap_or_else(|| ("http://127.0.0.1:8080".to_owned(), None)),
         };
-        let is_http = reqwest::Url::parse(&base)
-            .is_ok_and(|url| matches!(url.scheme(), "http" | "https") && url.has_host() && url.query().is_none());
-        if !is_http {
-            return Err(ClientError::Url { url: base }.into());
+        let url = reqwest::Url::parse(&base).ok();
+        let is_http =
+            |url: &reqwest::Url| matches!(url.scheme(), "http" | "https") && url.has_host() && url.query().is_none();
+        let Some(url) = url.filter(is_http) else { return Err(ClientError::Url { url: base }.into()) };
+        if connection.pin.is_some() && url.scheme() == "http" {
+            return Err(ClientError::PinInPlainText { url: base }.into());
         }
         let trust = Trust::by(connection.pin.or(known_pin).or_else(|| kept_pin(&base)));
         let http = reqwest::Client::builder()
@@ -154,7 +172,7 @@ impl Client {
             .redirect(reqwest::redirect::Policy::none())
             .user_agent(concat!("taskd/", env!("CARGO_PKG_VERSION")))
             .build()
-            .map_err(|source| ClientError::Unreachable { url: base.clone(), source })?;
+            .map_err(|source| ClientError::Unreachable { url: base.clone(), hint: "", source })?;
         Ok(Self { http, base, token: None, trust })
     }
 
@@ -354,11 +372,26 @@ impl Client {
 
     pub(crate) fn unreachable(&self, source: reqwest::Error) -> ClientError {
         // The URL is in our own text; in reqwest's it would only be said twice.
-        ClientError::Unreachable { url: self.base.clone(), source: source.without_url() }
+        let hint = hint(&self.base, &source);
+        ClientError::Unreachable { url: self.base.clone(), hint, source: source.without_url() }
     }
 
     pub(crate) fn not_the_server(&self, status: StatusCode) -> ClientError {
         ClientError::NotTheServer { url: self.base.clone(), status }
+    }
+}
+
+/// What to try instead where the server was spoken to in the wrong way, as far as its answer tells.
+fn hint(base: &str, error: &reqwest::Error) -> &'static str {
+    let causes = std::iter::successors(std::error::Error::source(error), |cause| cause.source());
+    let said = causes.map(ToString::to_string).collect::<Vec<_>>().join(": ");
+    match base.starts_with("https:") {
+        false if said.contains("invalid HTTP version") => " (it seems to encrypt: try https://)",
+        true if said.contains("InvalidContentType") => " (it does not seem to encrypt: try http://)",
+        true if said.contains("UnknownIssuer") => {
+            " (nobody known here vouches for its certificate: give the pin that taskd serve printed, as --pin)"
+        }
+        _ => "",
     }
 }
 
@@ -400,8 +433,14 @@ pub(super) fn data_directory(connection: &Connection) -> Option<PathBuf> {
 
 /// What was said wins, then what was signed in to, then what lies where a server on this machine would put it.
 fn find_token(connection: &Connection, data: Option<&Path>, base: &str) -> Result<Token, ClientError> {
-    let is_said = connection.token.is_some() || connection.token_file.is_some() || connection.data.is_some();
-    if !is_said && let Some(token) = kept_token(base) {
+    // Of a directory only the server that serves from it is shown the token.
+    let data = data.filter(|data| serves_from(data, base));
+    let is_said = connection.token.is_some() || connection.token_file.is_some();
+    let names_data = connection.data.is_some() && data.is_some();
+    if !is_said
+        && !names_data
+        && let Some(token) = kept_token(base)
+    {
         return Ok(token);
     }
     let (text, origin) = match (&connection.token_file, &connection.token, data) {
@@ -410,13 +449,28 @@ fn find_token(connection: &Connection, data: Option<&Path>, base: &str) -> Resul
         (None, None, Some(data)) => {
             let path = data.join("operator.token");
             if connection.data.is_none() && !path.exists() {
-                return Err(ClientError::NoToken);
+                return Err(ClientError::NoToken { url: base.to_owned() });
             }
             (read_token(&path)?, path.display().to_string())
         }
-        (None, None, None) => return Err(ClientError::NoToken),
+        (None, None, None) => return Err(ClientError::NoToken { url: base.to_owned() }),
     };
     text.parse().map_err(|source| ClientError::Token { origin, source })
+}
+
+/// Whether what is reached at `base` serves from `data`, as far as can be told: by the addresses that are kept there, or,
+/// if it does not run, on this machine at all.
+fn serves_from(data: &Path, base: &str) -> bool {
+    let local = local_server(Some(data)).map(|(url, _)| url);
+    let port = |url: &str| reqwest::Url::parse(url).ok().and_then(|url| url.port_or_known_default());
+    let is_here = reqwest::Url::parse(base).is_ok_and(|url| {
+        let host = url.host_str().unwrap_or_default().trim_matches(['[', ']']);
+        host == "localhost" || host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback())
+    });
+    match local {
+        Some(local) => local == base || (is_here && port(&local) == port(base)),
+        None => is_here,
+    }
 }
 
 fn read_token(path: &Path) -> Result<String, ClientError> {
@@ -513,6 +567,56 @@ mod tests {
         let client = client(busy_server().await);
         let answer = client.get::<Vec<String>>("/page", &[]).await;
         assert!(matches!(answer, Err(ClientError::NotTheServer { .. })), "{answer:?}");
+    }
+
+    #[test]
+    fn a_directorys_token_is_shown_to_its_own_server_only() {
+        let dir = tempfile::tempdir().unwrap();
+        let token = Token::random(task_proto::token::TokenKind::Operator).reveal();
+        std::fs::write(dir.path().join("operator.token"), token).unwrap();
+        let addresses = dir.path().join("addresses.json");
+        std::fs::write(&addresses, r#"{"http":"10.0.0.7:8081","mqtt":"10.0.0.7:1884"}"#).unwrap();
+        let mut connection = Connection {
+            server: None,
+            token: None,
+            pin: None,
+            token_file: None,
+            data: Some(dir.path().display().to_string()),
+            output: super::super::Format::Json,
+        };
+        let mut finds = |server: Option<&str>| {
+            connection.server = server.map(str::to_owned);
+            match Client::connect(&connection) {
+                Ok(client) => client.token.is_some(),
+                Err(CommandError::Client(ClientError::NoToken { .. })) => false,
+                Err(other) => panic!("{other}"),
+            }
+        };
+        for own in [None, Some("http://10.0.0.7:8081"), Some("http://localhost:8081"), Some("http://[::1]:8081/")] {
+            assert!(finds(own), "{own:?}");
+        }
+        for other in ["https://10.0.0.8:8081", "http://localhost.example:8081", "http://127.0.0.1:9"] {
+            assert!(!finds(Some(other)), "{other}");
+        }
+        std::fs::remove_file(addresses).unwrap();
+        assert!(finds(None) && finds(Some("http://127.0.0.1:9")), "none runs: it may have run there");
+        assert!(!finds(Some("http://10.0.0.7:8081")));
+    }
+
+    #[tokio::test]
+    async fn what_is_asked_in_the_wrong_way_is_told_the_right_one() {
+        let plain = busy_server().await;
+        let client = |url: String, pin: Option<CaPin>| {
+            let data = None;
+            let token = Some(Token::random(task_proto::token::TokenKind::Operator).reveal());
+            let output = super::super::Format::Json;
+            Client::connect(&Connection { server: Some(url), token, pin, token_file: None, data, output })
+        };
+        let error = client(format!("https://{plain}"), None).unwrap().delete("/refused").await.unwrap_err();
+        assert!(error.to_string().ends_with("(it does not seem to encrypt: try http://)"), "{error}");
+        let refused = client(format!("http://{plain}"), Some(CaPin::of(b"an authority's key"))).err().unwrap();
+        assert!(refused.to_string().starts_with("--pin: http://127.0.0.1:"), "{refused}");
+        assert_eq!(refused.outcome(), Outcome::Usage);
     }
 
     #[test]

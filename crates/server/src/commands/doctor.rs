@@ -40,8 +40,12 @@ pub(super) async fn run(connection: &Connection) -> Result<Outcome, CommandError
         certificate(&mut checkup, &client).await;
         known_to(&mut checkup, connection).await;
     }
-    if let Some(data) = data.filter(|data| data.exists()) {
-        doctor_here::check(&mut checkup, &data, is_up);
+    match data {
+        Some(data) if data.exists() => doctor_here::check(&mut checkup, &data, is_up),
+        Some(data) if connection.data.is_some() => {
+            checkup.bad("data", format!("{} does not exist", data.display()), "look at --data and TASKD_DATA");
+        }
+        _ => {}
     }
     print(&Output::new(connection.output), &checkup)?;
     Ok(if checkup.is_healthy() { Outcome::Succeeded } else { Outcome::Failed })

@@ -3,11 +3,12 @@
 
 use std::io;
 use std::net::{SocketAddr, TcpListener};
+use std::os::unix::fs::MetadataExt as _;
 use std::path::Path;
 
 use nix::sys::resource::{Resource, getrlimit};
 use nix::sys::statvfs::statvfs;
-use nix::unistd::{AccessFlags, access};
+use nix::unistd::{AccessFlags, access, geteuid};
 use task_proto::checkup::Checkup;
 
 use super::output::bytes;
@@ -23,6 +24,13 @@ const OTHER_FILES: u64 = 500;
 
 /// Looks at `data`, and at what a server there would need if none answers.
 pub(super) fn check(checkup: &mut Checkup, data: &Path, is_up: bool) {
+    if let Some(owner) = anothers(data) {
+        return checkup.notice(
+            "data",
+            format!("{} is user {owner}'s, and this account must not look into it", data.display()),
+            "run taskd doctor as that user to have the directory, the disk and the limits looked at",
+        );
+    }
     directory(checkup, data);
     disk(checkup, data);
     let flags = ServeFlags { config: None, settings: vec![("data", data.display().to_string())] };
@@ -35,6 +43,13 @@ pub(super) fn check(checkup: &mut Checkup, data: &Path, is_up: bool) {
         }
         Err(error) => checkup.bad("settings", error.to_string(), "mend the setting that it names"),
     }
+}
+
+/// Whose the directory is, if it is closed to this account because it is another's.
+fn anothers(data: &Path) -> Option<u32> {
+    let owner = std::fs::metadata(data).ok()?.uid();
+    let is_closed = access(data, AccessFlags::R_OK | AccessFlags::X_OK).is_err();
+    (is_closed && owner != geteuid().as_raw()).then_some(owner)
 }
 
 fn directory(checkup: &mut Checkup, data: &Path) {

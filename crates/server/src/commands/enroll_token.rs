@@ -10,7 +10,7 @@ use task_proto::id::{LabelKey, LabelValue};
 use super::output::{say, time};
 use super::table::Columns;
 use super::{CommandError, Outcome, Session, complete};
-use crate::config::lifetime;
+use crate::config::{at_least_one, lifetime};
 
 /// What to do with enrolment tokens.
 #[derive(Debug, Subcommand)]
@@ -21,7 +21,7 @@ pub enum Action {
         #[arg(long, value_name = "ROBOT", add = complete::robots())]
         robot: Option<String>,
         /// How many enrolments it is good for [default: any number]
-        #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+        #[arg(long, value_name = "N", value_parser = at_least_one)]
         uses: Option<u64>,
         /// How long it lives, like 2h or 7d [default: 1d]
         #[arg(long, value_name = "TIME", value_parser = lifetime)]

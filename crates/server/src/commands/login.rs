@@ -41,6 +41,7 @@ pub(super) async fn log_in(connection: &Connection, order: LoginOrder) -> Result
     let token: AccessToken = client.once("/login", &request).await?;
     let mut kept = Kept::read(&path)?;
     kept.servers.insert(client.base().to_owned(), token.token);
+    kept.last = Some(client.base().to_owned());
     if let Some(pin) = connection.pin {
         kept.pins.insert(client.base().to_owned(), pin);
     }
@@ -57,6 +58,7 @@ pub(super) async fn log_out(connection: &Connection) -> Result<Outcome, CommandE
     let Some(token) = kept.servers.remove(&base) else {
         return Err(CommandError::Usage(format!("you are not signed in at {base}")));
     };
+    kept.last.take_if(|last| *last == base);
     kept.write(&path)?;
     let client = Client::with_token(connection, &token)?;
     // It may have ended by itself, which comes to the same.
@@ -77,6 +79,11 @@ pub(super) fn kept_pin(base: &str) -> Option<CaPin> {
     Kept::read(&path()?).ok()?.pins.remove(base)
 }
 
+/// The server that was signed in to last, unless it was signed out of.
+pub(super) fn last_server() -> Option<String> {
+    Kept::read(&path()?).ok()?.last
+}
+
 /// `credentials.json`: tokens by the server's URL.
 #[derive(Default, Serialize, Deserialize)]
 struct Kept {
@@ -84,6 +91,9 @@ struct Kept {
     /// The pins that were given with them.
     #[serde(default)]
     pins: BTreeMap<String, CaPin>,
+    /// The server that is meant where none is named.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    last: Option<String>,
 }
 
 fn path() -> Option<PathBuf> {

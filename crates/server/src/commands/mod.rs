@@ -181,13 +181,13 @@ pub enum Command {
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Asking the server")]
 pub struct Connection {
-    /// The server's URL [default: the server of --data, else http://127.0.0.1:8080]
+    /// The server's URL [default: the server of --data, else that of the last taskd login, else http://127.0.0.1:8080]
     #[arg(long, env = "TASKD_SERVER", value_name = "URL", global = true)]
     pub server: Option<String>,
     /// The pin of the server's certificate authority [default: that of taskd login or of the server of --data, else the system's roots]
     #[arg(long, env = "TASKD_PIN", value_name = "PIN", global = true)]
     pub pin: Option<CaPin>,
-    /// A person's token [default: that of taskd login, else operator.token in --data]
+    /// A person's token [default: operator.token of the server that --data names, else that of taskd login]
     #[arg(long, env = "TASKD_TOKEN", value_name = "TOKEN", hide_env_values = true, global = true)]
     pub token: Option<String>,
     /// A file that holds the token

@@ -14,7 +14,7 @@ use task_proto::selector::Selector;
 use super::confirm::confirm;
 use super::output::{Output, bytes, robots, say};
 use super::{CommandError, Outcome, Session, client, complete, robot, upload, view, wait};
-use crate::config::lifetime;
+use crate::config::{at_least_one, lifetime};
 use crate::key_file;
 use crate::package::{self, Launch, Packed};
 
@@ -34,7 +34,7 @@ pub struct Push {
     #[arg(long, value_name = "TIME", value_parser = lifetime, default_value = "10m", requires = "to")]
     timeout: Duration,
     /// So many robots at a time [default: all at once]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..), requires = "to")]
+    #[arg(long, value_name = "N", value_parser = at_least_one, requires = "to")]
     batch: Option<u64>,
     /// Pause when more robots than this have failed [default: never]
     #[arg(long, value_name = "N", requires = "to")]

@@ -2,7 +2,7 @@
 
 use std::str::FromStr;
 
-use clap::Subcommand;
+use clap::{ArgGroup, Subcommand};
 use task_proto::RobotName;
 use task_proto::api::{
     BulkLabels, BulkRemove, EditRobot, MatchedRobot, MatchedRobots, PendingRobotList, RobotList, RobotView,
@@ -37,15 +37,16 @@ pub enum Action {
         robot: RobotName,
     },
     /// Change a robot's name or settings
+    #[command(group = ArgGroup::new("change").required(true).multiple(true).args(["name", "settings", "unset"]))]
     Edit {
         /// Its name or id
         #[arg(add = complete::robots())]
         robot: RobotName,
         /// The name it has from now on
-        #[arg(long, value_name = "NAME", required_unless_present_any = ["settings", "unset"])]
+        #[arg(long, value_name = "NAME")]
         name: Option<RobotName>,
-        /// A setting by its key in agent.toml: underlays, workspace, ros_domain_id, forward_level or limits.…; what the robot
-        /// has of its own wins; may be repeated
+        /// A setting: underlays, workspace, ros_domain_id, forward_level or limits.…; what the robot has of its own in
+        /// agent.toml wins; may be repeated
         #[arg(long = "set", value_name = "KEY=VALUE")]
         settings: Vec<Setting>,
         /// The key of a setting that the robot is to have no more from here; may be repeated

@@ -3,6 +3,7 @@
 use std::str::FromStr;
 
 use serde_json::{Map, Value};
+use task_proto::expected::in_file_words;
 use task_proto::settings::RobotSettings;
 
 use super::CommandError;
@@ -37,22 +38,22 @@ pub(super) fn changed(
         Ok(Value::Object(values)) => values,
         _ => Map::new(),
     };
+    let wrong = |text: String| CommandError::Usage(text);
     for key in unset {
+        if !RobotSettings::has(key) {
+            return Err(wrong(format!("{key}: there is no such setting")));
+        }
         put(&mut values, key, None);
     }
     for Setting { key, value } in set {
-        put(&mut values, key, Some(typed(key, value)));
-    }
-    let wrong = |text: String| CommandError::Usage(text);
-    let read: RobotSettings = serde_path_to_error::deserialize(Value::Object(values))
-        .map_err(|error| wrong(format!("{}: {}", error.path(), error.inner())))?;
-    read.check().map_err(|error| wrong(error.to_string()))?;
-    let kept = serde_json::to_value(&read).unwrap_or_default();
-    for key in set.iter().map(|setting| &setting.key) {
-        if kept.pointer(&format!("/{}", key.replace('.', "/"))).is_none() {
+        if !RobotSettings::has(key) {
             return Err(wrong(format!("{key}: there is no such setting")));
         }
+        put(&mut values, key, Some(typed(key, value)));
     }
+    let read: RobotSettings = serde_path_to_error::deserialize(Value::Object(values))
+        .map_err(|error| wrong(format!("{}: {}", error.path(), in_file_words(&error.inner().to_string()))))?;
+    read.check().map_err(|error| wrong(error.to_string()))?;
     Ok((!read.is_empty()).then_some(read))
 }
 
@@ -136,10 +137,13 @@ mod tests {
             ("workspace=ws", "workspace: "),
             ("ros_domain_id=400", "ros_domain_id: 400 is not between"),
             ("ros_domain_id=x", "ros_domain_id: "),
+            ("limits.log_bytes=1MB", "limits.log_bytes: invalid type: string \"1MB\", expected a whole number"),
         ] {
             let error = set(&[text]).expect_err(text);
             assert!(error.starts_with(said), "{text}: {error}");
         }
         assert!("workspace".parse::<Setting>().is_err());
+        let error = changed(None, &[], &["workspce".to_owned()]).expect_err("no such setting");
+        assert_eq!(error.to_string(), "workspce: there is no such setting");
     }
 }

@@ -77,8 +77,7 @@ pub(super) async fn pending(State(app): State<App>) -> Result<Json<PendingRobotL
 }
 
 /// Lets a robot in that waits.
-#[utoipa::path(post, path = "/api/v1/robots/{robot}/approve", tag = "enrolment",
-    responses((status = 409, description = "`not_pending`: it does not wait.")))]
+#[utoipa::path(post, path = "/api/v1/robots/{robot}/approve", tag = "enrolment")]
 pub(super) async fn approve(
     State(app): State<App>,
     by: Person,

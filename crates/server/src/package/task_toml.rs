@@ -4,6 +4,7 @@
 use std::collections::BTreeMap;
 
 use serde::de::DeserializeOwned;
+use task_proto::expected::in_file_words;
 use task_proto::manifest::{BuildTool, Limits, Outputs, Ready, ReadyTopic, Requires, Run};
 use task_proto::{TaskName, Version};
 
@@ -109,7 +110,7 @@ impl Section<'_> {
             Ok(value) => *slot = value,
             Err(error) => {
                 let error: toml::de::Error = error;
-                self.problem(key, format!("{} (it is {written})", error.message().trim_end()));
+                self.problem(key, format!("{} (it is {written})", in_file_words(error.message().trim_end())));
             }
         }
     }
@@ -297,7 +298,7 @@ mod tests {
             "task.toml: zzz: there is no such key (known here: name, version, build, run,",
             "task.toml: version: invalid type: integer `1`, expected a string (it is 1)",
             "task.toml: run.kindd: there is no such key (did you mean run.kind?)",
-            "task.toml: run.exec: invalid type: string \"true\", expected a sequence",
+            "task.toml: run.exec: invalid type: string \"true\", expected a list",
             "task.toml: run.restart: unknown variant `sometimes`, expected one of `on-failure`, `always`, `never`",
             "task.toml: ready.hold_s: ",
             "task.toml: outputs.paths: ",

@@ -36,7 +36,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use sqlx::any::{Any, AnyPoolOptions};
-use sqlx::{AnyConnection, AnyPool, Transaction};
+use sqlx::migrate::MigrateError;
+use sqlx::{AnyConnection, AnyPool, Connection as _, Transaction};
 
 use access::{Access, Ending};
 pub use assignments::{Released, TaskOrder};
@@ -108,6 +109,14 @@ pub enum StoreError {
         url: String,
         /// Why.
         source: sqlx::migrate::MigrateError,
+    },
+    /// A later version of this program has brought its tables further.
+    #[error("database {url} was last used by a newer taskd (its tables are at {version}): install that one again")]
+    Newer {
+        /// Which, without its password.
+        url: String,
+        /// The migration that this program does not have.
+        version: i64,
     },
     /// A statement failed.
     #[error("the database refused a statement")]
@@ -192,9 +201,13 @@ impl Store {
     pub async fn open(url: &str) -> Result<Self, StoreError> {
         sqlx::any::install_default_drivers();
         let open_error = |source| StoreError::Open { url: without_password(url), source };
+        is_there(url).await.map_err(open_error)?;
         // One writer: its transactions queue for this connection instead of failing each other.
         let writes = pool_options(url, 1, WRITER_CACHE).connect(url).await.map_err(open_error)?;
-        migrate::run(&writes).await.map_err(|source| StoreError::Migrate { url: without_password(url), source })?;
+        migrate::run(&writes).await.map_err(|source| match source {
+            MigrateError::VersionMissing(version) => StoreError::Newer { url: without_password(url), version },
+            source => StoreError::Migrate { url: without_password(url), source },
+        })?;
         let reads = pool_options(url, READERS, READER_CACHE).connect(url).await.map_err(open_error)?;
         let is_postgres = url.starts_with("postgres");
         Ok(Self { reads, writes, access: Access::default(), first_uses: FirstUses::default(), is_postgres })
@@ -242,6 +255,15 @@ impl Store {
     }
 }
 
+/// Asks once without a pool, which would try until its patience is over and then say only that.
+async fn is_there(url: &str) -> Result<(), sqlx::Error> {
+    let mut connection = AnyConnection::connect(url).await?;
+    // SQLite reads its file no sooner.
+    let first = if url.starts_with("sqlite:") { "PRAGMA schema_version" } else { "SELECT 1" };
+    sqlx::raw_sql(first).execute(&mut connection).await?;
+    connection.close().await
+}
+
 fn pool_options(url: &str, connections: u32, cache: &'static str) -> AnyPoolOptions {
     let is_sqlite = url.starts_with("sqlite:");
     AnyPoolOptions::new().max_connections(connections).acquire_timeout(PATIENCE).after_connect(move |connection, _| {
@@ -280,6 +302,31 @@ mod tests {
         assert_eq!(without_password("postgres://u:p?ss@host/db"), "postgres://host/db");
         assert_eq!(without_password("postgres://host/db?password=secret"), "postgres://host/db");
         assert_eq!(without_password("sqlite:///a.db"), "sqlite:///a.db");
+    }
+
+    #[tokio::test]
+    async fn a_database_that_is_none_or_of_a_newer_program_is_called_so_at_once() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let refused = async |name: &str| {
+            let url = sqlite_url(&directory.path().join(name));
+            // Far below what a pool would wait for.
+            let opened = tokio::time::timeout(PATIENCE / 3, Store::open(&url)).await.expect("at once");
+            let error = opened.expect_err("refused");
+            format!("{error}: {}", std::error::Error::source(&error).map(ToString::to_string).unwrap_or_default())
+        };
+        std::fs::write(directory.path().join("torn"), vec![7; 8192]).expect("written");
+        let torn = refused("torn").await;
+        assert!(torn.contains("/torn can't be opened") && torn.contains("not a database"), "{torn}");
+        let missing = refused("no/such").await;
+        assert!(missing.contains("/no/such can't be opened"), "{missing}");
+        let url = sqlite_url(&directory.path().join("newer"));
+        let store = Store::open(&url).await.expect("opens");
+        let newer = "INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time)
+                     VALUES (9999, 'later', TRUE, x'00', 0)";
+        sqlx::query(newer).execute(&store.writes).await.expect("written");
+        store.close().await;
+        let newer = refused("newer").await;
+        assert!(newer.contains("a newer taskd (its tables are at 9999)"), "{newer}");
     }
 
     #[test]

@@ -202,13 +202,17 @@ async fn who_may_not_ask_is_told_apart_from_what_does_not_work() {
     bench.taskd(&["robot", "list", "--token", &other]).await.expect(4, "");
     bench.taskd(&["robot", "list", "--token", "secret"]).await.expect(2, "not a token");
     bench.taskd(&["robot", "list", "--server", "nonsense"]).await.expect(2, "--server");
+    bench
+        .taskd(&["robot", "list", "--server", "http://127.0.0.1:9"])
+        .await
+        .expect(2, "no token for http://127.0.0.1:9");
     bench.taskd(&["robot", "list", "--nonsense"]).await.expect(2, "--nonsense");
     let mut without = command(&list);
     without.env("HOME", "/nonexistent").env("XDG_DATA_HOME", "/nonexistent");
     run(without).await.expect(2, "no token");
     let nobody = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
     let nobody = format!("http://{nobody}");
-    bench.taskd(&["robot", "list", "--server", &nobody]).await.expect(1, "can't reach the server");
+    bench.taskd(&["robot", "list", "--token", &other, "--server", &nobody]).await.expect(1, "can't reach the server");
 }
 
 #[tokio::test(flavor = "multi_thread")]

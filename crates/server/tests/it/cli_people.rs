@@ -69,6 +69,9 @@ async fn a_user_is_added_signs_in_and_out() {
     let me = away.taskd(&["whoami", "-o", "json"]).await.expect(0, "").json();
     assert_eq!((&me["name"], &me["scope"][0]), (&Value::from("alice"), &Value::from("site=lab")));
     assert_eq!(me["permissions"], serde_json::json!(["read", "operate", "publish"]));
+    let mut anywhere = away.command(&["whoami"]);
+    anywhere.env_remove("TASKD_SERVER");
+    run(anywhere).await.expect(0, "");
     away.taskd(&["user", "list"]).await.expect(4, "alice has no permission to administer");
 
     let token = away.taskd(&["token", "create", "--title", "ci", "--role", "publisher"]).await.expect(0, "of alice");

@@ -1,0 +1,28 @@
+//! What a parser says it expected, in the words of the files that people write. It knows no file and no key.
+
+/// A message of serde's with its types named as TOML and JSON have them: `expected a sequence` becomes `expected a list`.
+///
+/// ```
+/// use task_proto::expected::in_file_words;
+/// assert_eq!(in_file_words("invalid type: string \"x\", expected a sequence"), "invalid type: string \"x\", expected a list");
+/// assert_eq!(in_file_words("invalid type: map, expected u64"), "invalid type: table, expected a whole number");
+/// ```
+pub fn in_file_words(message: &str) -> String {
+    // What was given stands before, in quotes, and may have any words.
+    let (given, expected) = message.rsplit_once(", expected ").unwrap_or((message, ""));
+    let given = match given {
+        "invalid type: sequence" => "invalid type: list",
+        "invalid type: map" => "invalid type: table",
+        other => other,
+    };
+    let expected = match expected {
+        "" => return given.to_owned(),
+        "a sequence" => "a list",
+        "a map" => "a table",
+        "a boolean" => "true or false",
+        "u8" | "u16" | "u32" | "u64" | "usize" | "i8" | "i16" | "i32" | "i64" => "a whole number",
+        "f32" | "f64" => "a number",
+        other => other,
+    };
+    format!("{given}, expected {expected}")
+}

@@ -274,7 +274,10 @@ fn missing_package(version: &VersionDir) -> Option<String> {
 /// The name in a `package.xml`. It was checked when the package was pushed, so looking for the element is enough. The build
 /// may have put anything in its place: what is no plain file is not read.
 fn package_name(path: &Path) -> Option<String> {
-    let text = String::from_utf8(foreign_file::read(path, MAX_PACKAGE_XML_BYTES).ok()?).ok()?;
+    let mut text = String::from_utf8(foreign_file::read(path, MAX_PACKAGE_XML_BYTES).ok()?).ok()?;
+    while let Some((before, rest)) = text.split_once("<!--") {
+        text = format!("{before}{}", rest.split_once("-->")?.1);
+    }
     let (_, rest) = text.split_once("<name>")?;
     let (name, _) = rest.split_once("</name>")?;
     let name = name.trim();

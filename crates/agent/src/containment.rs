@@ -13,7 +13,7 @@ use std::time::Duration;
 use nix::sys::signal::Signal;
 
 use crate::cgroup::Cgroup;
-use crate::process::{ProcessEntry, ProcessIdentity, boot_id};
+use crate::process::{ProcessEntry, ProcessIdentity, boot_id, environments};
 
 /// The variable by which a run's processes are found: the path of its run directory, which no other run shares, not
 /// even one of the same deployment by a second agent on this machine.
@@ -132,7 +132,10 @@ impl Containment {
     }
 
     /// Does what goes through the whole process table where nobody waits for it.
-    async fn in_background<T: Send + 'static>(&self, work: fn(&Self) -> io::Result<T>) -> io::Result<T> {
+    pub async fn in_background<T: Send + 'static>(
+        &self,
+        work: impl FnOnce(&Self) -> io::Result<T> + Send + 'static,
+    ) -> io::Result<T> {
         let own = self.clone();
         tokio::task::spawn_blocking(move || work(&own)).await.map_err(io::Error::from).flatten()
     }
@@ -144,17 +147,18 @@ impl Containment {
             Some(shim) if shim.is_alive() => descendants(&table, shim.pid),
             _ => HashSet::new(),
         };
-        let is_member = |entry: &&ProcessEntry| {
-            !entry.is_zombie && (below.contains(&entry.pid) || entry.was_started_with(&self.marker))
-        };
-        let mut members: Vec<_> = table.iter().filter(is_member).map(|entry| entry.identity(&boot_id)).collect();
-        let known: HashSet<u32> = members.iter().map(|member| member.pid).collect();
-        for entry in self.cgroup.as_ref().map_or(Ok(Vec::new()), grouped)? {
-            if !entry.is_zombie && !known.contains(&entry.pid) {
-                members.push(entry.identity(&boot_id));
-                table.push(entry);
-            }
-        }
+        let grouped = self.cgroup.as_ref().map_or(Ok(Vec::new()), grouped)?;
+        let mut known: HashSet<u32> = grouped.iter().map(|entry| entry.pid).chain(below).collect();
+        // Only of the others it takes a look into their environment to tell.
+        let others = table.iter().filter(|entry| !known.contains(&entry.pid) && !entry.is_zombie).copied().collect();
+        let marker = self.marker.clone();
+        let marked = environments::look(others, move |entry| entry.was_started_with(&marker));
+        known.extend(marked.into_iter().filter(|(_, is_ours)| *is_ours).map(|(entry, _)| entry.pid));
+        // Later than the table, they know better who has a pid.
+        table.retain(|entry| grouped.iter().all(|later| later.pid != entry.pid));
+        table.extend(grouped);
+        let is_member = |entry: &&ProcessEntry| !entry.is_zombie && known.contains(&entry.pid);
+        let members = table.iter().filter(is_member).map(|entry| entry.identity(&boot_id)).collect();
         Ok((table, members))
     }
 }

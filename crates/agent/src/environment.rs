@@ -19,13 +19,24 @@ const PASSED_ON: [(&str, Option<&str>); 6] = [
 
 /// Variables that say how a robot's nodes find each other and what carries them; tasks get the agent's, where it has them.
 /// `ROS_DOMAIN_ID` is not among them: it is a setting, whose default is the agent's variable.
-pub const ROS_VARIABLES: [&str; 9] = [
+pub const ROS_VARIABLES: [&str; 20] = [
     "ROS_AUTOMATIC_DISCOVERY_RANGE",
     "ROS_STATIC_PEERS",
     "ROS_LOCALHOST_ONLY",
     "RMW_IMPLEMENTATION",
     "CYCLONEDDS_URI",
     "FASTRTPS_DEFAULT_PROFILES_FILE",
+    "FASTDDS_DEFAULT_PROFILES_FILE",
+    "FASTDDS_BUILTIN_TRANSPORTS",
+    "RMW_FASTRTPS_USE_QOS_FROM_XML",
+    "ROS_DISCOVERY_SERVER",
+    "ROS_SUPER_CLIENT",
+    "ROS_SECURITY_ENABLE",
+    "ROS_SECURITY_STRATEGY",
+    "ROS_SECURITY_KEYSTORE",
+    "ROS_SECURITY_ENCLAVE_OVERRIDE",
+    "ZENOH_ROUTER_CONFIG_URI",
+    "ZENOH_SESSION_CONFIG_URI",
     "ROS_MASTER_URI",
     "ROS_IP",
     "ROS_HOSTNAME",

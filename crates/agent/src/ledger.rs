@@ -10,11 +10,12 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use task_proto::desired::{Delivery, DesiredTask, PackageRef, Wanted};
 use task_proto::envelope::Envelope;
-use task_proto::manifest::TaskKind;
+use task_proto::manifest::{OnBoot, TaskKind};
 use task_proto::report::{Failure, Phase};
 use task_proto::{DeploymentId, Digest, Generation, TaskName};
 
 use crate::durable;
+use crate::plan::MAX_RESTARTS_IN_A_ROW;
 
 mod asked;
 mod rules;
@@ -317,6 +318,10 @@ impl Ledger {
             for collection in &mut record.collections {
                 (collection.since_ms, collection.retry_at_ms) = (now_ms, 0);
             }
+            // What it lacked when it was given up may be there again.
+            if let Some(active) = record.active.as_mut().filter(|active| active.is_worn_out()) {
+                (active.end, active.restarts_in_a_row) = (None, 0);
+            }
             for run in [&mut record.active, &mut record.fallback].into_iter().flatten() {
                 (run.retry_at_ms, run.first_start_ms, run.admitted) = (0, now_ms, false);
             }
@@ -497,6 +502,12 @@ impl ActiveRun {
         self.deployment == order.deployment && self.run == order.run && self.package == order.package
     }
 
+    /// Whether it was good, and was given up only for being started again too often in one boot.
+    fn is_worn_out(&self) -> bool {
+        let is_up_at_boot = self.rules.kind == TaskKind::Service && self.rules.on_boot == OnBoot::Start;
+        self.end.is_some() && self.ever_ready && is_up_at_boot && self.restarts_in_a_row >= MAX_RESTARTS_IN_A_ROW
+    }
+
     /// Whether a process of it was started before. An earlier agent wrote down only that one was ready.
     pub fn has_started(&self) -> bool {
         self.ever_started || self.ever_ready
@@ -615,5 +626,28 @@ mod tests {
         ledger.enter_boot("second", 10);
         let record = &ledger.tasks[&order.task];
         assert_eq!((record.phase_since_ms, record.preparation.retry_at_ms), (10, 0));
+    }
+
+    #[test]
+    fn a_good_service_that_was_given_up_is_tried_again_in_another_boot() {
+        let order = order();
+        let after_boot = |restarts_in_a_row, on_boot: &str| {
+            let mut ledger = Ledger::new(1);
+            let mut record = TaskRecord::new(order.clone(), 5);
+            let manifest = serde_json::json!({
+                "name": "talker", "version": "1.0", "run": {"exec": ["true"], "on_boot": on_boot},
+                "content": {"tar_digest": Digest::of(b""), "tar_size": 0, "entries": 0},
+            });
+            let rules = RunRules::from(&serde_json::from_value::<TaskManifest>(manifest).expect("manifest"));
+            let end = Some(End { phase: Phase::Failed, failure: None });
+            let run = ActiveRun::of(&order, rules, 1);
+            record.active = Some(ActiveRun { end, ever_ready: true, restarts_in_a_row, ..run });
+            ledger.tasks.insert(order.task.clone(), record);
+            ledger.enter_boot("second", 10);
+            ledger.tasks[&order.task].standing().0
+        };
+        assert_eq!(after_boot(MAX_RESTARTS_IN_A_ROW, "start"), Phase::Starting);
+        assert_eq!(after_boot(MAX_RESTARTS_IN_A_ROW, "hold"), Phase::Failed);
+        assert_eq!(after_boot(MAX_RESTARTS_IN_A_ROW - 1, "start"), Phase::Failed, "it has ended for something else");
     }
 }

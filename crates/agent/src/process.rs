@@ -26,6 +26,8 @@ use tokio::io::unix::AsyncFd;
 
 use crate::confinement::Confinement;
 
+pub mod environments;
+
 /// Kernel ticks per second in `/proc/<pid>/stat`: USER_HZ, 100 on every architecture that Linux runs ROS on.
 const TICKS_PER_SECOND: u64 = 100;
 
@@ -158,7 +160,8 @@ impl ProcessEntry {
         ProcessIdentity { pid: self.pid, start_ticks: self.start_ticks, boot_id: boot_id.to_owned() }
     }
 
-    /// What it was started with as the variable `name`. `None` also where that can't be read.
+    /// What it was started with as the variable `name`. `None` also where that can't be read. May take for ever, as
+    /// [`environments`] says.
     pub fn variable(&self, name: &str) -> Option<String> {
         let environment = std::fs::read(format!("/proc/{}/environ", self.pid)).ok()?;
         let mut entries = environment.split(|byte| *byte == 0);
@@ -166,7 +169,8 @@ impl ProcessEntry {
         String::from_utf8(value.to_vec()).ok()
     }
 
-    /// Whether it was started with `variable` (`NAME=value`) in its environment. False where that can't be read.
+    /// Whether it was started with `variable` (`NAME=value`) in its environment. False where that can't be read. May take
+    /// for ever likewise.
     pub fn was_started_with(&self, variable: &str) -> bool {
         let environment = std::fs::read(format!("/proc/{}/environ", self.pid)).unwrap_or_default();
         environment.split(|byte| *byte == 0).any(|entry| entry == variable.as_bytes())

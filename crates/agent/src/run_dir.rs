@@ -103,6 +103,14 @@ pub enum RunDirError {
     },
 }
 
+impl RunDirError {
+    /// Whether all that is missing is room.
+    pub fn is_full(&self) -> bool {
+        use io::ErrorKind::{QuotaExceeded, StorageFull};
+        matches!(self, Self::Io { source, .. } if matches!(source.kind(), StorageFull | QuotaExceeded))
+    }
+}
+
 impl RunDir {
     /// The run directory at `path`, created if absent. The path becomes absolute and free of links, because it is also
     /// the key by which the run's processes are found.

@@ -51,6 +51,9 @@ pub fn run_script(manifest: &TaskManifest, version: &VersionDir, underlays: &[Pa
     script
 }
 
+/// cmake's word for optimised; it does nothing of the kind unless it is told.
+const RELEASE: &str = "-DCMAKE_BUILD_TYPE=Release";
+
 /// The script that builds the package into `install`; `None` when there is nothing to build.
 pub fn build_script(tool: BuildTool, version: &VersionDir, underlays: &[PathBuf]) -> Option<String> {
     let mut script = HEAD.to_owned();
@@ -60,9 +63,11 @@ pub fn build_script(tool: BuildTool, version: &VersionDir, underlays: &[PathBuf]
         BuildTool::None => return None,
         BuildTool::Colcon => {
             need(&mut script, "colcon");
-            script.push_str(
-                "exec colcon --log-base log build --base-paths src --build-base build --install-base install\n",
-            );
+            // Not every colcon knows of cmake.
+            script.push_str(&format!(
+                "cmake=()\nif [ -n \"$(find src -name CMakeLists.txt -print -quit)\" ]; then cmake=(--cmake-args {RELEASE} -DBUILD_TESTING=OFF); fi\n\
+                 exec colcon --log-base log build --base-paths src --build-base build --install-base install \"${{cmake[@]}}\"\n",
+            ));
         }
         BuildTool::Catkin => {
             system_first(&mut script);
@@ -72,7 +77,9 @@ pub fn build_script(tool: BuildTool, version: &VersionDir, underlays: &[PathBuf]
                 "mkdir -p build/workspace/src && ln -sfn ../../../src build/workspace/src/package || exit 1\n",
             );
             let install = quote(&format!("-DCMAKE_INSTALL_PREFIX={}", version.install().display()));
-            script.push_str(&format!("exec catkin_make -C build/workspace {install} install\n"));
+            script.push_str(&format!(
+                "exec catkin_make -C build/workspace {RELEASE} -DCATKIN_ENABLE_TESTING=OFF {install} install\n"
+            ));
         }
     }
     Some(script)

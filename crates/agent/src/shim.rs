@@ -24,6 +24,9 @@ use crate::run_dir::{Ended, RunDir, RunDirError, RunSpec, Started};
 const LEFTOVER_GRACE: Duration = Duration::from_secs(2);
 /// How long it may take after SIGKILL; what is still there then hangs in the kernel.
 const KILL_TIMEOUT: Duration = Duration::from_secs(10);
+/// How often the end is tried to be written to a full disk, and how long it rests in between: an hour in all.
+const MAX_WRITES: u32 = 720;
+const ROOM_PAUSE: Duration = Duration::from_secs(5);
 /// How long the rest of the output may take once nobody is left to write any.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(2);
 
@@ -87,10 +90,22 @@ pub fn run(path: &Path) -> Result<(), ShimError> {
     let _ = task.drained.recv_timeout(DRAIN_TIMEOUT);
     let at_uptime_ms = u64::try_from(process::uptime()?.as_millis()).unwrap_or(u64::MAX);
     let out_of_memory_bytes = task.memory_bytes.filter(|_| task.containment.is_out_of_memory());
-    dir.write_ended(&Ended { status, at_uptime_ms, out_of_memory_bytes })?;
+    let ended = Ended { status, at_uptime_ms, out_of_memory_bytes };
+    once_there_is_room(ROOM_PAUSE, || dir.write_ended(&ended))?;
     // The next stop of this run or the next boot removes what is left here.
     let _ = task.containment.remove();
     Ok(())
+}
+
+/// The task may have filled the disk itself, and how it ended must not be lost for that.
+fn once_there_is_room(pause: Duration, mut write: impl FnMut() -> Result<(), RunDirError>) -> Result<(), RunDirError> {
+    for _ in 1..MAX_WRITES {
+        match write() {
+            Err(error) if error.is_full() => std::thread::park_timeout(pause),
+            written => return written,
+        }
+    }
+    write()
 }
 
 fn begin(dir: &RunDir) -> Result<Task, ShimError> {
@@ -200,4 +215,24 @@ fn with_causes(error: &dyn std::error::Error) -> String {
         cause = inner.source();
     }
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn how_a_task_ended_is_written_once_the_disk_has_room_again() {
+        let refused = |kind: io::ErrorKind| RunDirError::Io { path: "exit.json".into(), source: kind.into() };
+        let mut answers =
+            vec![Ok(()), Err(refused(io::ErrorKind::StorageFull)), Err(refused(io::ErrorKind::QuotaExceeded))];
+        once_there_is_room(Duration::ZERO, || answers.pop().expect("asked three times")).expect("written");
+        assert!(answers.is_empty());
+        let mut count = 0;
+        let never = once_there_is_room(Duration::ZERO, || {
+            count += 1;
+            Err(refused(if count == 2 { io::ErrorKind::PermissionDenied } else { io::ErrorKind::StorageFull }))
+        });
+        assert!(never.is_err() && count == 2, "what room does not mend is told at once");
+    }
 }

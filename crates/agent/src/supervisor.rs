@@ -191,9 +191,8 @@ impl Supervisor {
     pub async fn pids(&self, path: &Path) -> Result<Vec<u32>, SupervisorError> {
         let (dir, started, cgroup) = read(path).await?;
         let containment = Containment::new(dir.path(), started.map(|started| started.shim), cgroup);
-        let members = tokio::task::spawn_blocking(move || containment.members()).await;
-        let members =
-            members.map_err(std::io::Error::from).flatten().map_err(failed("look for the task's processes"))?;
+        let members = containment.in_background(Containment::members).await;
+        let members = members.map_err(failed("look for the task's processes"))?;
         Ok(members.iter().map(|member| member.pid).collect())
     }
 
@@ -225,14 +224,17 @@ impl Supervisor {
         let (path, signalled) = (dir.path(), failed("signal the task"));
         match dir.spec()?.map(|spec| spec.interrupt).unwrap_or_default() {
             // The task's first process leads its group.
-            Interrupt::Group => containment.signal_group(task.pid, Signal::SIGINT),
+            Interrupt::Group => {
+                let group = task.pid;
+                containment.in_background(move |all| all.signal_group(group, Signal::SIGINT)).await
+            }
             Interrupt::Leader => task.signal(Signal::SIGINT),
         }
         .map_err(&signalled)?;
         if let Ok(ended) = tokio::time::timeout(grace, self.wait(path)).await {
             return ended;
         }
-        containment.signal_all(Signal::SIGTERM).map_err(&signalled)?;
+        containment.in_background(|all| all.signal_all(Signal::SIGTERM)).await.map_err(&signalled)?;
         if let Ok(ended) = tokio::time::timeout(grace, self.wait(path)).await {
             return ended;
         }

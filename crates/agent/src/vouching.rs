@@ -150,13 +150,9 @@ impl Vouching {
                     outcome = outcome.and(self.take_signatures(package, &cancel).await.map(drop));
                 }
             }
-            match outcome {
-                Err(error) if error.is_retryable() || matches!(error, FetchError::Disk { .. }) => {
-                    tracing::info!(error = %chain(&error), "what publishers have signed can't be had yet");
-                }
-                Err(error) => return tracing::warn!(error = %chain(&error), "what publishers have signed can't be had"),
-                Ok(()) => return,
-            }
+            // Whatever came instead: a robot that gave up would never hear that somebody is not trusted any more.
+            let Err(error) = outcome else { return };
+            tracing::info!(error = %chain(&error), "what publishers have signed can't be had yet");
             failures += 1;
             let wait_ms = backoff_ms(failures, MAX_BACKOFF_MS, rand::random()).max(1000);
             tokio::time::sleep(Duration::from_millis(wait_ms)).await;
@@ -167,7 +163,18 @@ impl Vouching {
     async fn take_lists(&self, cancel: &CancellationToken) -> Result<(), FetchError> {
         let repository: RepositoryName = LIST_REPOSITORY.parse().expect("a repository's name");
         for blob in self.fresh_lists() {
-            let bytes = self.fetcher.small(&repository, blob, MAX_LIST_BYTES, cancel).await?;
+            let bytes = match self.fetcher.small(&repository, blob, MAX_LIST_BYTES, cancel).await {
+                Ok(bytes) => bytes,
+                Err(error) => {
+                    if !error.is_retryable() {
+                        let text = format!("the list of publishers {} can't be had: {}", blob.digest, chain(&error));
+                        if self.told().refused.replace(text.clone()) != Some(text) {
+                            self.epoch.fetch_add(1, Ordering::AcqRel);
+                        }
+                    }
+                    return Err(error);
+                }
+            };
             let refused = match serde_json::from_slice(&bytes) {
                 Ok(envelope) => match self.trust.take(&envelope, blob.digest) {
                     Ok(()) => None,

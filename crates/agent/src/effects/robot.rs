@@ -391,7 +391,7 @@ impl Effects for Robot {
         self.vouched(&run.package, purpose, &CancellationToken::new()).await?;
         let manifest = self.manifest(&run.package).await?;
         let version = self.version(&run.package);
-        let text = script::run_script(&manifest, &version, &self.setup_files(&manifest)?);
+        let text = script::run_script(&manifest, &version, &self.setup_files_of(run, &manifest)?);
         let (user, environment) = self.account(task)?;
         durable::write(&version.run_script(), text.as_bytes(), 0o755).map_err(|error| failed(&error))?;
         user.as_ref().map_or(Ok(()), |user| user.hand_over(version.root())).map_err(|error| failed(&error))?;
@@ -416,8 +416,9 @@ impl Effects for Robot {
         self.end_other_runs(&task_dir.run(), Some(&run_dir)).await.map_err(|error| failed(&error))?;
         let facts = self.ros_facts_in(&spec.environment);
         self.watcher.before_start(&Promise::of(&manifest), facts.as_ref()).await.map_err(|failure| {
-            // Whoever has the name may go away: a run that was ready before waits for that.
-            StepFailure { failure, retry_after_ms: run.ever_ready.then_some(0) }
+            // Whoever has the name may go away: a run that was ready before waits for that. So may what is in the graph's way.
+            let may_pass = run.ever_ready || (failure.code == FailureCode::GRAPH_UNAVAILABLE && facts.is_some());
+            StepFailure { failure, retry_after_ms: may_pass.then_some(0) }
         })?;
         let started = self.supervisor.start(&run_dir, &spec).await;
         if matches!(started, Err(SupervisorError::NoAnswer))

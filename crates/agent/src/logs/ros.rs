@@ -17,7 +17,7 @@ use crate::clock;
 use crate::containment::RUN_DIR_VARIABLE;
 use crate::graph::{DiagnosticLevel, DiagnosticStatus, Graph, ParticipantId, RosoutLine};
 use crate::layout::DataDir;
-use crate::process::ProcessEntry;
+use crate::process::{ProcessEntry, environments};
 use crate::run_dir::LogSpec;
 
 /// Messages that wait for the disk.
@@ -126,8 +126,10 @@ impl Owners {
 fn pids_by_task(data: &DataDir) -> Vec<(TaskName, Vec<u32>)> {
     let tasks = data.task_names().unwrap_or_default();
     let mut found: BTreeMap<TaskName, Vec<u32>> = BTreeMap::new();
-    for process in ProcessEntry::all().unwrap_or_default() {
-        let Some(run_dir) = process.variable(RUN_DIR_VARIABLE) else { continue };
+    let run_dirs =
+        environments::look(ProcessEntry::all().unwrap_or_default(), |process| process.variable(RUN_DIR_VARIABLE));
+    for (process, run_dir) in run_dirs {
+        let Some(run_dir) = run_dir else { continue };
         let task = tasks.iter().find(|task| std::path::Path::new(&run_dir).starts_with(data.task(task).run()));
         if let Some(task) = task {
             found.entry(task.clone()).or_default().push(process.pid);

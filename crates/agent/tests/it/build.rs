@@ -220,6 +220,28 @@ async fn a_missing_tool_and_a_missing_underlay_are_named() {
 }
 
 #[tokio::test]
+async fn a_build_is_optimised_and_leaves_tests_out() {
+    let build = TestBuild::new(vec![ros()]);
+    write(
+        &build.src("package.xml"),
+        "<package format=\"3\"><!-- was <name>tested</name> --><name>plain</name><version>1.0.0</version><description>p</description><maintainer email=\"a@b.co\">a</maintainer><license>MIT</license><export><build_type>cmake</build_type></export></package>",
+    );
+    let cmake = "cmake_minimum_required(VERSION 3.10)\nproject(plain NONE)\noption(BUILD_TESTING \"\" ON)\n\
+                 if(BUILD_TESTING)\nfind_package(nobody_has_this REQUIRED)\nendif()\n\
+                 file(WRITE ${CMAKE_BINARY_DIR}/kind \"${CMAKE_BUILD_TYPE}\")\n\
+                 install(FILES package.xml ${CMAKE_BINARY_DIR}/kind DESTINATION share/plain)\n";
+    write(&build.src("CMakeLists.txt"), cmake);
+    build.run().await.unwrap_or_else(|error| panic!("{error}\n{}", build.log()));
+    let kind =
+        std::fs::read_to_string(build.order.version.install().join("plain/share/plain/kind")).expect("installed");
+    assert_eq!(kind, "Release");
+    // A colcon that knows nothing of cmake is asked nothing about it.
+    let bare = TestBuild::with_colcon("echo \"asked: $*\"; mkdir -p install/talker");
+    bare.run().await.expect("built");
+    assert!(bare.log().contains("--install-base install\n"), "{}", bare.log());
+}
+
+#[tokio::test]
 async fn a_build_is_nice_and_limited() {
     let mut build = TestBuild::with_colcon("echo nice $(nice), memory $(ulimit -v); mkdir -p install/talker; exit 0");
     build.order.limits.memory_bytes = Some(1 << 30);

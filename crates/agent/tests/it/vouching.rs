@@ -294,6 +294,26 @@ async fn a_new_list_is_followed_without_an_order_and_an_old_one_never() {
 }
 
 #[tokio::test]
+async fn a_list_that_does_not_come_is_told_and_asked_for_until_it_does() {
+    let (robot, talker) = (Robot::new().await, package("talker"));
+    let [ada, bob] = [1, 2].map(|seed| signature(seed, &talker));
+    robot.told(&talker, &[&list(1, &[1])], &[&ada]);
+    robot.vouch(&talker).await.unwrap();
+    // Something in between answers in the server's place.
+    let revoking = list(2, &[2]);
+    let lists = vec![robot.shelve(&list(1, &[1])), robot.shelve(&revoking)];
+    robot.shelf.lock().unwrap().blobs.clear();
+    robot.told_of(&talker, Evidence { lists, signatures: Vec::new() });
+    let said = eventually("it to be told", || robot.vouching.facts().refused_list).await;
+    assert!(said.contains("can't be had"), "{said}");
+    robot.shelve(&revoking);
+    eventually("the second list to be followed", || (robot.vouching.version() == 2).then_some(())).await;
+    assert_eq!((robot.vouching.facts().refused_list, robot.vouching.look(&talker)), (None, Vouched::No));
+    robot.told(&talker, &[&revoking], &[&bob]);
+    robot.vouch(&talker).await.unwrap();
+}
+
+#[tokio::test]
 async fn what_is_installed_gets_the_signature_of_a_new_key_without_an_order() {
     let (robot, talker) = (Robot::new().await, package("talker"));
     let [ada, eve] = [1, 9].map(|seed| signature(seed, &talker));

@@ -11,6 +11,7 @@ use task_proto::report::{FailureCode, RosFacts};
 use super::Robot;
 use super::outcomes::finally;
 use crate::installation::Installation;
+use crate::ledger::ActiveRun;
 use crate::plan::StepFailure;
 use crate::run_dir::RunDir;
 use crate::{environment, launch, survey, underlay};
@@ -46,6 +47,17 @@ impl Robot {
         let version = launch::of(manifest).ros;
         let found = underlay::setup_files(&self.installations(), version, &manifest.requires.ros_distro);
         found.map_err(|error| finally(FailureCode::REQUIREMENTS_UNMET, &error))
+    }
+
+    /// The same for a run that is to be started. What is not there is looked for once more; for a run that was ready before
+    /// it may come back, as a disk that is mounted late or a package that is being upgraded.
+    pub(super) fn setup_files_of(&self, run: &ActiveRun, manifest: &TaskManifest) -> Result<Vec<PathBuf>, StepFailure> {
+        let again = |_| {
+            self.find_ros();
+            self.setup_files(manifest)
+        };
+        let retry_after_ms = run.ever_ready.then_some(0);
+        self.setup_files(manifest).or_else(again).map_err(|error| StepFailure { retry_after_ms, ..error })
     }
 
     /// Takes what can be found by the settings that hold for what there is, until somebody has looked into it. What has been

@@ -10,6 +10,7 @@ use task_proto::request::{Answer, Ask, MAX_REPLY_BYTES, MAX_TTL_MS, Outcome, Ref
 use task_proto::topic::RobotTopic;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
+use tokio::time::Instant;
 
 use crate::graph_answers::GraphAnswers;
 use crate::link::Message;
@@ -39,16 +40,16 @@ fn refusal(code: &str, text: impl Into<String>) -> Refusal {
 
 impl Answers {
     /// Answers until nobody can ask any more.
-    pub async fn run(self, mut requests: mpsc::Receiver<Request>, messages: mpsc::Sender<Message>) {
+    pub async fn run(self, mut requests: mpsc::Receiver<(Request, Instant)>, messages: mpsc::Sender<Message>) {
         let answers = Arc::new(self);
         let mut under_way = JoinSet::new();
         loop {
             tokio::select! {
                 // Cancel-safe: a request stays in the channel until it is received.
                 request = requests.recv(), if under_way.len() < AT_A_TIME => {
-                    let Some(request) = request else { return };
+                    let Some((request, came)) = request else { return };
                     let (answers, messages) = (answers.clone(), messages.clone());
-                    under_way.spawn(async move { answers.reply(request, &messages).await });
+                    under_way.spawn(async move { answers.reply(request, came, &messages).await });
                 }
                 // Cancel-safe: what has ended stays in the set until it is taken.
                 Some(_) = under_way.join_next() => {}
@@ -56,11 +57,16 @@ impl Answers {
         }
     }
 
-    async fn reply(&self, request: Request, messages: &mpsc::Sender<Message>) {
+    /// Answers what came at `came`, as long as somebody waits for it.
+    async fn reply(&self, request: Request, came: Instant, messages: &mpsc::Sender<Message>) {
         let Request { id, ttl_ms, ask } = request;
-        let patience = Duration::from_millis(ttl_ms.min(MAX_TTL_MS));
-        let answer = tokio::time::timeout(patience, self.answer(ask)).await;
-        let answer = answer.unwrap_or_else(|_| Err(refusal("timeout", "the robot had no answer in time")));
+        let until = came + Duration::from_millis(ttl_ms.min(MAX_TTL_MS));
+        let late = || Err(refusal("timeout", "the robot had no answer in time"));
+        // Nothing is begun for who does not wait any more.
+        let answer = match Instant::now() < until {
+            true => tokio::time::timeout_at(until, self.answer(ask)).await.unwrap_or_else(|_| late()),
+            false => late(),
+        };
         let written = |answer: Result<Answer, Refusal>| {
             let outcome = answer.map_or_else(Outcome::Refusal, Outcome::Answer);
             serde_json::to_vec(&Reply { robot_id: self.robot_id.clone(), id: id.clone(), outcome })

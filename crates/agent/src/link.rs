@@ -97,8 +97,8 @@ pub struct Shared {
 /// What goes between an MQTT session and those in the agent who answer and tell. Both ways are bounded and lossy: nothing
 /// in them outlives its moment.
 pub struct Talk {
-    /// Where questions that came in go.
-    pub requests: mpsc::Sender<Request>,
+    /// Where questions that came in go, each with when it came.
+    pub requests: mpsc::Sender<(Request, Instant)>,
     /// What is to be published.
     pub messages: mpsc::Receiver<Message>,
     /// Log lines to be published, a batch at a time: the next is taken when the one before has arrived.

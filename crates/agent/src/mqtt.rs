@@ -194,22 +194,20 @@ enum Published {
 async fn session(
     access: &MqttAccess,
     external: Option<&ExternalBroker>,
-    way: Option<Route>,
+    way: Route,
     shared: &Shared,
     heard: &mpsc::Sender<Heard>,
     talk: &mut Talk,
     room: MessageRoom,
 ) -> Ended {
     let Talk { requests, messages, lines } = talk;
-    let line = match Line::open(way.as_ref(), CONNECT_TIMEOUT).await {
+    let line = match Line::open(&way, CONNECT_TIMEOUT).await {
         Ok(line) => line,
         Err(error) => return Ended::Unreachable(error),
     };
     let options = options(access, external, &line, room);
     let (client, mut event_loop) = AsyncClient::new(options, QUEUED_REQUESTS);
     event_loop.network_options.set_connection_timeout(CONNECT_TIMEOUT.as_secs());
-    // An acknowledgement that waits for another packet to be answered would hold the sender up.
-    event_loop.network_options.set_tcp_nodelay(true);
     let (events_in, mut events) = mpsc::channel(QUEUED_EVENTS);
     let (acknowledge, due) = mpsc::channel(QUEUED_ACKNOWLEDGEMENTS);
     let (mut reports, mut wishes) = (shared.reports.subscribe(), shared.listening.changes());
@@ -304,7 +302,7 @@ struct Session<'a> {
     is_external: bool,
     shared: &'a Shared,
     heard: &'a mpsc::Sender<Heard>,
-    requests: &'a mpsc::Sender<Request>,
+    requests: &'a mpsc::Sender<(Request, Instant)>,
     client: AsyncClient,
     up: bool,
     /// Handed to rumqttc, which has not given them a packet id yet.
@@ -443,7 +441,7 @@ impl Session<'_> {
         match serde_json::from_slice::<Request>(payload) {
             // Who asks waits only so long; a question that finds no room may be asked again.
             Ok(request) => {
-                if self.requests.try_send(request).is_err() {
+                if self.requests.try_send((request, Instant::now())).is_err() {
                     tracing::warn!("too many questions at a time");
                 }
             }
@@ -497,10 +495,8 @@ impl Session<'_> {
 }
 
 fn options(access: &MqttAccess, external: Option<&ExternalBroker>, line: &Line, room: MessageRoom) -> MqttOptions {
-    let mut options = MqttOptions::new(access.robot.as_str(), line.name().unwrap_or(&access.host), access.port);
-    if line.name().is_some() {
-        options.set_transport(Transport::Unix);
-    }
+    let mut options = MqttOptions::new(access.robot.as_str(), line.name(), access.port);
+    options.set_transport(Transport::Unix);
     let password = external.map_or_else(|| access.token.current(), |external| external.password.clone());
     options.set_credentials(access.robot.as_str(), password);
     options.set_clean_session(true);

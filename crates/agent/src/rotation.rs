@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use tokio::time::sleep;
 
+use crate::clock::PROGRAM_EXISTS_SINCE_MS;
 use crate::credential::Credential;
 use crate::effects::chain;
 use crate::identity::Identity;
@@ -59,7 +60,10 @@ impl Rotation {
         if self.identity.next_token.is_some() {
             return self.go_over(wall_ms).await;
         }
-        // A clock that was put back makes the token older than it is by nothing: it begins anew.
+        // The clock was ahead when the token came: it begins anew.
+        if (PROGRAM_EXISTS_SINCE_MS..self.identity.token_since_ms).contains(&wall_ms) {
+            self.keep(Identity { token_since_ms: wall_ms, ..self.identity.clone() });
+        }
         let age_ms = wall_ms.saturating_sub(self.identity.token_since_ms);
         if u128::from(age_ms) < self.lifetime.as_millis() {
             return spread(CHECK);

@@ -30,6 +30,7 @@ use task_proto::request::{Answer, Ask, Outcome, Refusal, Reply, Request};
 use task_proto::topic::RobotTopic;
 use task_proto::{DeploymentId, InstanceId, RobotId};
 use tokio::sync::mpsc;
+use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
 use self::body::Body;
@@ -189,10 +190,10 @@ fn start(number: usize, robot: Assembled, crew: &Crew, words: mpsc::Sender<Word>
 async fn answer(
     robot_id: RobotId,
     mut machine: Machine,
-    mut asked: mpsc::Receiver<Request>,
+    mut asked: mpsc::Receiver<(Request, Instant)>,
     said: mpsc::Sender<Message>,
 ) {
-    while let Some(Request { id, ask, .. }) = asked.recv().await {
+    while let Some((Request { id, ask, .. }, _)) = asked.recv().await {
         let text = "a simulated robot has no more than its vitals".to_owned();
         let outcome = match ask {
             Ask::Vitals => Outcome::Answer(Answer::Vitals(machine.look())),

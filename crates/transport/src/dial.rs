@@ -2,12 +2,16 @@
 //! HTTP. It gives up nothing and waits for ever: whoever calls it has the time.
 
 use std::io;
+use std::net::SocketAddr;
 use std::sync::Arc;
+use std::time::Duration;
 
 use rustls::ClientConfig;
 use rustls::pki_types::ServerName;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpStream;
+use tokio::task::JoinSet;
+use tokio::time::timeout;
 use tokio_rustls::TlsConnector;
 
 use crate::websocket::{WebSocket, WebSocketError};
@@ -61,11 +65,53 @@ pub enum DialError {
     WebSocket(#[from] WebSocketError),
 }
 
+/// What an address has before the next is tried beside it; RFC 8305 recommends it.
+const HEAD_START: Duration = Duration::from_millis(250);
+/// The most addresses of a name that are tried.
+const MAX_ADDRESSES: usize = 16;
+
+/// The addresses of both families in turns, beginning with the one that the system prefers.
+fn in_turns(addresses: impl Iterator<Item = SocketAddr>) -> Vec<SocketAddr> {
+    let addresses: Vec<_> = addresses.collect();
+    let is_first = addresses.first().map(SocketAddr::is_ipv6);
+    let (first, second): (Vec<_>, Vec<_>) =
+        addresses.into_iter().partition(|address| Some(address.is_ipv6()) == is_first);
+    let (mut first, mut second) = (first.into_iter(), second.into_iter());
+    let pairs = std::iter::from_fn(|| Some([first.next(), second.next()]).filter(|pair| *pair != [None, None]));
+    pairs.flatten().flatten().take(MAX_ADDRESSES).collect()
+}
+
+/// A connection to the first of these addresses that answers: one that is silent, as a family that is not routed, holds
+/// nobody up.
+async fn connect(addresses: Vec<SocketAddr>) -> io::Result<TcpStream> {
+    let mut addresses = addresses.into_iter();
+    let mut tries = JoinSet::new();
+    let mut failed = io::Error::new(io::ErrorKind::NotFound, "the name has no address");
+    loop {
+        if let Some(address) = addresses.next() {
+            tries.spawn(TcpStream::connect(address));
+        }
+        let head_start = if addresses.len() > 0 { HEAD_START } else { Duration::MAX };
+        // Cancel-safe: a try that has ended stays in the set until it is taken.
+        match timeout(head_start, tries.join_next()).await {
+            Ok(None) => return Err(failed),
+            Ok(Some(Ok(Ok(stream)))) => return Ok(stream),
+            Ok(Some(Ok(Err(error)))) => failed = error,
+            Ok(Some(Err(error))) => failed = error.into(),
+            Err(_) => {}
+        }
+    }
+}
+
 /// Opens a connection.
 pub async fn dial(route: &Route) -> Result<Box<dyn Duplex>, DialError> {
     let (host, port) = (route.host.clone(), route.port);
     let bare = host.strip_prefix('[').and_then(|host| host.strip_suffix(']')).unwrap_or(&host).to_owned();
-    let stream = match TcpStream::connect((bare.as_str(), port)).await {
+    let addresses = match tokio::net::lookup_host((bare.as_str(), port)).await {
+        Ok(addresses) => in_turns(addresses),
+        Err(source) => return Err(DialError::Connect { host, port, source }),
+    };
+    let stream = match connect(addresses).await {
         Ok(stream) => stream,
         Err(source) => return Err(DialError::Connect { host, port, source }),
     };
@@ -83,5 +129,43 @@ pub async fn dial(route: &Route) -> Result<Box<dyn Duplex>, DialError> {
     match &route.websocket {
         None => Ok(stream),
         Some(path) => Ok(Box::new(WebSocket::connect(stream, &format!("{host}:{port}"), path).await?)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn address(text: &str) -> SocketAddr {
+        text.parse().expect("an address")
+    }
+
+    #[test]
+    fn both_families_have_their_turn() {
+        let given = ["[::1]:1", "[::2]:1", "[::3]:1", "10.0.0.1:1", "10.0.0.2:1"].map(address);
+        let turns = ["[::1]:1", "10.0.0.1:1", "[::2]:1", "10.0.0.2:1", "[::3]:1"].map(address);
+        assert_eq!(in_turns(given.into_iter()), turns);
+        assert_eq!(in_turns(given[3..].iter().copied()), given[3..]);
+        assert_eq!(in_turns(std::iter::empty()), []);
+    }
+
+    #[tokio::test]
+    async fn an_address_that_is_silent_or_refuses_holds_nobody_up() {
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("a port");
+        let open = listener.local_addr().expect("its address");
+        // Whose queue is full: what else comes there gets no answer.
+        let silent = tokio::net::TcpSocket::new_v4().expect("a socket");
+        silent.bind(address("127.0.0.1:0")).expect("a port");
+        let silent = silent.listen(0).expect("listens");
+        let full = silent.local_addr().expect("its address");
+        let mut waiting = Vec::new();
+        while let Ok(Ok(stream)) = timeout(HEAD_START, TcpStream::connect(full)).await {
+            waiting.push(stream);
+        }
+        let refuses = address("127.0.0.1:1");
+        let stream = connect(vec![full, refuses, open]).await.expect("connected");
+        assert_eq!(stream.peer_addr().expect("its address"), open);
+        assert_eq!(connect(vec![refuses]).await.expect_err("refused").kind(), io::ErrorKind::ConnectionRefused);
+        assert_eq!(connect(Vec::new()).await.expect_err("none").kind(), io::ErrorKind::NotFound);
     }
 }

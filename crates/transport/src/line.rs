@@ -1,6 +1,6 @@
 //! Lends rumqttc a connection that it can't make itself. Its own TLS and WebSocket bring an old certificate verifier, know no
-//! pin and no clock that may be wrong, and it takes no stream that somebody else has opened; but it does connect to a local
-//! socket. So it gets one that has a name nobody knows and takes just this process, and what passes there is carried over.
+//! pin and no clock that may be wrong, it waits for an address that is silent though the name has others, and it takes no
+//! stream that somebody else has opened; but it does connect to a local socket. So it gets one that has a name nobody knows and takes just this process, and what passes there is carried over.
 
 use std::io;
 use std::time::Duration;
@@ -35,44 +35,36 @@ pub enum LineError {
     Local(#[source] io::Error),
 }
 
-/// What a session goes over: a connection that is open, or one that rumqttc makes itself.
-pub struct Line(Option<Lent>);
-
-/// A connection, and the local socket by which rumqttc gets to it.
-struct Lent {
+/// What a session goes over: an open connection, and the local socket by which rumqttc gets to it.
+pub struct Line {
     name: String,
     listener: UnixListener,
     far: Box<dyn Duplex>,
 }
 
 impl Line {
-    /// Opens the connection within `time`; none where rumqttc needs no help.
-    pub async fn open(route: Option<&Route>, time: Duration) -> Result<Self, LineError> {
-        let Some(route) = route else { return Ok(Self(None)) };
+    /// Opens the connection within `time`.
+    pub async fn open(route: &Route, time: Duration) -> Result<Self, LineError> {
         let late = |_| LineError::Late { host: route.host.clone(), port: route.port, time };
         let far = timeout(time, dial(route)).await.map_err(late)??;
         // In the abstract namespace: there is no file that would have to be removed.
         let name = format!("\0task-line-{:032x}", rand::random::<u128>());
         let listener = UnixListener::bind(&name).map_err(LineError::Local)?;
-        Ok(Self(Some(Lent { name, listener, far })))
+        Ok(Self { name, listener, far })
     }
 
     /// The local socket that rumqttc is to connect to.
-    pub fn name(&self) -> Option<&str> {
-        self.0.as_ref().map(|lent| lent.name.as_str())
+    pub fn name(&self) -> &str {
+        &self.name
     }
 
     /// Carries bytes both ways until either end is through, which the session sees by itself; then it rests.
     pub async fn carry(self) {
-        if let Self(Some(lent)) = self {
-            lent.carry().await;
-        }
+        self.carry_all().await;
         std::future::pending().await
     }
-}
 
-impl Lent {
-    async fn carry(mut self) {
+    async fn carry_all(mut self) {
         let own = i32::try_from(std::process::id()).ok();
         let mut near = loop {
             match self.listener.accept().await {

@@ -10,6 +10,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::net::{IpAddr, SocketAddr};
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 use std::{fs, io};
 
@@ -20,6 +21,8 @@ use crate::process::ProcessIdentity;
 
 /// How exactly the kernel says when a process was started, and how long ago that is.
 const CLOCK_STEP: Duration = Duration::from_millis(20);
+/// Addresses of this host that are remembered; beyond it all are forgotten.
+const MAX_FORMER: usize = 256;
 /// The most open files of one process that are looked at.
 const MAX_FILES: usize = 65_536;
 
@@ -41,6 +44,8 @@ pub struct Owners {
 #[derive(Debug, Default)]
 struct Host {
     addresses: BTreeSet<IpAddr>,
+    /// Those that it had before. What was started then goes on announcing them.
+    former: BTreeSet<IpAddr>,
     /// Sockets by the port they are bound to.
     sockets: BTreeMap<u16, BTreeSet<u64>>,
     /// The sockets that the processes hold, with the age of the oldest that does.
@@ -70,6 +75,7 @@ impl Host {
     fn look(proc: &Path, pids: &[u32]) -> io::Result<Self> {
         let mut host = Self { complete: true, ..Self::default() };
         host.addresses = getifaddrs()?.filter_map(|interface| ip_of(&interface)).collect();
+        host.former = former(&host.addresses);
         for table in ["net/udp", "net/udp6"] {
             match fs::read_to_string(proc.join(table)) {
                 Ok(text) => text.lines().skip(1).filter_map(socket_of).for_each(|(port, inode)| {
@@ -119,21 +125,24 @@ impl Host {
     fn holds(&self, locators: &BTreeSet<SocketAddr>, seen_for: Duration) -> Option<bool> {
         let ports = locators.iter().filter(|locator| self.is_here(locator.ip())).map(SocketAddr::port);
         let (mut theirs, mut others, mut shared) = (false, false, false);
+        let is_held = |socket: &u64| self.held.get(socket).is_some_and(|age| *age + CLOCK_STEP >= seen_for);
         for sockets in ports.filter_map(|port| self.sockets.get(&port)) {
-            let is_held = |socket: &u64| self.held.get(socket).is_some_and(|age| *age + CLOCK_STEP >= seen_for);
             match sockets.iter().filter(|socket| is_held(socket)).count() {
                 0 => others = true,
                 held if held == sockets.len() => theirs = true,
                 _ => shared = true,
             }
         }
+        // Whoever has the address now may listen at the same port, so that it is held here proves nothing.
+        let former = locators.iter().filter(|locator| self.former.contains(&locator.ip()));
+        let may_be_here = former.filter_map(|locator| self.sockets.get(&locator.port())).flatten().any(is_held);
         // Another host may have one of our addresses too (a container bridge's), but hardly all of them.
         let all_here = locators.iter().all(|locator| self.is_here(locator.ip()));
         match (theirs, others, shared) {
             _ if locators.is_empty() => None,
             (true, false, _) => all_here.then_some(true),
             (true, true, _) | (false, false, true) => None,
-            (false, ..) => self.complete.then_some(false),
+            (false, ..) => (self.complete && !may_be_here).then_some(false),
         }
     }
 
@@ -166,6 +175,17 @@ impl Host {
     fn is_here(&self, address: IpAddr) -> bool {
         address.is_loopback() || self.addresses.contains(&address)
     }
+}
+
+/// The addresses that this host had when somebody looked, since the agent was started, and has no longer.
+fn former(now: &BTreeSet<IpAddr>) -> BTreeSet<IpAddr> {
+    static EVER: Mutex<BTreeSet<IpAddr>> = Mutex::new(BTreeSet::new());
+    let mut ever = EVER.lock().unwrap_or_else(PoisonError::into_inner);
+    if ever.len() > MAX_FORMER {
+        ever.clear();
+    }
+    ever.extend(now);
+    ever.difference(now).copied().collect()
 }
 
 fn ip_of(interface: &nix::ifaddrs::InterfaceAddress) -> Option<IpAddr> {
@@ -213,6 +233,7 @@ mod tests {
     fn host(complete: bool) -> Host {
         Host {
             addresses: BTreeSet::from(["192.168.1.5".parse().expect("ip"), "172.17.0.1".parse().expect("ip")]),
+            former: BTreeSet::from(["192.168.1.4".parse().expect("ip")]),
             sockets: BTreeMap::from([
                 (7411, BTreeSet::from([1])),
                 (7413, BTreeSet::from([2])),
@@ -241,6 +262,10 @@ mod tests {
             (&["192.168.1.5:7417"], true, None),
             (&["192.168.1.5:7417", "192.168.1.5:7411"], true, Some(true)),
             (&["192.168.1.5:7411", "192.168.1.5:7413"], true, None),
+            // It announces an address that this host has lost; who has that now may be meant as well.
+            (&["192.168.1.4:7411"], true, None),
+            (&["192.168.1.4:7413"], true, Some(false)),
+            (&["192.168.1.4:7411", "192.168.1.5:7411"], true, None),
             (&[], true, None),
         ] {
             let found = host(complete).holds(&participant(locators).locators, Duration::from_secs(1));
@@ -266,6 +291,7 @@ mod tests {
             // Of two ports that it had, one is shared with others who live.
             (&["192.168.1.5:7415", "192.168.1.5:7413"], 1, true),
             (&["192.168.1.7:7415"], 1, false),
+            (&["192.168.1.4:7415"], 1, false),
             (&["192.168.1.5:7415", "192.168.1.7:7415"], 1, false),
             (&[], 1, false),
         ] {

@@ -125,6 +125,8 @@ struct Gatherer {
     suppressed: u64,
     counted_at: Option<Instant>,
     has_more: bool,
+    /// Which file comes first in the next batch.
+    next: usize,
 }
 
 /// Lines a task may still say now.
@@ -145,6 +147,7 @@ impl Gatherer {
             suppressed: 0,
             counted_at: None,
             has_more: false,
+            next: 0,
         }
     }
 
@@ -157,18 +160,23 @@ impl Gatherer {
 
     /// The next batch, if there is something to say.
     fn gather(&mut self, wanted: &Wanted, now: Instant) -> Option<LogBatch> {
-        let files = files(&self.data);
+        let mut files = files(&self.data);
         self.tails.retain(|path, _| files.iter().any(|file| file.path == *path));
         self.budgets.retain(|task, _| files.iter().any(|file| file.task == *task));
         let (mut batch, mut room) = (Gathered::default(), ROOM_BYTES);
-        for file in &files {
+        // One that has more to say than a batch takes leaves the next batch to those behind it.
+        let first = std::mem::take(&mut self.next).checked_rem(files.len()).unwrap_or_default();
+        files.rotate_left(first);
+        self.has_more = false;
+        for (place, file) in files.iter().enumerate() {
             if file.task.is_none() && !wanted.others {
                 self.tails.entry(file.path.clone()).or_default().skip(&file.path, 0);
-            } else if !batch.is_full() {
+            } else if !self.has_more {
                 self.read(file, wanted, now, &mut batch, &mut room);
+                self.has_more = batch.is_full() || room == 0;
+                self.next = if self.has_more { first + place + 1 } else { 0 };
             }
         }
-        self.has_more = batch.is_full() || room == 0;
         let is_due = || self.counted_at.is_none_or(|at| now.duration_since(at) >= COUNT_INTERVAL);
         if batch.lines.is_empty() && (self.suppressed == 0 || !is_due()) {
             return None;
@@ -318,6 +326,17 @@ mod tests {
         bench.say("loud", LogSource::Stderr, (0..100).map(|number| format!("later {number}")));
         let (lines, suppressed) = bench.gather(Duration::ZERO, None);
         assert_eq!((lines.len(), suppressed), (50, 50), "ten lines for each second that passed");
+    }
+
+    #[test]
+    fn one_that_fills_every_batch_leaves_others_theirs() {
+        let mut bench = Bench::new();
+        let long = "x".repeat(3000);
+        for task in ["one", "two"] {
+            bench.say(task, LogSource::Stderr, (0..60).map(|number| format!("{task} {number} {long}")));
+        }
+        let first_of_both: String = (0..2).map(|_| bench.gather(Duration::ZERO, None).0.remove(0)).collect();
+        assert!(first_of_both.contains("one 0") && first_of_both.contains("two 0"), "{first_of_both:.40}");
     }
 
     #[test]

@@ -2,6 +2,7 @@
 //! show. What is of no task is kept apart. It decides nothing by what is said.
 
 use std::collections::{BTreeMap, HashMap};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -199,15 +200,17 @@ impl Recorder {
     }
 
     fn write(&mut self, task: Option<TaskName>, source: LogSource, text: &str) {
-        let path = task.as_ref().map_or_else(|| self.data.ros_log(), |task| self.data.task(task).ros_log());
+        let path = path_in(&self.data, task.as_ref());
         // A task that was removed has no directory any more, and gets none by this.
         let parent = path.parent().filter(|_| task.is_none());
         if let Some(Err(error)) = parent.map(std::fs::create_dir_all) {
             tracing::debug!(%error, "what nodes say can't be kept");
         }
         if !path.exists() {
-            // It was never begun, or its task was removed with it: what was open then is no file of the next one.
-            self.logs.remove(&task);
+            // It was never begun, or its task was removed with it: what was open then is no file of the next one. Nor is
+            // that of any other that was removed, which would keep its bytes on the disk.
+            let data = &self.data;
+            self.logs.retain(|task, _| path_in(data, task.as_ref()).exists());
         }
         let log = self.logs.entry(task).or_insert_with(|| {
             let mut spec = LogSpec::at(path);
@@ -221,6 +224,11 @@ impl Recorder {
         record::write(&mut line, &timestamp(clock::wall_ms()), source, false, text.as_bytes());
         log.write(&line);
     }
+}
+
+/// Where what a task's nodes say is kept, or what others say.
+fn path_in(data: &DataDir, task: Option<&TaskName>) -> PathBuf {
+    task.map_or_else(|| data.ros_log(), |task| data.task(task).ros_log())
 }
 
 fn seconds(ms: u64) -> String {

@@ -65,7 +65,9 @@ impl Tail {
                 return Ok(());
             }
             if is_read {
-                self.at = next_newer(log, &path)?;
+                // Somebody has deleted the newest, while it is written: nothing more comes until it is rotated.
+                let Some(newer) = next_newer(log, &path)? else { return Ok(()) };
+                self.at = Some(newer);
             }
         }
         Ok(())
@@ -205,6 +207,22 @@ mod tests {
         let rest = read(&mut tail, &log);
         assert!(rest.len() < 60 && rest.last().is_some_and(|line| line == "flood 199"), "{rest:?}");
         assert!(rest.iter().all(|line| line.starts_with("flood ")));
+    }
+
+    #[test]
+    fn a_log_that_somebody_deleted_is_not_read_again() {
+        let temp = tempfile::tempdir().unwrap();
+        let log = temp.path().join("task.log");
+        let mut written = RotatedLog::new(LogSpec { path: log.clone(), max_bytes: 100, files: 5 });
+        (0..30).for_each(|number| written.write(format!("line {number}\n").as_bytes()));
+        let mut tail = Tail::default();
+        assert_eq!(read(&mut tail, &log).len(), 30);
+        std::fs::remove_file(&log).unwrap();
+        // The newest that is left, once: what was read of it before was in the file that is gone.
+        read(&mut tail, &log);
+        assert_eq!(read(&mut tail, &log), Vec::<String>::new());
+        (0..30).for_each(|number| written.write(format!("later {number}\n").as_bytes()));
+        assert!(read(&mut tail, &log).iter().all(|line| line.starts_with("later ")));
     }
 
     #[test]

@@ -35,27 +35,20 @@ impl Ways {
         Self { transport, tls, websocket, is_turned: false }
     }
 
-    /// The next way; `None`: rumqttc's own, over a port that does not encrypt. A broker that is not the server's own has
-    /// nothing but its port, and a certificate by somebody else.
-    pub(super) fn next(
-        &self,
-        host: &str,
-        port: u16,
-        is_encrypted: bool,
-        external: Option<&ExternalBroker>,
-    ) -> Option<Route> {
+    /// The next way. A broker that is not the server's own has nothing but its port, and a certificate by somebody else.
+    pub(super) fn next(&self, host: &str, port: u16, is_encrypted: bool, external: Option<&ExternalBroker>) -> Route {
         let by_websocket = match self.transport {
             MqttTransport::Auto => self.is_turned,
             MqttTransport::Tcp => false,
             MqttTransport::Websocket => true,
         };
         let tls = match external {
-            None if by_websocket => return Some(self.websocket.clone()),
-            _ if !is_encrypted => return None,
-            None => self.tls.clone(),
-            Some(broker) => Arc::new(Trust::by(broker.ca_pin).client_config(clock::for_certificates())),
+            None if by_websocket => return self.websocket.clone(),
+            _ if !is_encrypted => None,
+            None => Some(self.tls.clone()),
+            Some(broker) => Some(Arc::new(Trust::by(broker.ca_pin).client_config(clock::for_certificates()))),
         };
-        Some(Route { host: host.to_owned(), port, tls: Some(tls), websocket: None })
+        Route { host: host.to_owned(), port, tls, websocket: None }
     }
 
     /// No session came about.
@@ -81,42 +74,42 @@ mod tests {
     }
 
     /// Host, port, path of the WebSocket, and whether it encrypts.
-    fn shown(route: Option<Route>) -> Option<(String, u16, Option<String>, bool)> {
-        route.map(|route| (route.host, route.port, route.websocket, route.tls.is_some()))
+    fn shown(route: Route) -> (String, u16, Option<String>, bool) {
+        (route.host, route.port, route.websocket, route.tls.is_some())
     }
 
     #[test]
     fn what_fails_is_given_up_for_the_other() {
         let mut ways = ways("https://fleet.lab/tasks/", MqttTransport::Auto);
         let direct = |ways: &Ways| shown(ways.next("fleet.lab", 8883, true, None));
-        let own_port = Some(("fleet.lab".to_owned(), 8883, None, true));
-        let websocket = Some(("fleet.lab".to_owned(), 443, Some("/tasks/mqtt".to_owned()), true));
+        let own_port = ("fleet.lab".to_owned(), 8883, None, true);
+        let websocket = ("fleet.lab".to_owned(), 443, Some("/tasks/mqtt".to_owned()), true);
         assert_eq!(direct(&ways), own_port);
         ways.turn();
         assert_eq!(direct(&ways), websocket);
         let broker = ExternalBroker { password: "secret".to_owned(), ca_pin: None };
         assert_eq!(
             shown(ways.next("broker.lab", 1883, false, Some(&broker))),
-            None,
+            ("broker.lab".to_owned(), 1883, None, false),
             "an external broker has no such way"
         );
-        let encrypted = Some(("broker.lab".to_owned(), 8883, None, true));
+        let encrypted = ("broker.lab".to_owned(), 8883, None, true);
         assert_eq!(shown(ways.next("broker.lab", 8883, true, Some(&broker))), encrypted);
         ways.turn();
         assert_eq!(direct(&ways), own_port);
         ways.turn();
         ways.begin_anew();
         assert_eq!(direct(&ways), own_port);
-        assert_eq!(shown(ways.next("fleet.lab", 1883, false, None)), None, "plain text is rumqttc's own affair");
+        assert_eq!(shown(ways.next("fleet.lab", 1883, false, None)), ("fleet.lab".to_owned(), 1883, None, false));
     }
 
     #[test]
     fn a_setting_leaves_no_choice() {
         let mut tcp = ways("http://10.0.0.7:8080", MqttTransport::Tcp);
         tcp.turn();
-        assert_eq!(shown(tcp.next("10.0.0.7", 1883, false, None)), None);
+        assert_eq!(shown(tcp.next("10.0.0.7", 1883, false, None)), ("10.0.0.7".to_owned(), 1883, None, false));
         let websocket = ways("http://10.0.0.7:8080", MqttTransport::Websocket);
-        let way = Some(("10.0.0.7".to_owned(), 8080, Some("/mqtt".to_owned()), false));
+        let way = ("10.0.0.7".to_owned(), 8080, Some("/mqtt".to_owned()), false);
         assert_eq!(shown(websocket.next("10.0.0.7", 1883, false, None)), way);
     }
 }

@@ -138,6 +138,8 @@ impl UnderWay {
     fn ended(&mut self, ended: Result<Digest, tokio::task::JoinError>) {
         match ended {
             Ok(digest) => drop(self.packages.remove(&digest)),
+            // Of those that were told to end below.
+            Err(error) if error.is_cancelled() => {}
             Err(error) => {
                 tracing::error!(%error, "a fan-out has failed; all begin anew");
                 self.tasks.abort_all();

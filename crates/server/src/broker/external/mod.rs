@@ -57,16 +57,17 @@ pub struct ExternalConfig {
 
 impl ExternalConfig {
     fn route(&self) -> Route {
-        let tls = Trust::by(self.pin).client_config(Clock::for_certificates());
-        Route { host: self.url.host.clone(), port: self.url.port, tls: Some(Arc::new(tls)), websocket: None }
+        let tls = || Arc::new(Trust::by(self.pin).client_config(Clock::for_certificates()));
+        let tls = self.url.tls.then(tls);
+        Route { host: self.url.host.clone(), port: self.url.port, tls, websocket: None }
     }
 }
 
 /// The connection to the broker, for as long as the server runs.
 pub(super) struct External {
     config: ExternalConfig,
-    /// How it is reached, where that takes more than TCP.
-    route: Option<Route>,
+    /// How it is reached.
+    route: Route,
     inbox: Arc<dyn Inbox>,
     outbox: Mutex<Outbox>,
     /// Something was put into the outbox.
@@ -90,7 +91,7 @@ impl External {
             config.url.address()
         )));
         let external = Arc::new(Self {
-            route: config.url.tls.then(|| config.route()),
+            route: config.route(),
             config,
             inbox,
             outbox: Mutex::default(),

@@ -85,7 +85,7 @@ impl Ended {
 /// Runs one session to its end; `None`: the server stops.
 pub(super) async fn run(external: &External, health: &watch::Sender<Health>) -> Option<Ended> {
     let line = tokio::select! {
-        line = Line::open(external.route.as_ref(), NETWORK_TIMEOUT) => line,
+        line = Line::open(&external.route, NETWORK_TIMEOUT) => line,
         () = external.stop.cancelled() => return None,
     };
     let line = match line {
@@ -93,7 +93,7 @@ pub(super) async fn run(external: &External, health: &watch::Sender<Health>) -> 
         Err(error) => return Some(Ended::Unreachable(error)),
     };
     let (client, mut event_loop) = AsyncClient::new(options(external, &line), QUEUED);
-    event_loop.network_options.set_connection_timeout(NETWORK_TIMEOUT.as_secs()).set_tcp_nodelay(true);
+    event_loop.network_options.set_connection_timeout(NETWORK_TIMEOUT.as_secs());
     let (events_in, mut events) = mpsc::channel(QUEUED);
     // rumqttc's poll must not be dropped half way, so it runs in one future that lives as long as the session.
     let pump = async {
@@ -157,10 +157,8 @@ fn with_causes(error: &dyn Error) -> String {
 
 fn options(external: &External, line: &Line) -> MqttOptions {
     let url = &external.config.url;
-    let mut options = MqttOptions::new(&external.config.client_id, line.name().unwrap_or(&url.host), url.port);
-    if line.name().is_some() {
-        options.set_transport(Transport::Unix);
-    }
+    let mut options = MqttOptions::new(&external.config.client_id, line.name(), url.port);
+    options.set_transport(Transport::Unix);
     options.set_credentials(&url.user_name, &url.password);
     options.set_clean_session(true);
     options.set_keep_alive(KEEP_ALIVE);

@@ -10,7 +10,7 @@ import { deliveries, failures } from './deployments/aside.js';
 import { Parts, canRetry, reasonOf } from './deployments/parts.js';
 import { list, steps, strip, tookInAll } from './timeline.js';
 import { open } from './dialog.js';
-import { selectorOf } from './fleet.js';
+import { idsOf } from './fleet.js';
 import { bytes, duration, moment, number, plural, size, tone, words } from './format.js';
 import { change } from './frame.js';
 import { tell } from './notice.js';
@@ -306,7 +306,8 @@ export class DeploymentView {
     const ids = new Set(parts.filter(canRetry).map(({ robot }) => robot));
     // A reason without a code is how they ended, which the server does not choose by.
     const code = reason && parts[0].failure?.code;
-    const selector = reason && !code ? selectorOf(ids, this.app) : undefined;
+    // Named one by one: whoever fails while the question is open was not in it.
+    const selector = idsOf(ids);
     const key = newKey();
     open({
       title: `Retry on ${plural(ids.size, 'robot')}`,

@@ -1,0 +1,47 @@
+// Orders are for the robots that the page has named, and for no others, whatever happens before they are sent.
+
+import { test } from 'node:test';
+import { assert, assertQuiet, eventually, open, Puppet, Server } from './harness.mjs';
+
+const FAILED = { each: () => ({ failure: { code: 'build_failed', text: 'colcon build ended with status 1' } }) };
+
+const enrolAll = (server, labels) => Promise.all(Object.entries(labels).map(([name, its]) => Puppet.enroll(server, name, its)));
+/** The names of the robots that a deployment is for. */
+const receivers = async (server, id) => (await server.ask('GET', `/deployments/${id}`)).assignments.map(({ name }) => name).sort();
+const newest = async (server) => (await server.ask('GET', '/deployments')).deployments[0].id;
+
+test('who fails while the question is open is not retried with the others', async (t) => {
+  const server = await Server.start(t);
+  const [atlas, borea] = await enrolAll(server, { atlas: {}, borea: {} });
+  const page = await open(t, server);
+  const dialog = page.getByRole('dialog');
+  // All that failed, and all that failed for one reason.
+  for (const [name, button] of [['talker', 'Retry 1 robot…'], ['singer', 'Retry these…']]) {
+    const { id } = server.push(name, '1.0.0', { to: '*' });
+    await atlas.report('failed', FAILED);
+    await page.goto(`${server.url}/#/deployments/${id}`);
+    await page.getByRole('button', { name: button }).click();
+    await dialog.getByRole('heading', { name: 'Retry on 1 robot' }).waitFor();
+    await borea.report('failed', FAILED);
+    await page.locator('.reason', { hasText: 'on 2 robots' }).waitFor();
+    await dialog.getByRole('button', { name: 'Retry' }).click();
+    await page.waitForURL((url) => /#\/deployments\/d/.test(url.hash) && !url.hash.includes(id));
+    assert.deepEqual(await receivers(server, await newest(server)), ['atlas'], button);
+  }
+  assertQuiet(page);
+});
+
+test('who is limited to some robots retries those', async (t) => {
+  const server = await Server.start(t);
+  const robots = await enrolAll(server, { atlas: { site: 'lab' }, borea: { site: 'yard' } });
+  const { id } = server.push('talker', '1.0.0', { to: '*' });
+  for (const robot of robots) await robot.report('failed', FAILED);
+  await server.ask('POST', '/users', { name: 'alice', roles: ['operator'], scope: 'site=lab' });
+  const { token } = await server.ask('POST', '/tokens', { user: 'alice', title: 'the page' });
+  const page = await open(t, server, { token, hash: `#/deployments/${id}` });
+  await page.getByRole('button', { name: 'Retry 1 robot…' }).click();
+  await page.getByRole('dialog').getByRole('button', { name: 'Retry' }).click();
+  await page.waitForURL((url) => /#\/deployments\/d/.test(url.hash) && !url.hash.includes(id));
+  assert.deepEqual(await receivers(server, await newest(server)), ['atlas']);
+  assertQuiet(page);
+});

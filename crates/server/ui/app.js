@@ -6,6 +6,7 @@
 // took it), and `leave()`. What every view may use is `app`, below.
 
 import { html, nothing, render } from './vendor/lit-html-3.3.3/lit-html.js';
+import { repeat } from './vendor/lit-html-3.3.3/directives/repeat.js';
 import * as api from './api.js';
 import { close as closeDialog, dialogView, settleDialog, takesKey as dialogTakes } from './dialog.js';
 import { Fleet, Selection } from './fleet.js';
@@ -290,6 +291,9 @@ drawWith((frame) => {
   settleDialog();
 });
 
+/** A view gets elements of its own: what the one before has put into them, what listens to them and what was unfolded is not its. */
+const ofView = (view, drawn) => repeat([view], (one) => one, () => drawn);
+
 const frameView = (now) => html`
   <header class="top">
     <a class="skip" href="#main" @click=${skip}>Skip to the content</a>
@@ -301,7 +305,7 @@ const frameView = (now) => html`
   </header>
   <main id="main" tabindex="-1">
     ${page.problem ? html`<p class="bad" role="alert">▲ ${page.problem}</p>` : nothing}
-    ${page.view.draw(now)}
+    ${ofView(page.view, page.view.draw(now))}
   </main>
   ${dialogView()}
   ${noticeView()}`;

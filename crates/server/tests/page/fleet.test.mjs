@@ -109,6 +109,26 @@ test('the log is followed, paused and filtered', async (t) => {
   assertQuiet(page);
 });
 
+test('the page of another robot shows nothing of the one before', async (t) => {
+  const server = await Server.start(t);
+  for (const [robot, task] of [['atlas', 'talker'], ['borea', 'singer']]) {
+    await agent(t, server, robot);
+    server.push(task, '1.0.0', { to: robot, files: { 'run.sh': `#!/bin/sh\nwhile :; do echo "${task} of ${robot}"; sleep 0.2; done\n` } });
+  }
+  const page = await open(t, server, { hash: '#/robots/atlas/logs' });
+  const said = async (text) => (await page.getByRole('log').innerText()).includes(text);
+  await eventually('what the first says', () => said('talker of atlas'));
+  await page.goto(`${server.url}/#/robots/borea/logs`);
+  await eventually('what the second says', () => said('singer of borea'));
+  assert.equal(await said('atlas'), false);
+  // The same robot by its id has a page of its own as well.
+  const { id } = await server.ask('GET', '/robots/borea');
+  await page.goto(`${server.url}/#/robots/${id}/logs`);
+  await until(page, () => document.querySelector('.log-line'));
+  assert.equal(await page.locator('.log-place > *').count(), 1);
+  assertQuiet(page);
+});
+
 test('labels are edited one by one and in bulk', async (t) => {
   const server = await Server.start(t);
   for (const name of ['atlas', 'borea']) await Puppet.enroll(server, name);

@@ -128,11 +128,11 @@ export class RobotsView {
     const { fleet, selection } = this.app;
     const { sort, isDescending } = fleet.search;
     const operations = this.#operations;
-    const isAll = fleet.shown.length > 0 && fleet.shown.every((id) => selection.has(id));
+    const isAll = this.#isAll;
     return html`
       <div class="table robots-table" role="grid" aria-label="Robots" aria-multiselectable="true" aria-rowcount=${fleet.shown.length + 1}>
         <div class="row head" role="row" aria-rowindex="1">
-          <span role="columnheader"><input type="checkbox" aria-label="Select all that are shown" .checked=${isAll} .indeterminate=${!isAll && selection.size > 0} @change=${() => change(() => selection.toggleAll(fleet.shown))}></span>
+          <span role="columnheader"><input type="checkbox" aria-label="Select all that are shown" .checked=${isAll} .indeterminate=${!isAll && selection.size > 0} @change=${({ currentTarget }) => this.#toggleAll(currentTarget)}></span>
           ${this.#columns.map(({ id, title }) => html`
             <span role="columnheader" aria-sort=${sort === id ? (isDescending ? 'descending' : 'ascending') : 'none'}>
               <button class="plain" @click=${() => this.#look({ sort: id, isDescending: sort === id && !isDescending })}>${title}<span class="arrow" aria-hidden="true">${sort === id ? (isDescending ? '↓' : '↑') : ''}</span></button>
@@ -152,11 +152,30 @@ export class RobotsView {
     const wrong = isNarrow ? troubles(robot) : [];
     return guard([robot, index, isChosen, tabindex, isNarrow, this.#columns, operations.length, Math.floor(now / 1000)], () => html`
       <div class="row" role="row" tabindex=${tabindex} aria-rowindex=${index + 2} aria-selected=${isChosen} data-key=${robot.id} data-robot=${robot.id} @focusin=${() => (this.#cursor.current = robot.id)}>
-        <span class="choose" role="gridcell"><input type="checkbox" aria-label=${`Select ${robot.name}`} .checked=${isChosen} @click=${(event) => change(() => selection.toggle(robot.id, fleet.shown, event.shiftKey))}></span>
+        <span class="choose" role="gridcell"><input type="checkbox" aria-label=${`Select ${robot.name}`} .checked=${isChosen} @click=${(event) => this.#toggle(robot.id, event)}></span>
         ${wrong.length ? html`<span class="cell trouble" role="gridcell">${wrong}</span>` : nothing}
         ${this.#columns.map(({ id, look, cell }) => html`<span class="cell ${id} ${look ?? ''}" role="gridcell">${cell(robot, now)}</span>`)}
         ${operations.length ? html`<span class="cell operations" role="gridcell">${operations.map(([title, act]) => html`<button class="plain" aria-label=${`${title} ${robot.name}`} @click=${() => act(robot)}>${title}</button>`)}</span>` : nothing}
       </div>`);
+  }
+
+  // A box has turned by itself when it was clicked, also where what it stands for stays: the next drawing would not find it changed.
+
+  #toggle(id, { currentTarget, shiftKey }) {
+    const { selection, fleet } = this.app;
+    change(() => selection.toggle(id, fleet.shown, shiftKey));
+    currentTarget.checked = selection.has(id);
+  }
+
+  #toggleAll(box) {
+    const { selection, fleet } = this.app;
+    change(() => selection.toggleAll(fleet.shown));
+    box.checked = this.#isAll;
+  }
+
+  get #isAll() {
+    const { fleet: { shown }, selection } = this.app;
+    return shown.length > 0 && shown.every((id) => selection.has(id));
   }
 
   /** What this person may do with a robot, in the words of the paper. */

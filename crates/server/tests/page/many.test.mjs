@@ -251,6 +251,20 @@ test('robots are chosen one by one, as a range, and all that match', async (t) =
   await box('corvus').click();
   await page.getByRole('button', { name: 'Select all 2 that match' }).click();
   await chosen('borea', 'corvus');
+  // A range back to where one is chosen already leaves it so, and its box says that.
+  await box('corvus').click();
+  await chosen('borea');
+  await box('corvus').click();
+  await box('borea').click({ modifiers: ['Shift'] });
+  await chosen('borea', 'corvus');
+  for (const name of ['borea', 'corvus']) assert.ok(await box(name).isChecked(), name);
+  // None are all.
+  await page.getByRole('searchbox').fill('nobody');
+  await page.getByText('No robot is like that.').waitFor();
+  const all = page.getByRole('checkbox', { name: 'Select all that are shown' });
+  await all.click();
+  await settled(page);
+  assert.equal(await all.isChecked(), false);
   assertQuiet(page);
 });
 

@@ -3,7 +3,7 @@
 import { html, nothing } from './vendor/lit-html-3.3.3/lit-html.js';
 import { newKey, order, patch, post } from './api.js';
 import { open } from './dialog.js';
-import { idsOf, selectorOf } from './fleet.js';
+import { idsOf, labelsOf, selectorOf } from './fleet.js';
 import { number, plural } from './format.js';
 import { tell } from './notice.js';
 
@@ -111,6 +111,21 @@ export function askDelete(app, ids) {
   });
 }
 
+/** These labels with what was changed from `before` to `after`: what somebody else has changed meanwhile stays. */
+function relabelled(labels, before, after) {
+  const kept = Object.entries(labels).filter(([label]) => !(label in before) || label in after);
+  const set = Object.entries(after).filter(([label, value]) => before[label] !== value);
+  return Object.fromEntries([...kept, ...set]);
+}
+
+/** What of a robot's name and labels was changed since they were as in `robot`, and nothing else. */
+function changesOf(app, robot, name, labels) {
+  const body = {};
+  if (name !== robot.name) body.name = name;
+  if (labels !== labelsOf(robot).join(', ')) body.labels = relabelled((app.fleet.robots.get(robot.id) ?? robot).labels, robot.labels, parseLabels(labels));
+  return body;
+}
+
 /** Changes a robot's name and labels; the rest of its settings is on its own page. */
 export function askEdit(app, robot) {
   open({
@@ -120,12 +135,14 @@ export function askEdit(app, robot) {
       <label for="name">Name</label>
       <input id="name" name="name" required .defaultValue=${robot.name} autocomplete="off" autocapitalize="none" spellcheck="false">
       <label for="labels">Labels</label>
-      <input id="labels" name="labels" .defaultValue=${Object.entries(robot.labels).map(([label, value]) => `${label}=${value}`).join(', ')} placeholder="site=lab, floor=2" autocomplete="off" autocapitalize="none" spellcheck="false">
+      <input id="labels" name="labels" .defaultValue=${labelsOf(robot).join(', ')} placeholder="site=lab, floor=2" autocomplete="off" autocapitalize="none" spellcheck="false">
       <label for="mac">MAC</label>
       <input id="mac" class="code" readonly .defaultValue=${robot.mac}>
       <p class="quiet"><a href=${`#/robots/${encodeURIComponent(robot.name)}/edit`}>Workspace, underlays and limits…</a></p>`,
     async act({ name, labels }) {
-      await patch(`/robots/${robot.id}`, { name: name.trim(), labels: parseLabels(labels) });
+      const body = changesOf(app, robot, name.trim(), labels);
+      if (!Object.keys(body).length) return;
+      await patch(`/robots/${robot.id}`, body);
       tell(`${name.trim()} is changed.`);
     },
   });

@@ -45,3 +45,28 @@ test('who is limited to some robots retries those', async (t) => {
   assert.deepEqual(await receivers(server, await newest(server)), ['atlas']);
   assertQuiet(page);
 });
+
+test('labels that somebody else changes while a robot is edited stay', async (t) => {
+  const server = await Server.start(t);
+  const [{ id }] = await enrolAll(server, { atlas: { site: 'lab', floor: '2', zone: 'a' } });
+  const page = await open(t, server);
+  await page.getByText('Columns').click();
+  await page.getByLabel('Labels').check();
+  const dialog = page.getByRole('dialog');
+  const edit = async ({ meanwhile, field, text }) => {
+    await page.getByRole('button', { name: /^Edit / }).click();
+    await server.ask('PATCH', `/robots/${id}`, { labels: meanwhile });
+    await page.locator('.cell.labels', { hasText: Object.entries(meanwhile).sort().map((pair) => pair.join('=')).join(', ') }).waitFor();
+    await dialog.getByLabel(field).fill(text);
+    await dialog.getByRole('button', { name: 'Save' }).click();
+    await page.getByText('is changed.').waitFor();
+    await page.getByRole('button', { name: 'Close the notice' }).click();
+    return (await server.ask('GET', `/robots/${id}`)).labels;
+  };
+  const first = { cart: 'one', floor: '3', site: 'lab' };
+  assert.deepEqual(await edit({ meanwhile: first, field: 'Name', text: 'atlas-2' }), first);
+  // And those that were edited are changed.
+  const labels = await edit({ meanwhile: { cart: 'one', floor: '4', site: 'lab', spare: 'yes' }, field: 'Labels', text: 'floor=3, site=yard' });
+  assert.deepEqual(labels, { floor: '4', site: 'yard', spare: 'yes' });
+  assertQuiet(page);
+});

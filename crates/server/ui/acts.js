@@ -3,7 +3,7 @@
 import { html, nothing } from './vendor/lit-html-3.3.3/lit-html.js';
 import { newKey, order, patch, post } from './api.js';
 import { open } from './dialog.js';
-import { idsOf, labelsOf, selectorOf } from './fleet.js';
+import { idsOf, labelsOf } from './fleet.js';
 import { number, plural } from './format.js';
 import { tell } from './notice.js';
 
@@ -37,8 +37,7 @@ export function askTask(app, verb, ids, only = null) {
   const { title, done, isDangerous } = VERBS[verb];
   const tasks = tasksOf(ids, app.fleet).filter(([task]) => !only || task === only);
   const chosen = new Set(ids);
-  const key = newKey();
-  let selector;
+  const [key, selector] = [newKey(), idsOf(chosen)];
   open({
     title: `${title} ${only ?? 'tasks'} on ${whom(chosen, app.fleet)}`,
     isDangerous,
@@ -50,8 +49,6 @@ export function askTask(app, verb, ids, only = null) {
     async act({ task = [] }) {
       const wanted = [task].flat();
       if (!wanted.length) throw new Error('Choose a task.');
-      // Sent again, it has to be the same order.
-      selector ??= selectorOf(chosen, app);
       const robots = new Set();
       const without = new Set();
       for (const name of wanted) {
@@ -80,7 +77,7 @@ export function askLabels(app, ids) {
     async act({ labels, taken = [] }) {
       const [set, remove] = [parseLabels(labels), [taken].flat()];
       if (!Object.keys(set).length && !remove.length) throw new Error('Say which labels.');
-      const { robots } = await post('/bulk/labels', { selector: selectorOf(chosen, app), set, remove });
+      const { robots } = await post('/bulk/labels', { selector: idsOf(chosen), set, remove });
       tell(`${plural(robots.length, 'robot')} labelled.`);
     },
   });

@@ -51,8 +51,6 @@ const app = {
   me: null,
   /** The server's time. */
   now: () => Date.now() + page.clockAheadMs,
-  /** Whether no robot is but those that are in the fleet: all were listed, nothing is missed, and nobody hides any. */
-  knowsAll: () => app.fleet.isLoaded && page.stream.state === 'open' && !page.backlog && app.me?.scope.length === 0,
   /** Whether this person may do it: `read`, `operate`, `publish`, `maintain`, `administer`. */
   can: (permission) => Boolean(app.me?.permissions.includes(permission)),
   /** Does what may fail, and says so where everybody looks. Answers what `act` did, or nothing. */

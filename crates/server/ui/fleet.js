@@ -247,12 +247,5 @@ export class Selection {
   }
 }
 
-/** A selector that means these robots and no others. It says who is left out, which is shorter, only where all that there are are known. */
-export function selectorOf(ids, { fleet, knowsAll }) {
-  const others = knowsAll() ? [...fleet.robots.keys()].filter((id) => !ids.has(id)) : null;
-  if (!others || others.length >= ids.size) return idsOf(ids);
-  return others.map((id) => `!${id}`).join(',') || '*';
-}
-
-/** A selector that names each of them, and nobody who comes meanwhile. */
+/** A selector that names each of them: by what they have in common it would also mean robots that were never shown. */
 export const idsOf = (ids) => [...ids].join(',');

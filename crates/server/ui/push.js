@@ -4,7 +4,7 @@ import { html, nothing } from './vendor/lit-html-3.3.3/lit-html.js';
 import { names, whom } from './acts.js';
 import { get, newKey, order, SignedOut } from './api.js';
 import { open } from './dialog.js';
-import { labelsOf, selectorOf } from './fleet.js';
+import { idsOf, labelsOf } from './fleet.js';
 import { number, plural, short, size, words } from './format.js';
 import { change } from './frame.js';
 import { go } from './router.js';
@@ -42,8 +42,6 @@ class Order {
   #keyed = null;
   #timer;
   #asked = 0;
-  /** Of the robots that were chosen, made once: sent again, it has to be the same order. */
-  #ofIds;
   /** What the selector means now: `{ total, some }`, or a `problem`. */
   #match = {};
   /** What the server refused, at its field. */
@@ -181,8 +179,7 @@ class Order {
     const { name, delivery, selector } = this.fields;
     const version = this.#version;
     if (!version) this.#refuse('name', `There is no package ${name}.`);
-    if (this.ids) this.#ofIds ??= selectorOf(this.ids, this.app);
-    const body = { package: name, manifest: version.package.manifest.digest, delivery, selector: this.#ofIds ?? selector.trim() };
+    const body = { package: name, manifest: version.package.manifest.digest, delivery, selector: this.ids ? idsOf(this.ids) : selector.trim() };
     const { batch, max_failures, priority, hours } = this.fields;
     for (const [field, value] of Object.entries({ batch, max_failures, priority, expires_in_s: hours && Number(hours) * 3600 })) if (value !== '') body[field] = Number(value);
     const text = JSON.stringify(body);

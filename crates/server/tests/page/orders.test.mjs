@@ -1,7 +1,7 @@
 // Orders are for the robots that the page has named, and for no others, whatever happens before they are sent.
 
 import { test } from 'node:test';
-import { assert, assertQuiet, eventually, open, Puppet, Server } from './harness.mjs';
+import { assert, assertQuiet, live, open, Puppet, Server } from './harness.mjs';
 
 const FAILED = { each: () => ({ failure: { code: 'build_failed', text: 'colcon build ended with status 1' } }) };
 
@@ -68,5 +68,42 @@ test('labels that somebody else changes while a robot is edited stay', async (t)
   // And those that were edited are changed.
   const labels = await edit({ meanwhile: { cart: 'one', floor: '4', site: 'lab', spare: 'yes' }, field: 'Labels', text: 'floor=3, site=yard' });
   assert.deepEqual(labels, { floor: '4', site: 'yard', spare: 'yes' });
+  assertQuiet(page);
+});
+
+/** A stream that is open and says nothing, as behind a proxy that keeps back what it gets. */
+function stallStream() {
+  delete window.SharedWorker;
+  const { fetch } = window;
+  window.fetch = (url, options) => (url === '/api/v1/events' ? Promise.resolve(new Response(new ReadableStream())) : fetch(url, options));
+}
+
+test('who comes unseen gets nothing of what is ordered for all', async (t) => {
+  const server = await Server.start(t);
+  await enrolAll(server, { atlas: {}, borea: {} });
+  server.push('talker', '1.0.0', { to: '*' });
+  const page = await open(t, server);
+  await page.addInitScript(stallStream);
+  await page.reload();
+  await live(page);
+  await page.getByRole('checkbox', { name: 'Select all that are shown' }).click();
+  await page.getByText('2 selected').waitFor();
+  await Puppet.enroll(server, 'corvus');
+  server.push('talker', '1.0.0', { to: 'corvus' });
+  const dialog = page.getByRole('dialog');
+  await page.getByRole('button', { name: 'Label…' }).click();
+  await page.getByLabel('Labels to set').fill('floor=2');
+  await dialog.getByRole('button', { name: 'Label' }).click();
+  await page.getByText('2 robots labelled.').waitFor();
+  await page.getByRole('button', { name: 'Stop…' }).click();
+  await dialog.getByLabel('talker').check();
+  await dialog.getByRole('button', { name: 'Stop' }).click();
+  await page.getByText('talker: to be stopped on 2 robots.').waitFor();
+  const corvus = await server.ask('GET', '/robots/corvus');
+  assert.deepEqual([corvus.labels, corvus.tasks[0].wanted], [{}, 'running']);
+  await page.getByRole('button', { name: 'Push…' }).click();
+  await dialog.getByRole('button', { name: 'Deploy' }).click();
+  await page.waitForURL(/#\/deployments\/d/);
+  assert.deepEqual(await receivers(server, await newest(server)), ['atlas', 'borea']);
   assertQuiet(page);
 });

@@ -192,11 +192,13 @@ addEventListener('hashchange', ({ oldURL }) => {
 
 // Listening
 
-function hear({ state, events, retry_at }) {
+function hear({ state, events, retry_at, problem }) {
   if (!live) return;
   if (state === 'signed_out') return leave();
-  if (state) change(() => (page.stream = { state, retry_at }));
+  if (state) change(() => (page.stream = { state, retry_at, problem }));
   if (state === 'open') page.hurry ? page.hurry() : refetch();
+  // Without a stream there is still what the server lists.
+  if (state === 'waiting' && !app.fleet.isLoaded && !page.backlog) refetch();
   if (!events) return;
   page.heardAt = app.now();
   if (page.backlog) page.backlog.push(...events);
@@ -319,12 +321,12 @@ const whoIsIt = ({ name, scope }) => (scope.length ? `${name}, ${scope.join(' an
 
 /** What moves on each second is for the eye only: read aloud, it would never stop. */
 function streamState(now) {
-  const { state, retry_at } = page.stream;
+  const { state, retry_at, problem } = page.stream;
   if (state === 'open' && app.fleet.isLoaded) return sign(true, 'Live');
   const since = page.heardAt ? `, shown as of ${ago(page.heardAt, now)}` : '';
   if (state !== 'waiting') return sign(false, html`Connecting<span aria-hidden="true">${since}</span>`);
   const seconds = Math.max(0, Math.ceil((retry_at - Date.now()) / 1000));
-  return sign(false, html`<span class="bad">Not live<span aria-hidden="true">${since}; trying again in ${plural(seconds, 'second')}</span></span>`);
+  return sign(false, html`<span class="bad">Not live${problem ? ` (${problem})` : ''}<span aria-hidden="true">${since}; trying again in ${plural(seconds, 'second')}</span></span>`);
 }
 
 // Keys

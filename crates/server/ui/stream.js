@@ -10,8 +10,9 @@ const LONGEST_PAUSE_MS = 20_000;
 const LONGEST_LINE = 16 * 1024 * 1024;
 
 /**
- * Opens the stream. `tell` gets `{events: [...]}` and `{state}`, one of `open`, `waiting` (with `retry_at`) and `signed_out`,
- * after which nothing follows. Returns a function that ends it. `url` is whose events: all there are, or a robot's lines.
+ * Opens the stream. `tell` gets `{events: [...]}` and `{state}`, one of `open`, `waiting` (with `retry_at` and, where the server
+ * refused, its words as `problem`) and `signed_out`, after which nothing follows. Returns a function that ends it. `url` is whose
+ * events: all there are, or a robot's lines.
  */
 export function openStream(tell, url = URL_OF_EVENTS) {
   const end = new AbortController();
@@ -27,13 +28,13 @@ async function follow(tell, url, end) {
       wasOpen = true;
       tell({ state: 'open' });
     };
-    const status = await read(tell, url, opened, end);
+    const { status, problem } = await read(tell, url, opened, end);
     if (end.aborted) return;
     if (status === 401) return tell({ state: 'signed_out' });
     pause = wasOpen ? FIRST_PAUSE_MS : Math.min(pause * 2, LONGEST_PAUSE_MS);
     // Spread out, so that a restarted server is not met by every page at once.
     const wait = pause * (0.5 + Math.random() / 2);
-    tell({ state: 'waiting', retry_at: Date.now() + wait });
+    tell({ state: 'waiting', retry_at: Date.now() + wait, problem });
     await rest(wait, end);
   }
 }
@@ -49,14 +50,14 @@ const rest = (ms, end) => new Promise((resume) => {
   end.addEventListener('abort', done);
 });
 
-/** Reads one connection to its end. Answers the HTTP status, or nothing if there was none. */
+/** Reads one connection to its end. Answers the HTTP status, if there was one, and why the server refused, if it did. */
 async function read(tell, url, opened, end) {
   const silence = new AbortController();
   let watchdog = setTimeout(() => silence.abort(), SILENCE_MS);
   try {
     const signal = AbortSignal.any([end, silence.signal]);
     const response = await fetch(url, { headers: { accept: 'text/event-stream' }, cache: 'no-store', signal });
-    if (!response.ok) return response.status;
+    if (!response.ok) return { status: response.status, problem: await refusal(response) };
     opened();
     let rest = '';
     for await (const text of chunks(response.body)) {
@@ -69,13 +70,19 @@ async function read(tell, url, opened, end) {
       const events = lines.filter((line) => line.startsWith('data:')).map((line) => JSON.parse(line.slice(5)));
       if (events.length) tell({ events });
     }
-    return response.status;
+    return { status: response.status };
   } catch {
-    return undefined;
+    return {};
   } finally {
     clearTimeout(watchdog);
     silence.abort();
   }
+}
+
+/** `503: too many listen`, in the server's words or in those of whatever stands before it. */
+async function refusal(response) {
+  const said = await response.json().catch(() => null);
+  return [response.status, said?.error?.message ?? response.statusText].filter(Boolean).join(': ');
 }
 
 async function* chunks(body) {

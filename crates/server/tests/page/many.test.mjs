@@ -76,6 +76,22 @@ test('a wrong token is refused in words, and a restarted server is found again',
   assert.equal(await page.evaluate(() => fetch('/api/v1/robots').then(({ status }) => status)), 401);
 });
 
+test('a page whose stream is refused says why, and shows what there is', async (t) => {
+  const server = await Server.start(t);
+  await Puppet.enroll(server, 'atlas');
+  const page = await open(t, server);
+  // The tabs' shared worker asks where a test can't answer for the server.
+  await page.addInitScript(() => delete window.SharedWorker);
+  const refusal = { error: { code: 'too_many_requests', message: 'too many listen already' } };
+  await page.route(/\/events$/, (route) => route.fulfill({ status: 429, json: refusal }));
+  await page.reload();
+  await page.locator('.stream', { hasText: 'Not live (429: too many listen already)' }).waitFor();
+  await page.locator('[data-robot]', { hasText: 'atlas' }).waitFor();
+  await page.unrouteAll();
+  await live(page);
+  assert.ok(takeComplaints(page).every((said) => said.includes('status of 429')));
+});
+
 test('a link with a token signs nobody in by itself', async (t) => {
   const server = await Server.start(t);
   await server.ask('POST', '/users', { name: 'mallory', roles: ['viewer'] });

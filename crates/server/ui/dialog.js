@@ -10,16 +10,25 @@ let current = null;
 let settled = null;
 /** How often the browser has yet to say that its dialog was closed by us, which it does late: the next question may be open by then. */
 let ownClosings = 0;
+/** Whether the pointer went down beside the dialog: a click that only ends there has begun within, as when text is selected. */
+let isPressedBeside = false;
 
 /**
  * Opens a dialog. `question` has a `title`, `body()` (a template, drawn again each frame), the `action`'s words, whether it
  * `isDangerous`, the words to leave it by if `Cancel` would be unclear (`dismissal`), and `act(fields)`, which gets what the form holds and may throw: the dialog stays open
  * and says why, unless the error `isSaid` already.
- * Without an `action` there is only something to read.
+ * Without an `action` there is only something to read. What is shown but once `isSecret`: only buttons
+ * close it, one of them with the words of `dismissal`.
+ * Answers the question, by which `isOpen` knows it.
  */
 export function open(question) {
-  change(() => (current = { ...question, problem: null, isBusy: false }));
+  const asked = { ...question, problem: null, isBusy: false };
+  change(() => (current = asked));
+  return asked;
 }
+
+/** Whether it is still this question that is asked. */
+export const isOpen = (question) => current === question;
 
 /** At once: the next key is the view's. */
 export function close() {
@@ -33,6 +42,8 @@ export function close() {
 /** The browser's dialog was closed: by us, or by a gesture that is the browser's. */
 function closed() {
   if (ownClosings > 0) ownClosings -= 1;
+  // The next drawing opens it again.
+  else if (current?.isSecret) change();
   else close();
 }
 
@@ -41,7 +52,7 @@ export function takesKey(event) {
   if (!current) return false;
   if (event.key === 'Escape') {
     event.preventDefault();
-    close();
+    if (!current.isSecret) close();
   }
   return true;
 }
@@ -63,12 +74,19 @@ async function submit(event) {
   }
 }
 
+const isBeside = ({ target, currentTarget }) => target === currentTarget;
+
+/** A click beside the dialog leaves it. */
+function click(event) {
+  if (isBeside(event) && isPressedBeside && !current?.isSecret) close();
+}
+
 export const dialogView = () => html`
-  <dialog id="dialog" aria-labelledby="dialog-title" @close=${closed} @click=${(event) => event.target === event.currentTarget && close()}>
+  <dialog id="dialog" aria-labelledby="dialog-title" @close=${closed} @pointerdown=${(event) => (isPressedBeside = isBeside(event))} @click=${click}>
     ${current ? content(current) : nothing}
   </dialog>`;
 
-const content = ({ title, body, action, dismissal = 'Cancel', isDangerous, isBusy, problem }) => html`
+const content = ({ title, body, action, dismissal = 'Cancel', isDangerous, isSecret, isBusy, problem }) => html`
   <form @submit=${submit}>
     <header>
       <h2 id="dialog-title">${title}</h2>
@@ -77,6 +95,7 @@ const content = ({ title, body, action, dismissal = 'Cancel', isDangerous, isBus
     ${body()}
     <p class="bad" role="alert">${problem ? `▲ ${problem}` : ''}</p>
     ${action ? html`<footer><button type="button" class="quiet-button" @click=${close}>${dismissal}</button><button class=${isDangerous ? 'danger' : 'primary'} ?disabled=${isBusy}>${action}</button></footer>` : nothing}
+    ${isSecret ? html`<footer><button type="button" class="primary" @click=${close}>${dismissal}</button></footer>` : nothing}
   </form>`;
 
 /** Opens the browser's own dialog for a new question; to be called after each drawing. */

@@ -3,7 +3,7 @@
 import { html, nothing } from './vendor/lit-html-3.3.3/lit-html.js';
 import { names, whom } from './acts.js';
 import { get, newKey, order, SignedOut } from './api.js';
-import { open } from './dialog.js';
+import { close, isOpen, open } from './dialog.js';
 import { idsOf, labelsOf } from './fleet.js';
 import { number, plural, short, size, words } from './format.js';
 import { change } from './frame.js';
@@ -30,10 +30,15 @@ const DELIVERIES = [
  * `manifest` that are chosen already.
  */
 export async function askPush(app, ids = null, given = {}) {
+  const chosen = ids && new Set(ids);
+  const title = chosen ? `Push to ${whom(chosen, app.fleet)}` : 'New deployment';
+  const waiting = open({ title, body: () => html`<p class="quiet" role="status">Fetching…</p>` });
   const list = await app.attempt(() => get('/packages'));
-  if (!list) return;
-  const question = new Order(app, ids && new Set(ids), list.packages, given);
-  open({ title: ids ? `Push to ${whom(ids, app.fleet)}` : 'New deployment', action: list.packages.length ? 'Deploy' : null, body: () => question.body(), act: () => question.act() });
+  // Whoever has left it meanwhile, or asks something else, is not disturbed.
+  if (!isOpen(waiting)) return;
+  if (!list) return void close();
+  const question = new Order(app, chosen, list.packages, given);
+  open({ title, action: list.packages.length ? 'Deploy' : null, body: () => question.body(), act: () => question.act() });
 }
 
 class Order {

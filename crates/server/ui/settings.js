@@ -231,4 +231,4 @@ const table = (heads, rows, label) => html`
   </table></div>`;
 
 /** Shows lines to copy that can't be had again. */
-const showSecret = (title, lines, note) => open({ title, body: () => html`${lines.map(command)}<p class="quiet">${note}</p>` });
+const showSecret = (title, lines, note) => open({ title, isSecret: true, dismissal: 'I have it', body: () => html`${lines.map(command)}<p class="quiet">${note}</p>` });

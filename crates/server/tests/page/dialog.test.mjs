@@ -1,0 +1,80 @@
+// What closes a question and what does not, so that nobody loses what they have typed or are shown but once.
+
+import { test } from 'node:test';
+import { assert, assertAccessible, assertQuiet, open, Puppet, Server, settled } from './harness.mjs';
+
+/** A place beside the dialog. */
+const BESIDE = [5, 450];
+
+test('text that is selected to beyond the edge of a question is kept', async (t) => {
+  const server = await Server.start(t);
+  await Puppet.enroll(server, 'atlas');
+  const page = await open(t, server);
+  await page.getByRole('checkbox', { name: 'Select atlas' }).click();
+  await page.getByRole('button', { name: 'Label…' }).click();
+  const field = page.getByLabel('Labels to set');
+  await field.fill('site=lab');
+  const { x, y, height } = await field.boundingBox();
+  await page.mouse.move(x + 60, y + height / 2);
+  await page.mouse.down();
+  await page.mouse.move(...BESIDE);
+  await page.mouse.up();
+  await settled(page);
+  assert.equal(await field.inputValue(), 'site=lab');
+  // A click beside it leaves it, as ever.
+  await page.mouse.click(...BESIDE);
+  await page.getByRole('dialog').waitFor({ state: 'hidden' });
+  assertQuiet(page);
+});
+
+test('what is shown but once stays until somebody says that they have it', async (t) => {
+  const server = await Server.start(t);
+  const page = await open(t, server, { hash: '#/settings' });
+  const dialog = page.getByRole('dialog');
+  await page.locator('section', { hasText: 'Enrolment tokens' }).getByRole('button', { name: 'New token…' }).click();
+  await dialog.getByRole('button', { name: 'Make it' }).click();
+  const secret = dialog.locator('code', { hasText: '--token' });
+  await secret.waitFor();
+  // By keys twice, because of a browser that is asked again it closes a dialog by itself.
+  await page.keyboard.press('Escape');
+  await page.keyboard.press('Escape');
+  await page.mouse.click(...BESIDE);
+  await settled(page);
+  assert.ok(await secret.isVisible());
+  await assertAccessible(page, 'the secret');
+  await dialog.getByRole('button', { name: 'I have it' }).click();
+  await dialog.waitFor({ state: 'hidden' });
+  assertQuiet(page);
+});
+
+test('an order that waits for the packages takes the place of no other question', async (t) => {
+  const server = await Server.start(t);
+  await Puppet.enroll(server, 'atlas');
+  server.push('talker', '1.0.0');
+  const page = await open(t, server);
+  const dialog = page.getByRole('dialog');
+  const push = async () => {
+    const asked = new Promise((resume) => page.route(/\/packages$/, resume, { times: 1 }));
+    await page.getByRole('button', { name: 'Push…' }).click();
+    await dialog.getByRole('heading', { name: 'Push to atlas' }).waitFor();
+    await dialog.getByText('Fetching…').waitFor();
+    return asked;
+  };
+  const answer = async (route) => {
+    const answered = page.waitForResponse(/\/packages$/);
+    await route.continue();
+    await (await answered).finished();
+    await settled(page);
+  };
+  await page.getByRole('checkbox', { name: 'Select atlas' }).click();
+  const left = await push();
+  await page.keyboard.press('Escape');
+  await page.getByRole('button', { name: 'Label…' }).click();
+  await answer(left);
+  assert.equal(await dialog.getByRole('heading').innerText(), 'Label atlas');
+  await page.keyboard.press('Escape');
+  await answer(await push());
+  await dialog.getByRole('button', { name: 'Deploy' }).waitFor();
+  assert.equal(await page.evaluate(() => document.activeElement.id), 'order-name', 'what is to be filled in has the focus');
+  assertQuiet(page);
+});

@@ -46,6 +46,21 @@ test('who is limited to some robots retries those', async (t) => {
   assertQuiet(page);
 });
 
+test('what a newer order has taken the place of is not to be retried', async (t) => {
+  const server = await Server.start(t);
+  const robots = await enrolAll(server, { atlas: {}, borea: {} });
+  const { id } = server.push('talker', '1.0.0', { to: '*' });
+  for (const robot of robots) await robot.report('failed', FAILED);
+  const page = await open(t, server, { hash: `#/deployments/${id}` });
+  await page.getByRole('button', { name: 'Retry 2 robots…' }).waitFor();
+  server.push('talker', '1.1.0', { to: 'atlas' });
+  await page.getByRole('button', { name: 'Retry 1 robot…' }).waitFor();
+  server.push('talker', '1.1.0', { to: 'borea' });
+  await page.getByRole('button', { name: 'Retry 1 robot…' }).waitFor({ state: 'detached' });
+  await page.getByText('superseded by').waitFor();
+  assertQuiet(page);
+});
+
 test('labels that somebody else changes while a robot is edited stay', async (t) => {
   const server = await Server.start(t);
   const [{ id }] = await enrolAll(server, { atlas: { site: 'lab', floor: '2', zone: 'a' } });

@@ -19,11 +19,15 @@ export class Parts {
   all = new Map();
   #slices = [];
   #summary = null;
+  /** Of robots whose part ended badly: which other deployment of the same task they have, and the server was asked about. */
+  #others = new Map();
+  #task;
   /** Bytes that each robot has to fetch. */
   size = 0;
 
   /** Takes in what the server lists. */
-  renew({ assignments, package: { content } }) {
+  renew({ assignments, package: { name, content } }) {
+    this.#task = name;
     this.size = content.size;
     this.#summary = null;
     this.all = new Map(assignments.map((part) => [part.robot, { ...part, timeline: this.#longer(part) }]));
@@ -42,6 +46,7 @@ export class Parts {
     if (!part) return robot.tasks.some((task) => task.deployment === deployment);
     part.online = robot.online;
     const task = robot.tasks.find((one) => one.deployment === deployment);
+    if (!task && canRetry(part)) return this.#isOther(robot);
     // Before its batch begins, the robot knows nothing of it.
     if (!task) return part.released && !ENDS.has(part.phase) && tone(part.phase) !== 'gone' && !part.superseded_by;
     const before = this.bytesOf(part);
@@ -54,6 +59,14 @@ export class Parts {
     }
     if (wasFetching || task.phase === 'fetching') this.#count(this.bytesOf(part) - before, now);
     return false;
+  }
+
+  /** Whether it has the task from another deployment than before: a newer order may have taken the place of this one. */
+  #isOther({ id, tasks }) {
+    const other = tasks.find(({ task }) => task === this.#task)?.deployment;
+    const isNew = other !== undefined && this.#others.get(id) !== other;
+    if (isNew) this.#others.set(id, other);
+    return isNew;
   }
 
   /** Forgets a robot that was removed. */

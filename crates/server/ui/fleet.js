@@ -49,6 +49,11 @@ const urgency = ({ phase }) => ({ bad: 0, busy: 1, waiting: 2, done: 3, gone: 4 
 
 export const labelsOf = ({ labels }) => Object.entries(labels).map(([label, value]) => `${label}=${value}`);
 
+const versionsOf = ({ tasks }) => tasks.map(({ task, version }) => `${task}@${version}`);
+
+/** What is meant exactly where it is written whole, by the sign in it. */
+const NAMED = { '=': labelsOf, '@': versionsOf };
+
 /** Under what a robot is counted. */
 function standingsOf({ online, tasks, conditions }) {
   const isFailed = tasks.some(({ phase }) => tone(phase) === 'bad');
@@ -175,11 +180,11 @@ export class Fleet {
 
   order(now = performance.now()) {
     const { text, standing, sort, isDescending } = this.search;
-    const words = text.toLowerCase().split(/\s+/).filter(Boolean);
+    const tests = text.toLowerCase().split(/\s+/).filter(Boolean).map((word) => this.#testOf(word));
     const rows = [];
     for (const robot of this.robots.values()) {
       if (standing && !this.#standings.get(robot.id)[standing]) continue;
-      if (words.length && !this.#hasWords(robot, words)) continue;
+      if (!tests.every((isLike) => isLike(robot))) continue;
       rows.push({ id: robot.id, key: KEYS[sort](robot), name: KEYS.name(robot) });
     }
     const sign = isDescending ? -1 : 1;
@@ -189,24 +194,37 @@ export class Fleet {
     this.#orderedAt = now;
   }
 
-  /** Whether each word occurs in what the row shows, or in the robot's labels. A robot's text is made once. */
-  #hasWords(robot, words) {
+  /**
+   * Whether a robot is found by this word. `key=value` means that label and no longer one, `name@version` that version, where there
+   * are such labels and tasks; all else may occur anywhere in what a robot is known by.
+   */
+  #testOf(word) {
+    for (const [sign, namesOf] of Object.entries(NAMED)) {
+      const [name, value] = word.split(sign, 2);
+      const isName = (robot) => namesOf(robot).some((one) => one.toLowerCase().startsWith(`${name}${sign}`));
+      if (name && value && [...this.robots.values()].some(isName)) return (robot) => namesOf(robot).some((one) => one.toLowerCase() === word);
+    }
+    return (robot) => this.#textOf(robot).includes(word);
+  }
+
+  /** A robot's text is made once. */
+  #textOf(robot) {
     let text = this.#texts.get(robot);
     if (text === undefined) {
       text = textOf(robot);
       this.#texts.set(robot, text);
     }
-    return words.every((word) => text.includes(word));
+    return text;
   }
 }
 
 const compare = (one, other) => (one < other ? -1 : one > other ? 1 : 0);
 
 function textOf(robot) {
-  const tasks = robot.tasks.map((task) => [`${task.task}@${task.version}`, task.phase, task.deployment, task.failure?.code, task.failure?.text]);
+  const tasks = robot.tasks.map(({ phase, deployment, failure }) => [phase, deployment, failure?.code, failure?.text]);
   const conditions = robot.conditions.flatMap(({ code, text }) => [code, text]);
   const state = robot.online ? 'online' : 'offline';
-  return [robot.id, robot.name, robot.mac, robot.address, state, labelsOf(robot), tasks, conditions].flat(2).join('\n').toLowerCase();
+  return [robot.id, robot.name, robot.mac, robot.address, state, labelsOf(robot), versionsOf(robot), tasks, conditions].flat(2).join('\n').toLowerCase();
 }
 
 /** Robots that a person has chosen, and how an order names them. */

@@ -284,6 +284,25 @@ test('robots are chosen one by one, as a range, and all that match', async (t) =
   assertQuiet(page);
 });
 
+test('a label and a version that are searched for are meant exactly', async (t) => {
+  const server = await Server.start(t);
+  const sites = { atlas: 'lab', borea: 'lab2', corvus: 'lab', delphin: 'yard' };
+  for (const [name, site] of Object.entries(sites)) await Puppet.enroll(server, name, { site });
+  server.push('talker', '1.0.0', { to: 'atlas' });
+  server.push('talker', '1.0.0-rc1', { to: 'borea' });
+  const page = await open(t, server);
+  const shown = (...names) => until(page, (all) => [...document.querySelectorAll('[data-robot] .name')].map((one) => one.innerText).join() === all, names.join());
+  const search = (text) => page.getByRole('searchbox').fill(text);
+  for (const [text, ...names] of [
+    ['site=lab', 'atlas', 'corvus'], ['Site=Lab2', 'borea'], ['site=', 'atlas', 'borea', 'corvus', 'delphin'], ['e=lab', 'atlas', 'borea', 'corvus'],
+    ['talker@1.0.0', 'atlas'], ['talker@1.0.0-rc1', 'borea'], ['ker@1.0.0', 'atlas', 'borea'], ['site=lab talker@1.0.0', 'atlas'],
+  ]) {
+    await search(text);
+    await shown(...names);
+  }
+  assertQuiet(page);
+});
+
 test('a question asked right after another was left stays', async (t) => {
   const server = await Server.start(t);
   const page = await open(t, server);

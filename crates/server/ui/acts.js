@@ -1,9 +1,9 @@
 // What is asked before something is done with robots that are chosen.
 
 import { html, nothing } from './vendor/lit-html-3.3.3/lit-html.js';
-import { newKey, order, patch, post } from './api.js';
+import { newKey, order, patch, post, remove } from './api.js';
 import { open } from './dialog.js';
-import { idsOf, labelsOf } from './fleet.js';
+import { idsOf, isWaiting, labelsOf } from './fleet.js';
 import { number, plural } from './format.js';
 import { tell } from './notice.js';
 
@@ -16,6 +16,12 @@ export function names(ids, fleet) {
   const rest = ids.size - some.length;
   return html`<p class="quiet names">${some.join(', ')}${rest > 0 ? ` and ${number(rest)} more` : ''}</p>`;
 }
+
+/** Those of them that get what is ordered. */
+export const receivers = (ids, fleet) => new Set([...ids].filter((id) => !isWaiting(fleet.robots.get(id))));
+
+/** Says that some of those who were chosen get nothing. */
+export const leftOut = (count) => (count ? html`<p class="quiet">${number(count)} of those that were chosen ${count === 1 ? 'waits' : 'wait'} for approval and ${count === 1 ? 'gets' : 'get'} nothing until then.</p>` : nothing);
 
 /** The tasks that these robots have, each with how many have it. */
 function tasksOf(ids, fleet) {
@@ -35,14 +41,15 @@ const VERBS = {
 /** Orders a task started, stopped, restarted, rolled back or removed on these robots. */
 export function askTask(app, verb, ids, only = null) {
   const { title, done, isDangerous } = VERBS[verb];
-  const tasks = tasksOf(ids, app.fleet).filter(([task]) => !only || task === only);
-  const chosen = new Set(ids);
+  const chosen = receivers(ids, app.fleet);
+  const tasks = tasksOf(chosen, app.fleet).filter(([task]) => !only || task === only);
+  const left = ids.size - chosen.size;
   const [key, selector] = [newKey(), idsOf(chosen)];
   open({
     title: `${title} ${only ?? 'tasks'} on ${whom(chosen, app.fleet)}`,
     isDangerous,
     action: tasks.length ? title : null,
-    body: () => html`${names(chosen, app.fleet)}
+    body: () => html`${names(chosen, app.fleet)}${leftOut(left)}
       ${tasks.length
         ? html`<fieldset><legend>Which task</legend>${tasks.map(([task, count], index) => html`<label class="choice"><input type="checkbox" name="task" value=${task} ?checked=${index === 0 && tasks.length === 1}> ${task} <span class="quiet">on ${plural(count, 'robot')}</span></label>`)}</fieldset>`
         : html`<p>None of them has a task.</p>`}`,
@@ -64,13 +71,14 @@ export function askTask(app, verb, ids, only = null) {
 
 /** Sets and takes away labels. */
 export function askLabels(app, ids) {
-  const chosen = new Set(ids);
+  const chosen = receivers(ids, app.fleet);
+  const left = ids.size - chosen.size;
   // A field must not be called like what a form can do: `remove` would be no function any more.
   const there = () => [...new Set([...chosen].flatMap((id) => Object.keys(app.fleet.robots.get(id)?.labels ?? {})))].sort();
   open({
     title: `Label ${whom(chosen, app.fleet)}`,
-    action: 'Label',
-    body: () => html`${names(chosen, app.fleet)}
+    action: chosen.size ? 'Label' : null,
+    body: () => html`${names(chosen, app.fleet)}${leftOut(left)}
       <label for="labels">Labels to set</label>
       <input id="labels" name="labels" placeholder="site=lab, floor=2" autocomplete="off" autocapitalize="none" spellcheck="false">
       ${there().length ? html`<fieldset><legend>Labels to take away</legend>${there().map((label) => html`<label class="choice"><input type="checkbox" name="taken" value=${label}> ${label}</label>`)}</fieldset>` : nothing}`,
@@ -93,17 +101,33 @@ export function parseLabels(text) {
   return Object.fromEntries(pairs);
 }
 
+/** Removes those that get orders at once, and one by one those that wait, whom no selector means. Whoever is gone leaves `left`. */
+async function removeAll(left, fleet) {
+  const ordered = receivers(left, fleet);
+  if (ordered.size) await post('/bulk/remove', { selector: idsOf(ordered) });
+  for (const id of ordered) left.delete(id);
+  for (const id of left) {
+    await remove(`/robots/${id}`).catch(ifGone);
+    left.delete(id);
+  }
+}
+
+/** The server gives up those that have waited for too long. */
+function ifGone(error) {
+  if (error.status !== 404) throw error;
+}
+
 /** Removes robots for good. */
 export function askDelete(app, ids) {
-  const chosen = new Set(ids);
+  const [chosen, left] = [new Set(ids), new Set(ids)];
   open({
     title: `Delete ${whom(chosen, app.fleet)}?`,
     action: 'Delete',
     isDangerous: true,
     body: () => html`${names(chosen, app.fleet)}<p>Their tokens end. What runs there goes on running, but nothing new starts. They come back by enrolling again.</p>`,
     async act() {
-      const { robots } = await post('/bulk/remove', { selector: idsOf(chosen) });
-      tell(`${plural(robots.length, 'robot')} deleted.`);
+      await removeAll(left, app.fleet);
+      tell(`${plural(chosen.size, 'robot')} deleted.`);
     },
   });
 }

@@ -47,6 +47,9 @@ function natural(text) {
 // Sorted by task, what needs a look comes first.
 const urgency = ({ phase }) => ({ bad: 0, busy: 1, waiting: 2, done: 3, gone: 4 })[tone(phase)];
 
+/** Whether it has yet to be approved: until then it gets nothing of what is ordered. */
+export const isWaiting = (robot) => Boolean(robot?.conditions.some(({ code }) => code === 'awaits_approval'));
+
 export const labelsOf = ({ labels }) => Object.entries(labels).map(([label, value]) => `${label}=${value}`);
 
 const versionsOf = ({ tasks }) => tasks.map(({ task, version }) => `${task}@${version}`);

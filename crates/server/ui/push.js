@@ -1,10 +1,10 @@
 // The order of a package to robots: which package, which robots, how the bytes travel, how carefully.
 
 import { html, nothing } from './vendor/lit-html-3.3.3/lit-html.js';
-import { names, whom } from './acts.js';
+import { leftOut, names, receivers, whom } from './acts.js';
 import { get, newKey, order, SignedOut } from './api.js';
 import { close, isOpen, open } from './dialog.js';
-import { idsOf, labelsOf } from './fleet.js';
+import { idsOf, isWaiting, labelsOf } from './fleet.js';
 import { number, plural, short, size, words } from './format.js';
 import { change } from './frame.js';
 import { go } from './router.js';
@@ -30,7 +30,8 @@ const DELIVERIES = [
  * `manifest` that are chosen already.
  */
 export async function askPush(app, ids = null, given = {}) {
-  const chosen = ids && new Set(ids);
+  const chosen = ids && receivers(ids, app.fleet);
+  const left = ids ? ids.size - chosen.size : 0;
   const title = chosen ? `Push to ${whom(chosen, app.fleet)}` : 'New deployment';
   const waiting = open({ title, body: () => html`<p class="quiet" role="status">Fetching…</p>` });
   const list = await app.attempt(() => get('/packages'));
@@ -38,7 +39,8 @@ export async function askPush(app, ids = null, given = {}) {
   if (!isOpen(waiting)) return;
   if (!list) return void close();
   const question = new Order(app, chosen, list.packages, given);
-  open({ title, action: list.packages.length ? 'Deploy' : null, body: () => question.body(), act: () => question.act() });
+  const isPossible = list.packages.length && chosen?.size !== 0;
+  open({ title, action: isPossible ? 'Deploy' : null, body: () => html`${question.body()}${leftOut(left)}`, act: () => question.act() });
 }
 
 class Order {
@@ -173,7 +175,7 @@ class Order {
     const asked = (this.#asked += 1);
     const selector = this.fields.selector.trim();
     this.#timer = setTimeout(async () => {
-      const match = selector ? await matchOf(selector) : {};
+      const match = selector ? await matchOf(selector, this.app.fleet) : {};
       if (match && asked === this.#asked) change(() => (this.#match = match));
     }, COUNT_PAUSE_MS);
   }
@@ -219,9 +221,11 @@ function matched(total, some) {
   return `${plural(total, 'robot')} now: ${some.join(', ')}${rest > 0 ? ` and ${number(rest)} more` : ''}`;
 }
 
-async function matchOf(selector) {
+/** Whom the selector means of those that get what is ordered. */
+async function matchOf(selector, fleet) {
+  const waiting = [...fleet.robots.values()].filter(isWaiting).map(({ id }) => `!${id}`);
   try {
-    const { robots, total = robots.length } = await get('/robots', { selector, limit: NAMED });
+    const { robots, total = robots.length } = await get('/robots', { selector: [selector, ...waiting].join(), limit: NAMED });
     return { total, some: robots.slice(0, NAMED).map(({ name }) => name) };
   } catch (error) {
     return error instanceof SignedOut ? null : { problem: error.message };

@@ -5,6 +5,7 @@ import { parseLabels } from './acts.js';
 import { get, post, remove } from './api.js';
 import { command } from './copy.js';
 import { open } from './dialog.js';
+import { isWaiting } from './fleet.js';
 import { duration, moment, number, plural, words } from './format.js';
 import { change } from './frame.js';
 import { tell } from './notice.js';
@@ -21,6 +22,8 @@ export const enrolCommand = ({ token }) => `task-agent enroll --server ${locatio
 export class SettingsView {
   #enrolment = null;
   #pending = [];
+  #isAskingPending = false;
+  #isPendingStale = false;
   #tokens = null;
   #users = null;
   #rules = null;
@@ -45,12 +48,30 @@ export class SettingsView {
       this.#server = server;
     });
     if (!this.#isForAll) return;
-    const [enrolment, pending, users] = await Promise.all(['/enrollment-tokens', '/pending-robots', '/users'].map((path) => app.attempt(() => get(path))));
+    this.#refreshPending();
+    const [enrolment, users] = await Promise.all(['/enrollment-tokens', '/users'].map((path) => app.attempt(() => get(path))));
     change(() => {
       this.#enrolment = enrolment?.tokens ?? [];
-      this.#pending = pending?.robots ?? [];
       this.#users = users?.users ?? [];
     });
+  }
+
+  /** Asks who waits; asked again meanwhile, once more. */
+  async #refreshPending() {
+    this.#isPendingStale = this.#isAskingPending;
+    if (this.#isPendingStale) return;
+    this.#isAskingPending = true;
+    const pending = await this.app.attempt(() => get('/pending-robots'));
+    this.#isAskingPending = false;
+    if (pending) change(() => (this.#pending = pending.robots));
+    if (this.#isPendingStale) this.#refreshPending();
+  }
+
+  /** A robot that waits and is not listed has come, and one that is listed and waits no longer has gone. */
+  hear({ type, robot, id }) {
+    if (!this.#isForAll || (type !== 'robot' && type !== 'robot_removed')) return;
+    const isListed = this.#pending.some((one) => one.id === (robot?.id ?? id));
+    if (isListed !== isWaiting(robot)) this.#refreshPending();
   }
 
   /** Does something, says so, and looks again. */

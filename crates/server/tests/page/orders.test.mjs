@@ -122,3 +122,43 @@ test('who comes unseen gets nothing of what is ordered for all', async (t) => {
   assert.deepEqual(await receivers(server, await newest(server)), ['atlas', 'borea']);
   assertQuiet(page);
 });
+
+test('who waits for approval gets no orders, and is deleted like others', async (t) => {
+  const server = await Server.start(t);
+  await enrolAll(server, { atlas: {} });
+  server.push('talker', '1.0.0');
+  const { token } = await server.enrolmentToken({ approval: true });
+  const wait = (name, mac) => server.ask('POST', '/enroll', { mac, name }, { token });
+  await wait('stranger', '02:00:00:00:00:81');
+  const page = await open(t, server);
+  const dialog = page.getByRole('dialog');
+  const said = dialog.getByText('1 of those that were chosen waits for approval and gets nothing until then.');
+  await page.locator('[data-robot]').nth(1).waitFor();
+  await page.getByRole('checkbox', { name: 'Select all that are shown' }).click();
+  for (const [button, title] of [['Label…', 'Label atlas'], ['Stop…', 'Stop tasks on atlas'], ['Push…', 'Push to atlas']]) {
+    await page.getByRole('button', { name: button }).click();
+    await dialog.getByRole('heading', { name: title }).waitFor();
+    await said.waitFor();
+    await page.keyboard.press('Escape');
+  }
+  // Also of those that a selector means.
+  await page.goto(`${server.url}/#/packages`);
+  await page.getByRole('button', { name: 'Push talker 1.0.0' }).click();
+  await dialog.getByText('1 robot now: atlas').waitFor();
+  await page.keyboard.press('Escape');
+  await page.goto(`${server.url}/#/settings`);
+  const waiting = page.locator('section', { hasText: 'Robots that wait to be approved' });
+  await waiting.getByRole('cell', { name: 'stranger' }).waitFor();
+  await wait('second', '02:00:00:00:00:82');
+  await waiting.getByRole('cell', { name: 'second' }).waitFor();
+  await page.goto(`${server.url}/#/robots`);
+  await page.getByRole('button', { name: 'Delete second' }).click();
+  await dialog.getByRole('button', { name: 'Delete' }).click();
+  await page.getByText('1 robot deleted.').waitFor();
+  await page.getByText('2 selected').waitFor();
+  await page.getByRole('button', { name: 'Delete…' }).click();
+  await dialog.getByRole('button', { name: 'Delete' }).click();
+  await page.getByText('2 robots deleted.').waitFor();
+  assert.deepEqual((await server.ask('GET', '/robots')).robots, []);
+  assertQuiet(page);
+});

@@ -8,6 +8,7 @@
 import { html, nothing, render } from './vendor/lit-html-3.3.3/lit-html.js';
 import { repeat } from './vendor/lit-html-3.3.3/directives/repeat.js';
 import * as api from './api.js';
+import { holdFocus } from './cursor.js';
 import { close as closeDialog, dialogView, settleDialog, takesKey as dialogTakes } from './dialog.js';
 import { Fleet, Selection } from './fleet.js';
 import { ago, plural } from './format.js';
@@ -286,7 +287,9 @@ drawWith((frame) => {
   if (page.state === 'signed_out') return render(signInView(page, signIn), document.body);
   app.fleet.settle(frame);
   app.selection.keep(app.fleet.robots);
+  const giveFocusBack = holdFocus();
   render(frameView(app.now()), document.body);
+  giveFocusBack();
   page.view.drawn?.();
   settleDialog();
 });

@@ -1,6 +1,22 @@
-// Going from row to row of a long list by keys: up, down, and Enter, which opens.
+// Going from row to row of a long list by keys: up, down, and Enter, which opens. And staying there while the rows change places.
 
 import { change } from './frame.js';
+
+const CONTROLS = 'a, button, input, summary';
+const rowOf = (key) => document.querySelector(`[data-key="${CSS.escape(key)}"]`);
+
+/** To be called before each drawing. Answers what gives the focus back after it: a row that is put elsewhere has lost it. */
+export function holdFocus() {
+  const held = document.activeElement;
+  const key = held?.closest('[data-key]')?.dataset.key;
+  if (key === undefined) return () => {};
+  const control = [...rowOf(key).querySelectorAll(CONTROLS)].indexOf(held);
+  return () => {
+    if (document.activeElement !== document.body) return;
+    const row = rowOf(key);
+    (control < 0 ? row : row?.querySelectorAll(CONTROLS)[control])?.focus({ preventScroll: true });
+  };
+}
 
 export class Cursor {
   /** The row that keys go to. */
@@ -45,6 +61,6 @@ export class Cursor {
   drawn() {
     if (!this.#isFocusDue) return;
     this.#isFocusDue = false;
-    document.querySelector(`[data-key="${CSS.escape(this.current)}"]`)?.focus({ preventScroll: true });
+    rowOf(this.current)?.focus({ preventScroll: true });
   }
 }

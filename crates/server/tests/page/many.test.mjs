@@ -303,6 +303,31 @@ test('a label and a version that are searched for are meant exactly', async (t) 
   assertQuiet(page);
 });
 
+test('who is in a row by keys stays in it when it is put elsewhere', async (t) => {
+  const server = await Server.start(t);
+  const puppets = [];
+  for (const name of ['atlas', 'borea', 'corvus']) puppets.push(await Puppet.enroll(server, name));
+  const page = await open(t, server, { hash: '#/robots?sort=cpu' });
+  const names = (all) => until(page, (said) => [...document.querySelectorAll('[data-robot] .name')].map((one) => one.innerText).join() === said, all);
+  const loads = async (...all) => {
+    for (const [index, cpu_percent] of all.entries()) await puppets[index].vitals({ at_ms: 1, cpu_percent, memory_used_bytes: 3e9, memory_total_bytes: 8e9 });
+  };
+  await loads(90, 50, 10);
+  await names('atlas,borea,corvus');
+  // The row itself, and a button in it.
+  await page.keyboard.press('ArrowDown');
+  await until(page, () => document.activeElement.matches('[data-robot]'));
+  await loads(5, 50, 90);
+  await names('corvus,borea,atlas');
+  assert.equal(await page.evaluate(() => document.activeElement.dataset.robot), puppets[0].id);
+  const button = page.getByRole('button', { name: 'Monitor corvus' });
+  await button.focus();
+  await loads(90, 50, 10);
+  await names('atlas,borea,corvus');
+  assert.ok(await button.evaluate((one) => one === document.activeElement));
+  assertQuiet(page);
+});
+
 test('a question asked right after another was left stays', async (t) => {
   const server = await Server.start(t);
   const page = await open(t, server);

@@ -16,6 +16,9 @@ const SHOWN_LABELS = 6;
 // With more packages than this, one types a name instead of looking through a list.
 const LISTED_PACKAGES = 12;
 
+/** What is wrong where nobody sees it would stop the form without a word. */
+const UNFOLD = { handleEvent: ({ currentTarget }) => (currentTarget.open = true), capture: true };
+
 /** Each way for the bytes, in words. */
 const DELIVERIES = [
   ['adaptive', 'Adaptive', 'The server’s rules decide, robot by robot.'],
@@ -97,7 +100,7 @@ class Order {
         ${this.#field('delivery', 'Delivery', html`<select id="order-delivery" aria-describedby="delivery-words order-delivery-problem" @change=${({ currentTarget }) => this.#set('delivery', currentTarget.value)}>${DELIVERIES.map(([id, title]) => html`<option value=${id} .selected=${id === delivery}>${title}</option>`)}</select>
           <span id="delivery-words" class="hint quiet">${DELIVERIES.find(([id]) => id === delivery)?.[2]}</span>`, 'wide')}
       </div>
-      <details class="more" ?open=${this.hasMore}>
+      <details class="more" ?open=${this.hasMore} @invalid=${UNFOLD}>
         <summary>Batches, priority, expiry</summary>
         <div class="fields">
           ${this.#number('batch', 'Robots at a time', { min: 1, placeholder: 'all' })}

@@ -1,7 +1,7 @@
 // Orders are for the robots that the page has named, and for no others, whatever happens before they are sent.
 
 import { test } from 'node:test';
-import { assert, assertQuiet, live, open, Puppet, Server } from './harness.mjs';
+import { assert, assertQuiet, live, open, Puppet, Server, until } from './harness.mjs';
 
 const FAILED = { each: () => ({ failure: { code: 'build_failed', text: 'colcon build ended with status 1' } }) };
 
@@ -160,5 +160,22 @@ test('who waits for approval gets no orders, and is deleted like others', async 
   await dialog.getByRole('button', { name: 'Delete' }).click();
   await page.getByText('2 robots deleted.').waitFor();
   assert.deepEqual((await server.ask('GET', '/robots')).robots, []);
+  assertQuiet(page);
+});
+
+test('what is wrong in a part of the order that is folded is shown', async (t) => {
+  const server = await Server.start(t);
+  await enrolAll(server, { atlas: {} });
+  server.push('talker', '1.0.0');
+  const page = await open(t, server, { hash: '#/packages' });
+  const dialog = page.getByRole('dialog');
+  await page.getByRole('button', { name: 'Push talker 1.0.0' }).click();
+  await dialog.getByText('Batches, priority, expiry').click();
+  await dialog.getByLabel('Priority').fill('1000');
+  await dialog.getByText('Batches, priority, expiry').click();
+  await dialog.getByLabel('Priority').waitFor({ state: 'hidden' });
+  await dialog.getByRole('button', { name: 'Deploy' }).click();
+  await until(page, () => document.activeElement.id === 'order-priority');
+  assert.ok(await dialog.getByLabel('Priority').isVisible());
   assertQuiet(page);
 });

@@ -243,7 +243,7 @@ export class RobotsView {
       else change(() => selection.clear());
       return true;
     }
-    if ((key === 'x' || key === 'X') && fleet.robots.has(current) && !target.matches('input[type=search]')) {
+    if ((key === 'x' || key === 'X') && fleet.shown.includes(current) && !target.matches('input[type=search]')) {
       change(() => selection.toggle(current, fleet.shown, shiftKey));
       return true;
     }

@@ -222,6 +222,16 @@ test('everything is done by keys', async (t) => {
   await page.getByRole('heading', { name: 'Keys' }).waitFor({ state: 'hidden' });
   await page.keyboard.press('Enter');
   await page.waitForURL(/#\/robots\/borea/);
+  // What is not shown is not selected.
+  await page.getByRole('link', { name: 'Robots' }).click();
+  await page.locator('[data-robot]', { hasText: 'borea' }).focus();
+  await page.getByRole('searchbox').fill('atlas');
+  await until(page, () => document.querySelectorAll('[data-robot]').length === 1);
+  await page.locator('#main').focus();
+  await page.keyboard.press('x');
+  await page.keyboard.press('ArrowDown');
+  await until(page, () => document.activeElement.matches('[data-robot]'));
+  assert.equal(await page.locator('.bulk').count(), 0);
   assertQuiet(page);
 });
 

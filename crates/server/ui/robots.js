@@ -30,7 +30,7 @@ const COLUMNS = [
   { id: 'labels', title: 'Labels', width: 'minmax(96px, 1fr)', isOptional: true, cell: (robot) => html`<span class="code quiet" title=${labelsOf(robot).join(', ')}>${labelsOf(robot).join(', ')}</span>` },
   { id: 'cpu', title: 'CPU', width: '56px', isOptional: true, cell: ({ vitals }) => vitals?.cpu_percent == null ? '–' : `${Math.round(vitals.cpu_percent)} %` },
   { id: 'memory', title: 'Memory', width: '76px', isOptional: true, cell: ({ vitals }) => vitals?.memory_used_bytes == null ? '–' : size(vitals.memory_used_bytes) },
-  { id: 'disk', title: 'Free disk', width: '76px', isOptional: true, cell: ({ host }) => (host?.disk_free_bytes ? size(host.disk_free_bytes) : '–') },
+  { id: 'disk', title: 'Free disk', width: '76px', isOptional: true, cell: ({ host }) => (host?.disk_free_bytes == null ? '–' : size(host.disk_free_bytes)) },
   { id: 'rtt', title: 'RTT', width: '60px', isOptional: true, cell: ({ link }) => link?.rtt_ms == null ? '–' : `${link.rtt_ms} ms` },
   { id: 'task', title: 'Task', width: 'minmax(320px, 4fr)', cell: work },
 ];

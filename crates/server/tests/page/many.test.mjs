@@ -400,6 +400,12 @@ test('how machines do comes to the list by itself', async (t) => {
     await row.locator('.cpu', { hasText: said }).waitFor();
   }
   await row.locator('.memory', { hasText: '3.0 GB' }).waitFor();
+  // None is a figure too.
+  await page.getByLabel('Free disk').check();
+  await row.locator('.disk', { hasText: '–' }).waitFor();
+  await atlas.report('running', { host: { disk_free_bytes: 0 } });
+  await row.locator('.disk', { hasText: '0 B' }).waitFor();
+  await page.getByLabel('Free disk').uncheck();
   for (const width of [1280, 1200, 1100]) {
     await page.setViewportSize({ width, height: 900 });
     // Tried without doing it: scrolled to, and not covered by anything.

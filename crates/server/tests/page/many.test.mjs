@@ -388,6 +388,17 @@ test('every page can be used by everybody, light and dark, wide and narrow', asy
   }
 });
 
+test('a long version does not make the page of a robot wider than the window', async (t) => {
+  const server = await Server.start(t);
+  await Puppet.enroll(server, 'atlas');
+  server.push('talker', `1.0.0-${'SNAPSHOT'.repeat(7)}`, { to: 'atlas' });
+  const page = await open(t, server, { hash: '#/robots/atlas/control', viewport: { width: 390, height: 800 } });
+  await page.locator('.orders', { hasText: 'SNAPSHOT' }).waitFor();
+  const [inner, outer] = await page.evaluate(() => [document.documentElement.scrollWidth, document.documentElement.clientWidth]);
+  assert.ok(inner <= outer, `${inner} > ${outer}`);
+  assertQuiet(page);
+});
+
 test('how machines do comes to the list by itself', async (t) => {
   const server = await Server.start(t);
   const atlas = await Puppet.enroll(server, 'atlas');

@@ -86,7 +86,7 @@ pub(super) async fn show(
         (status = 201, description = "The deployment.", body = DeploymentView),
         (status = 404, description = "`package_not_found`: nobody has pushed that."),
         (status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order."),
-        (status = 422, description = "`too_large_for_inline`: so much does not fit into the announcement.")))]
+        (status = 422, description = "`package_too_large`: so much does not fit into the announcement.")))]
 pub(super) async fn create(
     State(app): State<App>,
     by: Person,

@@ -2,6 +2,7 @@
 
 import { html, nothing } from './vendor/lit-html-3.3.3/lit-html.js';
 import { repeat } from './vendor/lit-html-3.3.3/directives/repeat.js';
+import { names } from './acts.js';
 import { get, remove } from './api.js';
 import { copyButton } from './copy.js';
 import { Cursor } from './cursor.js';
@@ -287,15 +288,27 @@ export class PackageView {
 
   // Acting.
 
+  /** The server refuses to delete what robots should have. */
+  #tellWhoNeeds(title, robots) {
+    const ids = new Set(robots.map(({ id }) => id));
+    open({
+      title: `${title} is in use`,
+      body: () => html`<p>${plural(ids.size, 'robot')} should have it. Bring them another version, or remove the task from them, before it can be deleted.</p>${names(ids, this.app.fleet)}`,
+    });
+  }
+
   #askDelete(version) {
     const { manifest } = version.package;
     const title = `${this.name} ${this.#titleOf(version)}`;
+    const isOnly = this.#versions.filter((one) => one.package.version === version.package.version).length === 1;
+    const wanting = this.uses.wanting(version.package, isOnly);
+    if (wanting.length) return void this.#tellWhoNeeds(title, wanting);
     const count = this.uses.of(version.package).length;
     open({
       title: `Delete ${title}?`,
       action: 'Delete',
       isDangerous: true,
-      body: () => html`<p>${count ? `It runs on ${plural(count, 'robot')} now. ` : ''}Its files are taken from the server, and it can't be pushed to robots any more. Robots that run it keep what they have.</p>`,
+      body: () => html`<p>${count ? `It still runs on ${plural(count, 'robot')}, which should have another version. ` : ''}Its files are taken from the server, and it can't be pushed to robots any more.</p>`,
       act: async () => {
         await remove(`/packages/${encodeURIComponent(this.name)}/${encodeURIComponent(manifest.digest)}`);
         tell(`${title} is deleted.`);

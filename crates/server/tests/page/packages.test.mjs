@@ -109,6 +109,30 @@ test('two packages of one version are told apart', async (t) => {
   assertQuiet(page);
 });
 
+test('what robots should have is not offered to be deleted', async (t) => {
+  const server = await Server.start(t);
+  await Puppet.enroll(server, 'atlas');
+  server.push('talker', '1.0.0', { files: { 'run.sh': SCRIPT, 'x86_64.so': 'one' } });
+  server.push('talker', '1.0.0', { files: { 'run.sh': SCRIPT, 'aarch64.so': 'another' }, to: 'atlas' });
+  const page = await open(t, server, { hash: '#/packages/talker' });
+  const dialog = page.getByRole('dialog');
+  const remove = dialog.getByRole('button', { name: 'Delete' });
+  const ask = () => page.getByRole('button', { name: 'Delete…' }).click();
+  await ask();
+  await dialog.getByText('1 robot should have it.').waitFor();
+  await dialog.getByText('atlas').waitFor();
+  assert.equal(await remove.count(), 0);
+  await assertAccessible(page, 'why not');
+  await page.keyboard.press('Escape');
+  // The other one of the same number nobody should have.
+  await page.getByRole('link', { name: /^1\.0\.0 \(/ }).click();
+  await page.getByRole('row', { name: /x86_64\.so/ }).waitFor();
+  await ask();
+  await remove.click();
+  await eventually('the version to be gone', async () => (await server.ask('GET', '/packages')).packages.length === 1);
+  assertQuiet(page);
+});
+
 test('failures are told by their reason, and retried', async (t) => {
   const server = await Server.start(t);
   await agent(t, server, 'atlas');

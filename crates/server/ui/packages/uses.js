@@ -1,4 +1,4 @@
-// Which robots run which version of a package, as the stream says.
+// Which robots run which version of a package, and which should, as the stream says.
 
 // Counting goes over all robots: not more often than somebody could read it.
 const COUNT_PAUSE_MS = 1_000;
@@ -30,6 +30,18 @@ export class Uses {
     this.#count();
     const [sure, likely] = [manifest.digest, `${name}@${version}`].map((key) => this.#robots.get(key) ?? []);
     return likely.length ? [...sure, ...likely].sort(byName) : sure;
+  }
+
+  /**
+   * The robots that should have this version, sorted by name. Of several packages with the same number only the order says which one
+   * is meant: robots whose order is not known here are left out then, unless it `isOnly` one.
+   */
+  wanting({ name, version, manifest }, isOnly) {
+    const isMeant = ({ task, version: wanted, deployment }) => {
+      const known = this.#fleet.deployment(deployment)?.package.manifest.digest;
+      return task === name && wanted === version && (known ? known === manifest.digest : isOnly);
+    };
+    return [...this.#fleet.robots.values()].filter(({ tasks }) => tasks.some(isMeant)).sort(byName);
   }
 
   #count() {

@@ -9,7 +9,7 @@ import { html, nothing, render } from './vendor/lit-html-3.3.3/lit-html.js';
 import { repeat } from './vendor/lit-html-3.3.3/directives/repeat.js';
 import * as api from './api.js';
 import { holdFocus } from './cursor.js';
-import { close as closeDialog, dialogView, settleDialog, takesKey as dialogTakes } from './dialog.js';
+import { close as closeDialog, dialogView, isAsking, settleDialog, takesKey as dialogTakes } from './dialog.js';
 import { Fleet, Selection } from './fleet.js';
 import { ago, plural } from './format.js';
 import { change, drawWith } from './frame.js';
@@ -31,6 +31,8 @@ import { SettingsView } from './settings.js';
 
 const REFETCH_PAUSE_MS = 2_000;
 const LONGEST_PAUSE_MS = 30_000;
+/** For which server the page was loaded anew, in this tab. */
+const RENEWED = 'taskd.renewed';
 
 /** The sections, and the views of what is in them. */
 const SECTIONS = [
@@ -82,6 +84,9 @@ const page = {
   /** What a link brought to sign in with. */
   token: null,
   clockAheadMs: 0,
+  /** The server's version when this page was loaded, and that of its last answer. */
+  version: null,
+  serverVersion: null,
   problem: null,
   isSigningIn: false,
   /** The lists have to be fetched once more. */
@@ -260,6 +265,8 @@ async function fetchLists(isMine) {
   if (!isMine()) return;
   const { fleet } = app;
   app.me = me;
+  page.version ??= server.version;
+  page.serverVersion = server.version;
   page.clockAheadMs = server.now_ms - Date.now();
   page.heardAt = app.now();
   page.problem = null;
@@ -292,7 +299,15 @@ drawWith((frame) => {
   giveFocusBack();
   page.view.drawn?.();
   settleDialog();
+  if (page.serverVersion !== page.version && !isAsking()) renew();
 });
+
+/** Loads the page that another server brings; once for each, lest two of them behind one address make it load for ever. */
+function renew() {
+  if (sessionStorage.getItem(RENEWED) === page.serverVersion) return;
+  sessionStorage.setItem(RENEWED, page.serverVersion);
+  location.reload();
+}
 
 /** A view gets elements of its own: what the one before has put into them, what listens to them and what was unfolded is not its. */
 const ofView = (view, drawn) => repeat([view], (one) => one, () => drawn);

@@ -27,6 +27,9 @@ export function open(question) {
   return asked;
 }
 
+/** Whether anything is asked. */
+export const isAsking = () => current !== null;
+
 /** Whether it is still this question that is asked. */
 export const isOpen = (question) => current === question;
 

@@ -92,6 +92,35 @@ test('a page whose stream is refused says why, and shows what there is', async (
   assert.ok(takeComplaints(page).every((said) => said.includes('status of 429')));
 });
 
+test('a new server brings a new page, once nobody is asked anything', async (t) => {
+  const server = await Server.start(t);
+  await Puppet.enroll(server, 'atlas');
+  const page = await open(t, server);
+  await page.addInitScript(() => delete window.SharedWorker);
+  await page.route(/\/events$/, (route) => route.fulfill({ status: 503 }));
+  await page.reload();
+  await page.locator('[data-robot]', { hasText: 'atlas' }).waitFor();
+  await page.evaluate(() => (window.isSameDocument = true));
+  await page.keyboard.press('?');
+  await page.getByRole('heading', { name: 'Keys' }).waitFor();
+  await page.route(/\/api\/v1\/server$/, async (route) => {
+    const response = await route.fetch();
+    await route.fulfill({ response, json: { ...(await response.json()), version: '9.9.9' } });
+  });
+  await page.unroute(/\/events$/);
+  await live(page);
+  await settled(page);
+  assert.equal(await page.evaluate(() => window.isSameDocument), true);
+  await page.keyboard.press('Escape');
+  await until(page, () => !window.isSameDocument);
+  // Once.
+  await live(page);
+  await page.evaluate(() => (window.isSameDocument = true));
+  await settled(page);
+  assert.equal(await page.evaluate(() => window.isSameDocument), true);
+  assert.ok(takeComplaints(page).every((said) => said.includes('status of 503')));
+});
+
 test('a link with a token signs nobody in by itself', async (t) => {
   const server = await Server.start(t);
   await server.ask('POST', '/users', { name: 'mallory', roles: ['viewer'] });

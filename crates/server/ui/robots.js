@@ -34,6 +34,8 @@ const COLUMNS = [
   { id: 'rtt', title: 'RTT', width: '60px', isOptional: true, cell: ({ link }) => link?.rtt_ms == null ? '–' : `${link.rtt_ms} ms` },
   { id: 'task', title: 'Task', width: 'minmax(320px, 4fr)', cell: work },
 ];
+/** What can be ordered of the tasks of robots that are chosen. */
+const ORDERS = [['start', 'Start'], ['stop', 'Stop'], ['restart', 'Restart'], ['rollback', 'Roll back'], ['remove', 'Remove task']];
 const CHOSEN_COLUMNS = 'taskd.columns';
 
 export class RobotsView {
@@ -200,15 +202,14 @@ export class RobotsView {
       <div class="bulk" role="toolbar" aria-label="With the selected robots">
         <p><strong>${number(ids.size)}</strong> selected</p>
         ${isMore ? html`<button class="plain link" @click=${() => change(() => fleet.shown.forEach((id) => ids.add(id)))}>Select all ${number(fleet.shown.length)} that match</button>` : nothing}
+        <button class="plain link" @click=${() => change(() => selection.clear())}>Clear</button>
         <span class="acts">
           ${can('operate') ? html`
             <button class="primary" @click=${() => askPush(this.app, ids)}>Push…</button>
-            <button class="quiet-button" @click=${() => askTask(this.app, 'stop', ids)}>Stop…</button>
-            <button class="quiet-button" @click=${() => askTask(this.app, 'restart', ids)}>Restart…</button>` : nothing}
+            ${ORDERS.map(([verb, title]) => html`<button class="quiet-button" @click=${() => askTask(this.app, verb, ids)}>${title}…</button>`)}` : nothing}
           ${can('maintain') ? html`
             <button class="quiet-button" @click=${() => askLabels(this.app, ids)}>Label…</button>
             <button class="quiet-button danger-text" @click=${() => askDelete(this.app, ids)}>Delete…</button>` : nothing}
-          <button class="plain link" @click=${() => change(() => selection.clear())}>Clear</button>
         </span>
       </div>`;
   }

@@ -1,7 +1,7 @@
 // Orders are for the robots that the page has named, and for no others, whatever happens before they are sent.
 
 import { test } from 'node:test';
-import { assert, assertQuiet, live, open, Puppet, Server, until } from './harness.mjs';
+import { assert, assertAccessible, assertQuiet, browser, live, open, Puppet, Server, until } from './harness.mjs';
 
 const FAILED = { each: () => ({ failure: { code: 'build_failed', text: 'colcon build ended with status 1' } }) };
 
@@ -178,4 +178,34 @@ test('what is wrong in a part of the order that is folded is shown', async (t) =
   await until(page, () => document.activeElement.id === 'order-priority');
   assert.ok(await dialog.getByLabel('Priority').isVisible());
   assertQuiet(page);
+});
+
+test('every order to tasks can be given to all that are chosen, wide and narrow', async (t) => {
+  const server = await Server.start(t);
+  const robots = await enrolAll(server, { atlas: {}, borea: {} });
+  const it = await browser(t);
+  const orders = [['Stop', 'stopped'], ['Start', 'started'], ['Restart', 'restarted'], ['Roll back', 'rolled back'], ['Remove task', 'removed']];
+  for (const width of [1280, 375]) {
+    for (const version of ['1.0.0', '1.1.0']) {
+      server.push('talker', `${version}-at${width}`, { to: '*' });
+      for (const robot of robots) await robot.report('running');
+    }
+    const page = await open(t, server, { on: it, viewport: { width, height: 900 } });
+    const dialog = page.getByRole('dialog');
+    for (const name of ['atlas', 'borea']) await page.getByRole('checkbox', { name: `Select ${name}` }).click();
+    await page.getByText('2 selected').waitFor();
+    await assertAccessible(page, `what is done with the selected, at ${width}`);
+    const [inner, outer] = await page.evaluate(() => [document.documentElement.scrollWidth, document.documentElement.clientWidth]);
+    assert.ok(inner <= outer, `not wider than the window at ${width}: ${inner} > ${outer}`);
+    const bar = page.getByRole('toolbar', { name: 'With the selected robots' });
+    assert.ok((await bar.boundingBox()).height < 120, `at ${width} the robots can be seen above the bar`);
+    for (const [button, done] of orders) {
+      await bar.getByRole('button', { name: `${button}…`, exact: true }).click();
+      await dialog.getByLabel('talker').check();
+      await dialog.getByRole('button', { name: button.split(' task')[0], exact: true }).click();
+      await page.getByText(`talker: to be ${done} on 2 robots.`).waitFor();
+      await page.getByRole('button', { name: 'Close the notice' }).click();
+    }
+    assertQuiet(page);
+  }
 });

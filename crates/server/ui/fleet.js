@@ -227,7 +227,8 @@ function textOf(robot) {
   const tasks = robot.tasks.map(({ phase, deployment, failure }) => [phase, deployment, failure?.code, failure?.text]);
   const conditions = robot.conditions.flatMap(({ code, text }) => [code, text]);
   const state = robot.online ? 'online' : 'offline';
-  return [robot.id, robot.name, robot.mac, robot.address, state, labelsOf(robot), versionsOf(robot), tasks, conditions].flat(2).join('\n').toLowerCase();
+  const { agent_version: agent, arch, ros_distros: distros = [] } = robot.host ?? {};
+  return [robot.id, robot.name, robot.mac, robot.address, state, agent, arch, distros, labelsOf(robot), versionsOf(robot), tasks, conditions].flat(2).join('\n').toLowerCase();
 }
 
 /** Robots that a person has chosen, and how an order names them. */

@@ -342,6 +342,18 @@ test('a label and a version that are searched for are meant exactly', async (t) 
   assertQuiet(page);
 });
 
+test('robots are found by their agent, their processor and their ROS', async (t) => {
+  const server = await Server.start(t);
+  const hosts = { atlas: { agent_version: '0.9.7', arch: 'x86_64', ros_distros: ['jazzy', 'kilted'] }, borea: { agent_version: '0.9.8', arch: 'aarch64' } };
+  for (const [name, host] of Object.entries(hosts)) await (await Puppet.enroll(server, name)).report('running', { host });
+  const page = await open(t, server);
+  for (const [text, name] of [['0.9.7', 'atlas'], ['aarch64', 'borea'], ['kilted', 'atlas'], ['0.9.8 AARCH64', 'borea']]) {
+    await page.getByRole('searchbox').fill(text);
+    await until(page, (only) => [...document.querySelectorAll('[data-robot] .name')].map((one) => one.innerText).join() === only, name);
+  }
+  assertQuiet(page);
+});
+
 test('who is in a row by keys stays in it when it is put elsewhere', async (t) => {
   const server = await Server.start(t);
   const puppets = [];

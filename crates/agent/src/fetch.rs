@@ -53,6 +53,8 @@ const MAX_MANIFEST_BYTES: u64 = 1 << 20;
 const QUEUED_CHUNKS: usize = 16;
 /// How often one pull connects anew after a cut before it is given back to the caller's slower retries.
 const MAX_RECONNECTS: u32 = 5;
+/// A connection that brought as much counts as good: the next cut is the first again.
+const PROGRESS_BYTES: u64 = 1 << 20;
 /// Contents that are remembered as not to be waited for.
 const MAX_GIVEN_UP: usize = 64;
 
@@ -377,7 +379,9 @@ impl Fetcher {
             ended => return ended,
         };
         let mut position = download.position();
-        for reconnects in 1..=MAX_RECONNECTS {
+        let mut reconnects = 0;
+        while reconnects < MAX_RECONNECTS {
+            reconnects += 1;
             tracing::info!(package = %package.name, position, %cut, "connecting anew");
             // A server that restarts cuts a whole fleet off at once.
             let longest = self.settings().reconnect_wait * reconnects;
@@ -385,6 +389,10 @@ impl Fetcher {
             let ended = match self.download_content(package, position).await {
                 Ok(mut download) => {
                     let ended = self.pass_on(&mut download, &sender).await;
+                    // On a network that cuts all the time it does get on.
+                    if download.position() - position >= PROGRESS_BYTES {
+                        reconnects = 0;
+                    }
                     position = download.position();
                     ended
                 }

@@ -66,6 +66,10 @@ impl RobotVitals {
         }
         let kept = robots.entry(robot.clone()).or_default();
         kept.newest = Vitals { at_ms: now_ms, ..sound(said) };
+        if now_ms < kept.sampled_ms {
+            // This machine's clock was set back: what was kept lies ahead.
+            kept.samples.clear();
+        }
         let gap_ms = now_ms.saturating_sub(kept.sampled_ms);
         if kept.samples.is_empty() || gap_ms >= LEAST_GAP_MS {
             if kept.samples.len() >= MAX_SAMPLES {
@@ -236,6 +240,17 @@ mod tests {
         assert_eq!(all.newest(&robot).and_then(|newest| newest.cpu_percent), Some(99.0));
         all.forget(&robot);
         assert_eq!((all.newest(&robot), all.last_hour(&robot, 0)), (None, Vec::new()));
+    }
+
+    #[test]
+    fn a_clock_that_is_set_back_begins_anew() {
+        let (robots, robot) = (RobotVitals::default(), RobotId::random());
+        robots.take(&robot, vitals(10.0), 7_200_000);
+        robots.take(&robot, vitals(20.0), 60_000);
+        robots.take(&robot, vitals(30.0), 120_000);
+        let hour: Vec<_> =
+            robots.last_hour(&robot, 120_000).iter().map(|said| (said.at_ms, said.cpu_percent)).collect();
+        assert_eq!(hour, [(60_000, Some(20.0)), (120_000, Some(30.0))]);
     }
 
     #[test]

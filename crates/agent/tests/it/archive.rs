@@ -123,3 +123,18 @@ fn pax_record(key: &str, value: &str) -> String {
     let length = (rest.len()..).find(|length| length.to_string().len() + rest.len() == *length).unwrap();
     format!("{length}{rest}")
 }
+
+/// Bytes that do not compress, the same in each run.
+pub fn noise() -> Vec<u8> {
+    let mut state = 1u64;
+    let next = || {
+        state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+        (state >> 33) as u8
+    };
+    std::iter::repeat_with(next).take(3 << 20).collect()
+}
+
+/// A package that is large enough to be cut.
+pub fn tar() -> Tar {
+    Tar::default().dir("bin").file("bin/run", b"#!/bin/sh\n").file("data", &noise()).end()
+}

@@ -21,7 +21,7 @@ use task_proto::report::{FailureCode, Progress};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
-use crate::archive::Tar;
+use crate::archive::{Tar, noise, tar};
 
 const CHUNK_BYTES: usize = 64 * 1024;
 const TOKEN: &str = "the robot's token";
@@ -169,20 +169,6 @@ fn manifest(facts: ContentFacts) -> TaskManifest {
     .unwrap()
 }
 
-/// Bytes that do not compress, the same in each run.
-pub fn noise() -> Vec<u8> {
-    let mut state = 1u64;
-    let next = || {
-        state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
-        (state >> 33) as u8
-    };
-    std::iter::repeat_with(next).take(3 << 20).collect()
-}
-
-pub fn tar() -> Tar {
-    Tar::default().dir("bin").file("bin/run", b"#!/bin/sh\n").file("data", &noise()).end()
-}
-
 async fn answer(
     State(script): State<Arc<Mutex<Script>>>,
     Path((name, digest)): Path<(String, String)>,
@@ -290,6 +276,18 @@ async fn a_cut_is_continued_within_the_pull() {
     let asked = site.asked();
     assert_eq!((asked.len(), asked[0]), (3, 0));
     assert!(asked[1] > 0 && asked[2] > asked[1], "{asked:?}");
+}
+
+#[tokio::test]
+async fn cuts_end_no_pull_that_gets_on() {
+    let often = 2 * 5;
+    // The same over and over would compress to nothing.
+    let noise = noise();
+    let parts = (0..6u8).flat_map(|part| noise.iter().map(move |byte| byte.rotate_left(part.into()) ^ part));
+    let site = Site::new(&Tar::default().file("data", &parts.collect::<Vec<_>>()).end()).await;
+    site.answers((0..often).map(|_| Answer::Cut(3 << 19)));
+    site.pull().await.unwrap();
+    assert_eq!(site.asked().len(), often + 1);
 }
 
 #[tokio::test]

@@ -18,7 +18,8 @@ use task_transport::Trust;
 use tokio::sync::{mpsc, watch};
 use tokio_util::sync::CancellationToken;
 
-use crate::fetch::{Answer, Site, settings, tar};
+use crate::archive::tar;
+use crate::fetch::{Answer, Site, settings};
 use crate::harness::{eventually, within};
 use crate::peer::Peer;
 

@@ -37,6 +37,17 @@ pub struct SiteLimits {
     pub bytes_per_s: Option<u64>,
 }
 
+/// What a transfer has of a bandwidth at least: several times what an agent takes for a stall.
+const LEAST_SHARE_BYTES_PER_S: u64 = 4 << 10;
+
+impl SiteLimits {
+    /// How many may go at the same time: no more than have something of the bandwidth.
+    pub fn most(&self) -> Option<u64> {
+        let with_share = self.bytes_per_s.map(|bytes| (bytes / LEAST_SHARE_BYTES_PER_S).max(1));
+        [self.max, with_share].into_iter().flatten().min()
+    }
+}
+
 /// What is wrong, and with which key below the table.
 pub(super) struct Wrong {
     pub(super) key: String,

@@ -77,7 +77,7 @@ struct Load {
 
 impl Load {
     fn free(&self) -> u64 {
-        self.limits.max.map_or(u64::MAX, |max| max.saturating_sub(self.running))
+        self.limits.most().map_or(u64::MAX, |max| max.saturating_sub(self.running))
     }
 }
 
@@ -190,7 +190,7 @@ impl Queue {
     pub(super) fn send_away(&mut self, asking: Asking, now_ms: u64, chance: f64) -> Option<u64> {
         let rank = self.asking.remove(&asking)?;
         let on_site = self.waiting.get(&rank)?.site.as_ref().and_then(|site| self.sites.get(site));
-        let at_once = [Some(&self.all), on_site].into_iter().flatten().filter_map(|load| load.limits.max).min();
+        let at_once = [Some(&self.all), on_site].into_iter().flatten().filter_map(|load| load.limits.most()).min();
         let (at_once, lasts_ms) = (at_once.unwrap_or(1).max(1), self.lasts_ms.max(1));
         // Beyond the longest time to stay away it does not matter how many there are.
         let enough = usize::try_from((MAX_AWAY_MS / lasts_ms + 1).saturating_mul(at_once)).unwrap_or(usize::MAX);
@@ -284,6 +284,19 @@ mod tests {
             queue.end(None, 1_000);
             assert_eq!(queue.begin(0), [(next, None)]);
         }
+    }
+
+    #[test]
+    fn a_bandwidth_is_shared_by_no_more_than_have_something_of_it() {
+        let most = |max, bytes_per_s| SiteLimits { max, bytes_per_s: Some(bytes_per_s) }.most();
+        assert_eq!([most(None, 1 << 20), most(Some(3), 1 << 20), most(Some(3), 1000)], [Some(256), Some(3), Some(1)]);
+        assert_eq!(SiteLimits::default().most(), None);
+        let all = SiteLimits { max: None, bytes_per_s: Some(8 << 10) };
+        let mut queue = Queue::new(&TransferLimits { all, ..TransferLimits::default() });
+        for number in 0..3 {
+            queue.ask(place(number), &claim(0), 0).expect("room");
+        }
+        assert_eq!(queue.begin(0).len(), 2);
     }
 
     #[test]

@@ -272,6 +272,11 @@ impl VersionDir {
         self.root.join("install")
     }
 
+    /// Where the nodes of a run write logs of their own.
+    pub fn node_logs(&self) -> PathBuf {
+        self.root().join("node_logs")
+    }
+
     /// The generated script that starts the task.
     pub fn run_script(&self) -> PathBuf {
         self.root.join("run.sh")

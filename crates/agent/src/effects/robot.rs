@@ -392,7 +392,8 @@ impl Effects for Robot {
         let manifest = self.manifest(&run.package).await?;
         let version = self.version(&run.package);
         let text = script::run_script(&manifest, &version, &self.setup_files_of(run, &manifest)?);
-        let (user, environment) = self.account(task)?;
+        let (user, mut environment) = self.account(task)?;
+        environment.extend(ros::node_logs(&version).await);
         durable::write(&version.run_script(), text.as_bytes(), 0o755).map_err(|error| failed(&error))?;
         user.as_ref().map_or(Ok(()), |user| user.hand_over(version.root())).map_err(|error| failed(&error))?;
         let task_dir = self.data.task(task);

@@ -2,6 +2,7 @@
 //! looked into it.
 
 use std::collections::BTreeMap;
+use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, PoisonError};
 
@@ -10,7 +11,9 @@ use task_proto::report::{FailureCode, RosFacts};
 
 use super::Robot;
 use super::outcomes::finally;
+use crate::durable;
 use crate::installation::Installation;
+use crate::layout::VersionDir;
 use crate::ledger::ActiveRun;
 use crate::plan::StepFailure;
 use crate::run_dir::RunDir;
@@ -18,6 +21,18 @@ use crate::{environment, launch, survey, underlay};
 
 /// Where looking into ROS installations has its files.
 const SURVEY_DIR: &str = "survey";
+
+/// The variable by which nodes find where to write logs of their own, which begin anew: ROS makes new files at each start and
+/// deletes none. What of them can't be deleted is no reason not to start.
+pub(super) async fn node_logs(version: &VersionDir) -> [(String, String); 1] {
+    let logs = version.node_logs();
+    let variable = ("ROS_LOG_DIR".to_owned(), logs.display().to_string());
+    let emptied = tokio::task::spawn_blocking(move || durable::remove_dir_all(&logs)).await;
+    if let Err(error) = emptied.map_err(io::Error::from).flatten() {
+        tracing::warn!(%error, "cannot delete what nodes wrote into logs of their own");
+    }
+    [variable]
+}
 
 impl Robot {
     /// How tasks that are started now meet ROS.
@@ -105,6 +120,20 @@ mod tests {
         std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o644)).expect("readable");
         let settings = serde_json::from_value(json!({ "underlays": [path] })).expect("parses");
         (path, settings)
+    }
+
+    #[tokio::test]
+    async fn logs_of_nodes_begin_anew_at_each_start() {
+        let temp = tempfile::tempdir().expect("a directory");
+        let digest = task_proto::Digest::of(b"manifest");
+        let data = crate::layout::DataDir::new(temp.path()).expect("a directory");
+        let version = data.task(&"talker".parse().expect("valid")).version(&digest);
+        let [(name, place)] = node_logs(&version).await;
+        assert_eq!((name.as_str(), Path::new(&place)), ("ROS_LOG_DIR", version.node_logs().as_path()));
+        std::fs::create_dir_all(version.node_logs().join("2026-11-22")).expect("made");
+        std::fs::write(version.node_logs().join("2026-11-22/launch.log"), "long").expect("written");
+        node_logs(&version).await;
+        assert!(!version.node_logs().exists() && version.root().exists());
     }
 
     #[test]

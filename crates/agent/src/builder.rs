@@ -59,7 +59,7 @@ pub struct BuildOrder {
 pub struct BuildLimits {
     /// The time it may take.
     pub timeout: Duration,
-    /// The memory all of it may have; without a control group the address space that each of its processes may have.
+    /// The memory all of it may have; without a control group the data that each of its processes may have.
     /// `None` does not limit it.
     pub memory_bytes: Option<u64>,
     /// The processes and threads it may have.

@@ -30,7 +30,7 @@ const LAST_CAPABILITY: libc::c_ulong = 63;
 #[derive(Debug)]
 pub struct Confinement {
     cgroup: Option<File>,
-    address_space_bytes: Option<u64>,
+    data_bytes: Option<u64>,
     user_processes: Option<u64>,
     user: Option<Account>,
     script: CString,
@@ -68,7 +68,7 @@ impl Confinement {
         };
         Ok(Self {
             cgroup: cgroup.map(Cgroup::entrance).transpose()?,
-            address_space_bytes: limits.memory_bytes.filter(|_| !keeps_memory),
+            data_bytes: limits.memory_bytes.filter(|_| !keeps_memory),
             user_processes,
             user: user.map(account),
             script: CString::new(script.as_os_str().as_bytes())?,
@@ -84,8 +84,9 @@ impl Confinement {
         if let Ok(file) = open(c"/proc/self/oom_score_adj", OFlag::O_WRONLY | OFlag::O_CLOEXEC, Mode::empty()) {
             let _ = nix::unistd::write(&file, TASK_OOM_SCORE.to_bytes());
         }
-        if let Some(bytes) = self.address_space_bytes {
-            setrlimit(Resource::RLIMIT_AS, bytes, bytes)?;
+        if let Some(bytes) = self.data_bytes {
+            // Not the address space, of which programs with many threads or large files mapped have far more than memory.
+            setrlimit(Resource::RLIMIT_DATA, bytes, bytes)?;
         }
         if let Some(count) = self.user_processes {
             setrlimit(Resource::RLIMIT_NPROC, count, count)?;

@@ -243,7 +243,7 @@ async fn a_build_is_optimised_and_leaves_tests_out() {
 
 #[tokio::test]
 async fn a_build_is_nice_and_limited() {
-    let mut build = TestBuild::with_colcon("echo nice $(nice), memory $(ulimit -v); mkdir -p install/talker; exit 0");
+    let mut build = TestBuild::with_colcon("echo nice $(nice), memory $(ulimit -d); mkdir -p install/talker; exit 0");
     build.order.limits.memory_bytes = Some(1 << 30);
     build.run().await.expect("built");
     assert!(build.log().contains("nice 10, memory 1048576"), "{}", build.log());

@@ -253,6 +253,33 @@ mod tests {
     }
 
     #[test]
+    fn packages_that_build_tools_pass_over_are_not_judged() {
+        let add = |dir: &TempDir, path: &str, text: &str| {
+            let path = dir.path().join(path);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, text).unwrap();
+        };
+        let bad = XML.replace("<build_type>ament_python</build_type>", "<build_type>ament_cmake</build_type>");
+        let dir = talker();
+        add(&dir, "test/fixtures/package.xml", &bad);
+        pack(dir.path()).expect("a package's own files are no packages");
+        let dir = tree(&[(
+            "task.toml",
+            &LAUNCH.replacen("[run]", "name = \"all\"\nversion = \"1\"\n[build]\ntool = \"colcon\"\n[run]", 1),
+            false,
+        )]);
+        for (path, text) in
+            [("src/talker/package.xml", XML), ("src/talker/setup.py", ""), ("src/talker/launch/talker.launch.py", "")]
+        {
+            add(&dir, path, text);
+        }
+        add(&dir, "third_party/old/package.xml", &bad);
+        refused(&dir, "third_party/old/CMakeLists.txt: is absent");
+        add(&dir, "third_party/COLCON_IGNORE", "");
+        pack(dir.path()).expect("nobody looks there");
+    }
+
+    #[test]
     fn what_is_missing_is_named_with_its_file() {
         refused(&tree(&[("a", "", false)]), "task.toml: is absent, and so is package.xml");
         refused(

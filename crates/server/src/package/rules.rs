@@ -35,14 +35,18 @@ pub(super) fn check(manifest: &TaskManifest, tree: &Tree, problems: &mut Vec<Pro
     Ok(())
 }
 
+/// Files that keep build tools out of their directory.
+const IGNORED_BY: [&str; 3] = ["COLCON_IGNORE", "AMENT_IGNORE", "CATKIN_IGNORE"];
+
 /// Every package.xml in the tree, as the build tool will find them.
 fn ros_packages(tree: &Tree, problems: &mut Vec<Problem>) -> Result<Vec<RosPackage>, PackageError> {
     const MAX_PACKAGES: usize = 1000;
     let mut packages = Vec::new();
-    for path in tree.entries.keys().filter(|path| path.rsplit('/').next() == Some(package_xml::FILE)).take(MAX_PACKAGES)
-    {
+    let found =
+        tree.entries.keys().filter(|path| name_of(path) == package_xml::FILE && is_looked_at(tree, parent(path)));
+    for path in found.take(MAX_PACKAGES) {
         let Some(text) = read_text(&tree.root, path, problems)? else { continue };
-        let directory = path.rsplit_once('/').map_or("", |(directory, _)| directory).to_owned();
+        let directory = parent(path).to_owned();
         match package_xml::parse(&text) {
             Ok(xml) => packages.push(RosPackage { directory, xml }),
             // The one at the top has been read, and complained about, before.
@@ -51,6 +55,26 @@ fn ros_packages(tree: &Tree, problems: &mut Vec<Problem>) -> Result<Vec<RosPacka
         }
     }
     Ok(packages)
+}
+
+/// Whether build tools look for a package in `directory`: not where a file says no, nor below another package.
+fn is_looked_at(tree: &Tree, directory: &str) -> bool {
+    let has = |directory: &str, file: &str| match directory {
+        "" => tree.entries.contains_key(file),
+        directory => tree.entries.contains_key(&format!("{directory}/{file}")),
+    };
+    let is_ignored = |directory: &str| IGNORED_BY.iter().any(|file| has(directory, file));
+    let mut above = std::iter::successors(Some(directory), |below| (!below.is_empty()).then(|| parent(below)));
+    above.all(|at| !is_ignored(at) && (at == directory || !has(at, package_xml::FILE)))
+}
+
+/// The directory of a path, which is "" at the top.
+fn parent(path: &str) -> &str {
+    path.rsplit_once('/').map_or("", |(parent, _)| parent)
+}
+
+fn name_of(path: &str) -> &str {
+    path.rsplit_once('/').map_or(path, |(_, name)| name)
 }
 
 fn check_build(tool: BuildTool, packages: &[RosPackage], tree: &Tree, problems: &mut Vec<Problem>) {

@@ -4,7 +4,7 @@ import assert from 'node:assert/strict';
 import { spawn, spawnSync } from 'node:child_process';
 import { createHash, randomBytes } from 'node:crypto';
 import { createSocket } from 'node:dgram';
-import { chmodSync, existsSync, mkdirSync, mkdtempSync, openSync, readFileSync, readdirSync, rmSync, writeFileSync } from 'node:fs';
+import { chmodSync, existsSync, mkdirSync, mkdtempSync, openSync, readFileSync, readdirSync, rmSync, rmdirSync, writeFileSync } from 'node:fs';
 import { createRequire } from 'node:module';
 import { tmpdir } from 'node:os';
 import { dirname, join } from 'node:path';
@@ -189,8 +189,27 @@ export async function ros(t) {
 /** The node of the end-to-end tests, which does as its arguments say. */
 export const probe = readFileSync(join(root, 'crates/bench/tests/it/graph_probe/graph_probe/probe.py'), 'utf8');
 
+/** The control groups of an agent's runs. They outlive it, as its tasks do. */
+function groupsOf(data) {
+  const tasks = join(data, 'tasks');
+  const entries = existsSync(tasks) ? readdirSync(tasks, { recursive: true }) : [];
+  const specs = entries.filter((entry) => /^[^/]+\/run\/[^/]+\/spec\.json$/.test(entry));
+  return specs.map((spec) => JSON.parse(readFileSync(join(tasks, spec), 'utf8')).cgroup).filter(Boolean);
+}
+
+/** Whether a control group is no longer there, or could be removed: nothing is left in it. */
+function isGone(group) {
+  try {
+    rmdirSync(group);
+  } catch ({ code }) {
+    return code === 'ENOENT';
+  }
+  return true;
+}
+
 /** Ends every process whose command line or environment names this directory: shims, then what they watched. */
-function endProcessesOf(data) {
+async function endProcessesOf(data) {
+  const groups = groupsOf(data);
   for (let round = 0; round < 3; round += 1) {
     for (const pid of readdirSync('/proc').filter((entry) => /^\d+$/.test(entry) && Number(entry) !== process.pid)) {
       try {
@@ -201,6 +220,7 @@ function endProcessesOf(data) {
       }
     }
   }
+  for (const group of groups) await eventually(`the end of ${group}`, () => isGone(group));
 }
 
 /** A robot that says over HTTP whatever the test wants: what no real one says, or not when it is to be looked at. */

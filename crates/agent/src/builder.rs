@@ -274,11 +274,14 @@ fn missing_package(version: &VersionDir) -> Option<String> {
 /// The name in a `package.xml`. It was checked when the package was pushed, so looking for the element is enough. The build
 /// may have put anything in its place: what is no plain file is not read.
 fn package_name(path: &Path) -> Option<String> {
-    let mut text = String::from_utf8(foreign_file::read(path, MAX_PACKAGE_XML_BYTES).ok()?).ok()?;
-    while let Some((before, rest)) = text.split_once("<!--") {
-        text = format!("{before}{}", rest.split_once("-->")?.1);
+    let text = String::from_utf8(foreign_file::read(path, MAX_PACKAGE_XML_BYTES).ok()?).ok()?;
+    // Each piece but the first begins in a comment.
+    let mut pieces = text.split("<!--");
+    let mut plain = pieces.next()?.to_owned();
+    for piece in pieces {
+        plain.push_str(piece.split_once("-->")?.1);
     }
-    let (_, rest) = text.split_once("<name>")?;
+    let (_, rest) = plain.split_once("<name>")?;
     let (name, _) = rest.split_once("</name>")?;
     let name = name.trim();
     let is_plain = !name.is_empty() && name.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"_-".contains(&byte));

@@ -218,7 +218,7 @@ mod tests {
         let mut tail = Tail::default();
         assert_eq!(read(&mut tail, &log).len(), 30);
         std::fs::remove_file(&log).unwrap();
-        // The newest that is left, once: what was read of it before was in the file that is gone.
+        // What is left of it once more: nobody knows any longer how far that was read. Then no more.
         read(&mut tail, &log);
         assert_eq!(read(&mut tail, &log), Vec::<String>::new());
         (0..30).for_each(|number| written.write(format!("later {number}\n").as_bytes()));

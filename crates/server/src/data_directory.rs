@@ -15,7 +15,8 @@ use task_proto::{CaPin, Digest};
 const LOCK: &str = "taskd.lock";
 const SIGNING_KEY: &str = "signing.key";
 const BROKER_SECRET: &str = "broker.secret";
-const OPERATOR_TOKEN: &str = "operator.token";
+/// The file with the first operator's token.
+pub(crate) const OPERATOR_TOKEN: &str = "operator.token";
 const AUTHORITY_KEY: &str = "ca.key";
 const AUTHORITY_CERTIFICATE: &str = "ca.pem";
 const ADDRESSES: &str = "addresses.json";
@@ -31,7 +32,7 @@ pub(crate) fn room(path: &Path) -> Option<(u64, u64)> {
 #[derive(Debug)]
 pub struct DataDirectory {
     path: PathBuf,
-    _lock: File,
+    lock: File,
 }
 
 /// What is bound, for programs on the same machine: the content of `addresses.json`, which exists while a server runs.
@@ -52,12 +53,24 @@ impl Addresses {
         let scheme = if self.ca_pin.is_some() { "https" } else { "http" };
         format!("{scheme}://{}", self.http)
     }
+
+    /// What was published last in the directory at `path`, by a server that may be gone: see [`is_locked`].
+    pub fn published(path: &Path) -> Option<Self> {
+        serde_json::from_slice(&std::fs::read(path.join(ADDRESSES)).ok()?).ok()
+    }
 }
 
-/// Whether a server runs from the directory at `path`.
-pub fn is_locked(path: &Path) -> bool {
-    let lock = File::open(path.join(LOCK));
-    lock.is_ok_and(|lock| matches!(lock.try_lock_shared(), Err(TryLockError::WouldBlock)))
+/// Whether a server runs from the directory at `path`, which need not exist.
+///
+/// # Errors
+///
+/// This account may not look.
+pub fn is_locked(path: &Path) -> io::Result<bool> {
+    match File::open(path.join(LOCK)) {
+        Ok(lock) => Ok(matches!(lock.try_lock_shared(), Err(TryLockError::WouldBlock))),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
+        Err(error) => Err(error),
+    }
 }
 
 /// Why the directory can't be used.
@@ -87,6 +100,13 @@ pub enum DataError {
     },
 }
 
+impl Drop for DataDirectory {
+    /// The next server may start at once, also while a process that is just being started still has our files open.
+    fn drop(&mut self) {
+        let _ = self.lock.unlock();
+    }
+}
+
 impl DataDirectory {
     /// Makes the directory if it is missing, and locks it.
     pub fn open(path: &Path) -> Result<Self, DataError> {
@@ -95,10 +115,18 @@ impl DataDirectory {
         let lock_path = path.join(LOCK);
         let lock = OpenOptions::new().create(true).truncate(false).write(true).mode(0o600).open(&lock_path);
         let lock = lock.map_err(io_error(lock_path.clone()))?;
-        match lock.try_lock() {
-            Ok(()) => Ok(Self { path: path.to_owned(), _lock: lock }),
-            Err(TryLockError::WouldBlock) => Err(DataError::InUse { path: path.to_owned() }),
-            Err(TryLockError::Error(source)) => Err(DataError::Io { path: lock_path, source }),
+        loop {
+            match lock.try_lock() {
+                Ok(()) => {
+                    let data = Self { path: path.to_owned(), lock };
+                    data.unpublish();
+                    return Ok(data);
+                }
+                // No server has it: commands do, which look whether one does, for a moment.
+                Err(TryLockError::WouldBlock) if lock.try_lock_shared().is_ok() => std::thread::yield_now(),
+                Err(TryLockError::WouldBlock) => return Err(DataError::InUse { path: path.to_owned() }),
+                Err(TryLockError::Error(source)) => return Err(DataError::Io { path: lock_path, source }),
+            }
         }
     }
 
@@ -173,9 +201,8 @@ impl DataDirectory {
         self.write_new(&path, &format!("{text}\n")).map_err(|source| DataError::Io { path, source })
     }
 
-    /// Nobody listens any more.
+    /// Nobody listens there, or soon nobody will: what else does is not shown our token.
     pub fn unpublish(&self) {
-        // At worst someone finds the old addresses and nobody behind them.
         let _ = std::fs::remove_file(self.path.join(ADDRESSES));
     }
 
@@ -220,6 +247,9 @@ impl DataDirectory {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::atomic::AtomicBool;
+    use std::sync::atomic::Ordering::Relaxed;
+
     use super::*;
     use std::os::unix::fs::PermissionsExt as _;
 
@@ -248,9 +278,31 @@ mod tests {
         let directory = tempfile::tempdir().expect("temp dir");
         let first = DataDirectory::open(directory.path()).expect("opens");
         assert!(matches!(DataDirectory::open(directory.path()), Err(DataError::InUse { .. })));
-        assert!(is_locked(directory.path()));
+        assert!(is_locked(directory.path()).expect("told"));
+        let kept_open = first.lock.try_clone().expect("cloned");
         drop(first);
-        assert!(!is_locked(directory.path()));
+        assert!(!is_locked(directory.path()).expect("told"));
         assert!(DataDirectory::open(directory.path()).is_ok());
+        drop(kept_open);
+        assert!(!is_locked(&directory.path().join("none")).expect("told"));
+    }
+
+    #[test]
+    fn who_looks_whether_a_server_runs_keeps_none_from_starting() {
+        let directory = tempfile::tempdir().expect("temp dir");
+        let is_over = AtomicBool::new(false);
+        std::thread::scope(|scope| {
+            for _ in 0..2 {
+                scope.spawn(|| {
+                    while !is_over.load(Relaxed) {
+                        is_locked(directory.path()).expect("told");
+                    }
+                });
+            }
+            let started = (0..1000).map(|_| DataDirectory::open(directory.path()).map(drop));
+            let refused = started.filter(Result::is_err).count();
+            is_over.store(true, Relaxed);
+            assert_eq!(refused, 0);
+        });
     }
 }

@@ -227,6 +227,7 @@ impl Server {
 
     /// Stops within ten seconds: listeners close, requests and sessions end, what was handed in is stored.
     pub async fn stop(self) {
+        self.data.unpublish();
         self.stop.cancel();
         let ((), http) = tokio::join!(self.broker.shutdown(SESSION_PATIENCE), self.http);
         if http.is_err() {
@@ -245,7 +246,6 @@ impl Server {
         if tokio::time::timeout(DATABASE_PATIENCE, self.store.close()).await.is_err() {
             tracing::warn!("the database did not close in time");
         }
-        self.data.unpublish();
     }
 }
 

@@ -19,7 +19,7 @@ use super::login::{kept_pin, kept_token, last_server};
 use super::output::printable;
 use super::{CommandError, Connection, Outcome};
 use crate::clock::Clock;
-use crate::data_directory::Addresses;
+use crate::data_directory::{Addresses, OPERATOR_TOKEN, is_locked};
 
 /// How often a request is tried.
 const TRIES: u32 = 6;
@@ -60,6 +60,20 @@ pub enum ClientError {
         url: String,
         /// The HTTP status.
         status: StatusCode,
+    },
+    /// The directory that says where the server is has none.
+    #[error("no server is up that serves from {}: start it with taskd serve, or name another with --server", data.display())]
+    NotServing {
+        /// The directory.
+        data: PathBuf,
+    },
+    /// Whether a server serves from the directory can't be told.
+    #[error("can't tell whether a server serves from {}", data.display())]
+    DataDirectory {
+        /// The directory.
+        data: PathBuf,
+        /// Why.
+        source: std::io::Error,
     },
     /// No token was given.
     #[error(
@@ -107,12 +121,15 @@ impl ClientError {
             Self::Refused { status: StatusCode::UNAUTHORIZED | StatusCode::FORBIDDEN, .. } => Outcome::NotAllowed,
             Self::Refused { status: StatusCode::BAD_REQUEST | StatusCode::UNPROCESSABLE_ENTITY, .. }
             | Self::NoToken { .. }
+            | Self::DataDirectory { .. }
             | Self::TokenFile { .. }
             | Self::Token { .. }
             | Self::Url { .. }
             | Self::PinInPlainText { .. } => Outcome::Usage,
             Self::Refused { code, .. } if code == "no_robots_match" => Outcome::Usage,
-            Self::Refused { .. } | Self::Unreachable { .. } | Self::NotTheServer { .. } => Outcome::Failed,
+            Self::Refused { .. } | Self::Unreachable { .. } | Self::NotTheServer { .. } | Self::NotServing { .. } => {
+                Outcome::Failed
+            }
         }
     }
 
@@ -150,14 +167,7 @@ impl Client {
 
     /// The same without a token, to ask for one.
     pub(crate) fn anonymous(connection: &Connection) -> Result<Self, CommandError> {
-        let data = data_directory(connection);
-        let (base, known_pin) = match &connection.server {
-            Some(url) => (url.trim_end_matches('/').to_owned(), None),
-            None => local_server(data.as_deref())
-                // What was signed in to elsewhere is not meant by who names a directory here.
-                .or_else(|| connection.data.is_none().then(last_server).flatten().map(|base| (base, None)))
-                .unwrap_or_else(|| ("http://127.0.0.1:8080".to_owned(), None)),
-        };
+        let (base, known_pin) = find_server(connection, data_directory(connection).as_deref())?;
         let url = reqwest::Url::parse(&base).ok();
         let is_http =
             |url: &reqwest::Url| matches!(url.scheme(), "http" | "https") && url.has_host() && url.query().is_none();
@@ -419,11 +429,34 @@ fn retry_after(response: &Response) -> Option<Duration> {
     Some(Duration::from_secs(seconds).min(MAX_PAUSE))
 }
 
-/// URL and pin of the server that serves from the directory, as it wrote them into there.
-fn local_server(data: Option<&Path>) -> Option<(String, Option<CaPin>)> {
-    let text = std::fs::read(data?.join("addresses.json")).ok()?;
-    let addresses: Addresses = serde_json::from_slice(&text).ok()?;
-    Some((addresses.url(), addresses.ca_pin))
+/// URL and pin of the server that serves from the directory, as it wrote them into there. What one wrote that was killed
+/// since does not count: by now anybody may listen there.
+fn local_server(data: &Path) -> std::io::Result<Option<(String, Option<CaPin>)>> {
+    let addresses = if is_locked(data)? { Addresses::published(data) } else { None };
+    Ok(addresses.map(|addresses| (addresses.url(), addresses.ca_pin)))
+}
+
+/// What was said wins, then what runs on this machine, then what was signed in to. Who names a directory means the server
+/// that serves from it and no other.
+fn find_server(connection: &Connection, data: Option<&Path>) -> Result<(String, Option<CaPin>), ClientError> {
+    if let Some(url) = &connection.server {
+        return Ok((url.trim_end_matches('/').to_owned(), None));
+    }
+    let is_named = connection.data.is_some();
+    let local = match data.map(|data| (data, local_server(data))) {
+        Some((data, Err(source))) if is_named => {
+            return Err(ClientError::DataDirectory { data: data.to_owned(), source });
+        }
+        Some((_, local)) => local.ok().flatten(),
+        None => None,
+    };
+    if let Some(server) = local.or_else(|| if is_named { None } else { Some((last_server()?, None)) }) {
+        return Ok(server);
+    }
+    match data.filter(|data| is_named || data.join(OPERATOR_TOKEN).exists()) {
+        Some(data) => Err(ClientError::NotServing { data: data.to_owned() }),
+        None => Ok(("http://127.0.0.1:8080".to_owned(), None)),
+    }
 }
 
 pub(super) fn data_directory(connection: &Connection) -> Option<PathBuf> {
@@ -447,7 +480,7 @@ fn find_token(connection: &Connection, data: Option<&Path>, base: &str) -> Resul
         (Some(path), _, _) => (read_token(path)?, path.display().to_string()),
         (None, Some(token), _) => (token.clone(), "--token or TASKD_TOKEN".to_owned()),
         (None, None, Some(data)) => {
-            let path = data.join("operator.token");
+            let path = data.join(OPERATOR_TOKEN);
             if connection.data.is_none() && !path.exists() {
                 return Err(ClientError::NoToken { url: base.to_owned() });
             }
@@ -458,19 +491,15 @@ fn find_token(connection: &Connection, data: Option<&Path>, base: &str) -> Resul
     text.parse().map_err(|source| ClientError::Token { origin, source })
 }
 
-/// Whether what is reached at `base` serves from `data`, as far as can be told: by the addresses that are kept there, or,
-/// if it does not run, on this machine at all.
+/// Whether what is reached at `base` is the server that serves from `data`.
 fn serves_from(data: &Path, base: &str) -> bool {
-    let local = local_server(Some(data)).map(|(url, _)| url);
+    let Ok(Some((local, _))) = local_server(data) else { return false };
     let port = |url: &str| reqwest::Url::parse(url).ok().and_then(|url| url.port_or_known_default());
     let is_here = reqwest::Url::parse(base).is_ok_and(|url| {
         let host = url.host_str().unwrap_or_default().trim_matches(['[', ']']);
         host == "localhost" || host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback())
     });
-    match local {
-        Some(local) => local == base || (is_here && port(&local) == port(base)),
-        None => is_here,
-    }
+    local == base || (is_here && port(&local) == port(base))
 }
 
 fn read_token(path: &Path) -> Result<String, ClientError> {
@@ -485,6 +514,7 @@ pub(super) fn random_key() -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::data_directory::DataDirectory;
 
     #[test]
     fn pauses_grow_to_a_bound() {
@@ -574,8 +604,9 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let token = Token::random(task_proto::token::TokenKind::Operator).reveal();
         std::fs::write(dir.path().join("operator.token"), token).unwrap();
-        let addresses = dir.path().join("addresses.json");
-        std::fs::write(&addresses, r#"{"http":"10.0.0.7:8081","mqtt":"10.0.0.7:1884"}"#).unwrap();
+        let server = DataDirectory::open(dir.path()).unwrap();
+        let (http, mqtt) = ("10.0.0.7:8081".to_owned(), "10.0.0.7:1884".to_owned());
+        server.publish(&Addresses { http, mqtt, ca_pin: None }).unwrap();
         let mut connection = Connection {
             server: None,
             token: None,
@@ -588,7 +619,7 @@ mod tests {
             connection.server = server.map(str::to_owned);
             match Client::connect(&connection) {
                 Ok(client) => client.token.is_some(),
-                Err(CommandError::Client(ClientError::NoToken { .. })) => false,
+                Err(CommandError::Client(ClientError::NoToken { .. } | ClientError::NotServing { .. })) => false,
                 Err(other) => panic!("{other}"),
             }
         };
@@ -598,9 +629,11 @@ mod tests {
         for other in ["https://10.0.0.8:8081", "http://localhost.example:8081", "http://127.0.0.1:9"] {
             assert!(!finds(Some(other)), "{other}");
         }
-        std::fs::remove_file(addresses).unwrap();
-        assert!(finds(None) && finds(Some("http://127.0.0.1:9")), "none runs: it may have run there");
-        assert!(!finds(Some("http://10.0.0.7:8081")));
+        // Killed, so that its addresses are still there: who listens there now is another.
+        drop(server);
+        for anyone in [None, Some("http://10.0.0.7:8081"), Some("http://localhost:8081"), Some("http://127.0.0.1:9")] {
+            assert!(!finds(anyone), "{anyone:?}");
+        }
     }
 
     #[tokio::test]
@@ -622,13 +655,28 @@ mod tests {
     #[test]
     fn the_server_on_this_machine_is_found_by_its_data_directory() {
         let dir = tempfile::tempdir().unwrap();
-        assert_eq!(local_server(Some(dir.path())), None);
-        std::fs::write(dir.path().join("addresses.json"), r#"{"http":"127.0.0.1:8081","mqtt":"127.0.0.1:1884"}"#)
-            .unwrap();
-        assert_eq!(local_server(Some(dir.path())), Some(("http://127.0.0.1:8081".to_owned(), None)));
-        let pin = CaPin::of(b"an authority's key");
-        let addresses = format!(r#"{{"http":"127.0.0.1:8081","mqtt":"127.0.0.1:1884","ca_pin":"{pin}"}}"#);
-        std::fs::write(dir.path().join("addresses.json"), addresses).unwrap();
-        assert_eq!(local_server(Some(dir.path())), Some(("https://127.0.0.1:8081".to_owned(), Some(pin))));
+        let connection = Connection {
+            server: None,
+            token: None,
+            pin: None,
+            token_file: None,
+            data: Some(dir.path().display().to_string()),
+            output: super::super::Format::Json,
+        };
+        let found = || find_server(&connection, Some(dir.path()));
+        let down = found().unwrap_err();
+        assert!(down.to_string().starts_with(&format!("no server is up that serves from {}", dir.path().display())));
+        assert_eq!(down.outcome(), Outcome::Failed);
+        let server = DataDirectory::open(dir.path()).unwrap();
+        let mut addresses = Addresses { http: "127.0.0.1:8081".to_owned(), mqtt: String::new(), ca_pin: None };
+        server.publish(&addresses).unwrap();
+        assert_eq!(found().unwrap(), ("http://127.0.0.1:8081".to_owned(), None));
+        addresses.ca_pin = Some(CaPin::of(b"an authority's key"));
+        server.publish(&addresses).unwrap();
+        assert_eq!(found().unwrap(), ("https://127.0.0.1:8081".to_owned(), addresses.ca_pin));
+        drop(server);
+        assert!(dir.path().join("addresses.json").exists() && found().is_err(), "it was killed");
+        let _next = DataDirectory::open(dir.path()).unwrap();
+        assert!(matches!(found(), Err(ClientError::NotServing { .. })), "it does not listen yet");
     }
 }

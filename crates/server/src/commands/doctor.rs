@@ -32,15 +32,13 @@ const DAY_MS: u64 = 24 * 60 * 60 * 1000;
 /// Looks at everything. Something bad is an outcome, not an error.
 pub(super) async fn run(connection: &Connection) -> Result<Outcome, CommandError> {
     let mut checkup = Checkup::default();
-    let client = Client::anonymous(connection)?;
-    let data = data_directory(connection);
-    let is_up = reach(&mut checkup, &client).await;
-    if is_up {
-        readiness(&mut checkup, &client).await;
-        certificate(&mut checkup, &client).await;
-        known_to(&mut checkup, connection).await;
-    }
-    match data {
+    let is_up = match Client::anonymous(connection) {
+        Ok(client) => server(&mut checkup, &client, connection).await,
+        // The directory, which is looked at below, is to say why.
+        Err(CommandError::Client(ClientError::NotServing { .. } | ClientError::DataDirectory { .. })) => false,
+        Err(error) => return Err(error),
+    };
+    match data_directory(connection) {
         Some(data) if data.exists() => doctor_here::check(&mut checkup, &data, is_up),
         Some(data) if connection.data.is_some() => {
             checkup.bad("data", format!("{} does not exist", data.display()), "look at --data and TASKD_DATA");
@@ -65,6 +63,17 @@ fn print(output: &Output, checkup: &Checkup) -> Result<(), CommandError> {
         }
         Format::Table | Format::Wide => output.text(&checkup.text(paint)),
     }
+}
+
+/// What can be seen from outside. Whether it answers at all.
+async fn server(checkup: &mut Checkup, client: &Client, connection: &Connection) -> bool {
+    let is_up = reach(checkup, client).await;
+    if is_up {
+        readiness(checkup, client).await;
+        certificate(checkup, client).await;
+        known_to(checkup, connection).await;
+    }
+    is_up
 }
 
 /// Name, connection and the first answer.

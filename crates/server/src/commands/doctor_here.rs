@@ -108,7 +108,7 @@ fn files(checkup: &mut Checkup, config: &Config) {
 
 /// Whether a server could begin to listen.
 fn ports(checkup: &mut Checkup, data: &Path, config: &Config) {
-    if is_locked(data) {
+    if is_locked(data).is_ok_and(|is_up| is_up) {
         return checkup.bad(
             "server",
             "one runs from this directory and does not answer",

@@ -108,7 +108,7 @@ impl Drop for DataDirectory {
 }
 
 impl DataDirectory {
-    /// Makes the directory if it is missing, and locks it.
+    /// Makes the directory if it is missing, and locks it. What a killed server published there is withdrawn.
     pub fn open(path: &Path) -> Result<Self, DataError> {
         let io_error = |path: PathBuf| move |source| DataError::Io { path, source };
         DirBuilder::new().recursive(true).mode(0o700).create(path).map_err(io_error(path.to_owned()))?;

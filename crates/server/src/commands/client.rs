@@ -516,6 +516,11 @@ mod tests {
     use super::*;
     use crate::data_directory::DataDirectory;
 
+    fn nothing_said() -> Connection {
+        let output = super::super::Format::Json;
+        Connection { server: None, token: None, pin: None, token_file: None, data: None, output }
+    }
+
     #[test]
     fn pauses_grow_to_a_bound() {
         assert_eq!(pause(1, u32::MAX), Duration::from_millis(400));
@@ -567,15 +572,8 @@ mod tests {
 
     fn client(address: std::net::SocketAddr) -> Client {
         let token = Token::random(task_proto::token::TokenKind::Operator).reveal();
-        let connection = Connection {
-            server: Some(format!("http://{address}/")),
-            token: Some(token),
-            pin: None,
-            token_file: None,
-            data: None,
-            output: super::super::Format::Json,
-        };
-        Client::connect(&connection).unwrap()
+        let server = Some(format!("http://{address}/"));
+        Client::connect(&Connection { server, token: Some(token), ..nothing_said() }).unwrap()
     }
 
     #[tokio::test]
@@ -607,14 +605,7 @@ mod tests {
         let server = DataDirectory::open(dir.path()).unwrap();
         let (http, mqtt) = ("10.0.0.7:8081".to_owned(), "10.0.0.7:1884".to_owned());
         server.publish(&Addresses { http, mqtt, ca_pin: None }).unwrap();
-        let mut connection = Connection {
-            server: None,
-            token: None,
-            pin: None,
-            token_file: None,
-            data: Some(dir.path().display().to_string()),
-            output: super::super::Format::Json,
-        };
+        let mut connection = Connection { data: Some(dir.path().display().to_string()), ..nothing_said() };
         let mut finds = |server: Option<&str>| {
             connection.server = server.map(str::to_owned);
             match Client::connect(&connection) {
@@ -640,10 +631,8 @@ mod tests {
     async fn what_is_asked_in_the_wrong_way_is_told_the_right_one() {
         let plain = busy_server().await;
         let client = |url: String, pin: Option<CaPin>| {
-            let data = None;
             let token = Some(Token::random(task_proto::token::TokenKind::Operator).reveal());
-            let output = super::super::Format::Json;
-            Client::connect(&Connection { server: Some(url), token, pin, token_file: None, data, output })
+            Client::connect(&Connection { server: Some(url), token, pin, ..nothing_said() })
         };
         let error = client(format!("https://{plain}"), None).unwrap().delete("/refused").await.unwrap_err();
         assert!(error.to_string().ends_with("(it does not seem to encrypt: try http://)"), "{error}");
@@ -655,14 +644,7 @@ mod tests {
     #[test]
     fn the_server_on_this_machine_is_found_by_its_data_directory() {
         let dir = tempfile::tempdir().unwrap();
-        let connection = Connection {
-            server: None,
-            token: None,
-            pin: None,
-            token_file: None,
-            data: Some(dir.path().display().to_string()),
-            output: super::super::Format::Json,
-        };
+        let connection = Connection { data: Some(dir.path().display().to_string()), ..nothing_said() };
         let found = || find_server(&connection, Some(dir.path()));
         let down = found().unwrap_err();
         assert!(down.to_string().starts_with(&format!("no server is up that serves from {}", dir.path().display())));

@@ -84,6 +84,7 @@ pub struct Situation<'a> {
 
 /// What to do next.
 #[derive(Debug, Clone, PartialEq)]
+#[expect(clippy::large_enum_variant, reason = "it is taken apart where it is made")]
 pub enum Next {
     /// Nothing before this time, or before something changes.
     Rest {

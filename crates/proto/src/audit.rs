@@ -65,7 +65,7 @@ pub struct Link {
 
 impl Link {
     /// Where every chain begins.
-    pub const START: Self = Self { number: 0, digest: Digest::from_bytes([0; 32]) };
+    pub const START: Self = Self { number: 0, digest: Digest::from_sha256([0; 32]) };
 
     /// The link that an entry with this text makes after this one.
     pub fn next(&self, entry: &str) -> Self {

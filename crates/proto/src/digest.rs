@@ -1,52 +1,100 @@
-//! Content digests, `sha256:<64 hex digits>` (OCI image-spec, "Digests"). Only sha-256 is accepted.
+//! Content digests (OCI image-spec, "Digests"): `sha256:<64 hex digits>`, or `sha512:<128 hex digits>`, which the registry
+//! takes as well. What robots get has the first.
 
 use std::fmt;
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
-use sha2::{Digest as _, Sha256};
+use sha2::{Digest as _, Sha256, Sha512};
 
-/// The sha-256 digest of some bytes.
+/// What some bytes hash to.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(value_type = String, pattern = "^sha256:[0-9a-f]{64}$", example = "sha256:e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"))]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(value_type = String, pattern = "^(sha256:[0-9a-f]{64}|sha512:[0-9a-f]{128})$", example = "sha256:e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"))]
 #[serde(try_from = "String", into = "String")]
-pub struct Digest([u8; 32]);
+pub struct Digest(Bytes);
 
-/// A text that is not `sha256:` and 64 lower-case hex digits.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+enum Bytes {
+    Sha256([u8; 32]),
+    Sha512([u8; 64]),
+}
+
+/// What a digest is made with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Algorithm {
+    /// SHA-256.
+    Sha256,
+    /// SHA-512.
+    Sha512,
+}
+
+/// A text that is not `sha256:` or `sha512:` and as many lower-case hex digits as it has.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("not a digest: expected \"sha256:\" and 64 lower-case hex digits")]
+#[error("not a digest: expected \"sha256:\" and 64 lower-case hex digits, or \"sha512:\" and 128")]
 pub struct InvalidDigest;
 
-impl Digest {
+impl Algorithm {
+    /// Both.
+    pub const ALL: [Self; 2] = [Self::Sha256, Self::Sha512];
+
+    /// Its name before the colon.
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Self::Sha256 => "sha256",
+            Self::Sha512 => "sha512",
+        }
+    }
+
     /// The digest of `bytes`.
+    pub fn digest(self, bytes: &[u8]) -> Digest {
+        match self {
+            Self::Sha256 => Digest::from_sha256(Sha256::digest(bytes).into()),
+            Self::Sha512 => Digest::from_sha512(Sha512::digest(bytes).into()),
+        }
+    }
+}
+
+impl Digest {
+    /// The SHA-256 digest of `bytes`.
     pub fn of(bytes: &[u8]) -> Self {
-        Self(Sha256::digest(bytes).into())
+        Algorithm::Sha256.digest(bytes)
     }
 
-    /// From the 32 bytes a hasher gave.
-    pub const fn from_bytes(bytes: [u8; 32]) -> Self {
-        Self(bytes)
+    /// From the 32 bytes a SHA-256 hasher gave.
+    pub const fn from_sha256(bytes: [u8; 32]) -> Self {
+        Self(Bytes::Sha256(bytes))
     }
 
-    /// The 32 bytes.
-    pub fn to_bytes(&self) -> [u8; 32] {
-        self.0
+    /// From the 64 bytes a SHA-512 hasher gave.
+    pub const fn from_sha512(bytes: [u8; 64]) -> Self {
+        Self(Bytes::Sha512(bytes))
     }
 
-    /// The 64 hex digits, without the algorithm: the blob's file name.
+    /// What it is made with.
+    pub const fn algorithm(&self) -> Algorithm {
+        match self.0 {
+            Bytes::Sha256(_) => Algorithm::Sha256,
+            Bytes::Sha512(_) => Algorithm::Sha512,
+        }
+    }
+
+    /// The hex digits, without the algorithm: the blob's file name.
     pub fn hex(&self) -> String {
-        hex(&self.0)
+        match &self.0 {
+            Bytes::Sha256(bytes) => hex(bytes),
+            Bytes::Sha512(bytes) => hex(bytes),
+        }
     }
 }
 
 /// Lower-case hex.
-pub(crate) fn hex(bytes: &[u8]) -> String {
+pub fn hex(bytes: &[u8]) -> String {
     const DIGITS: &[u8; 16] = b"0123456789abcdef";
     bytes.iter().flat_map(|b| [DIGITS[(b >> 4) as usize] as char, DIGITS[(b & 15) as usize] as char]).collect()
 }
 
 /// The bytes of `N` × 2 lower-case hex digits; `None` for anything else.
-pub(crate) fn unhex<const N: usize>(text: &str) -> Option<[u8; N]> {
+pub fn unhex<const N: usize>(text: &str) -> Option<[u8; N]> {
     let nibble = |b: u8| match b {
         b'0'..=b'9' => Some(b - b'0'),
         b'a'..=b'f' => Some(b - b'a' + 10),
@@ -66,7 +114,12 @@ pub(crate) fn unhex<const N: usize>(text: &str) -> Option<[u8; N]> {
 impl FromStr for Digest {
     type Err = InvalidDigest;
     fn from_str(text: &str) -> Result<Self, InvalidDigest> {
-        text.strip_prefix("sha256:").and_then(unhex).map(Self).ok_or(InvalidDigest)
+        let read = match text.split_once(':') {
+            Some(("sha256", digits)) => unhex(digits).map(Self::from_sha256),
+            Some(("sha512", digits)) => unhex(digits).map(Self::from_sha512),
+            _ => None,
+        };
+        read.ok_or(InvalidDigest)
     }
 }
 
@@ -85,7 +138,7 @@ impl From<Digest> for String {
 
 impl fmt::Display for Digest {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "sha256:{}", self.hex())
+        write!(f, "{}:{}", self.algorithm().as_str(), self.hex())
     }
 }
 
@@ -100,10 +153,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn known_digest_round_trips() {
-        let text = "sha256:e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855";
-        assert_eq!(Digest::of(b"").to_string(), text);
-        assert_eq!(text.parse(), Ok(Digest::of(b"")));
+    fn known_digests_round_trip() {
+        let known = [
+            "sha256:e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855",
+            "sha512:cf83e1357eefb8bdf1542850d66d8007d620e4050b5715dc83f4a921d36ce9ce47d0d13c5d85f2b0ff8318d2877eec2f63b931bd47417a81a538327af927da3e",
+        ];
+        for (algorithm, text) in Algorithm::ALL.into_iter().zip(known) {
+            let digest = algorithm.digest(b"");
+            assert_eq!(digest.to_string(), text);
+            assert_eq!(text.parse(), Ok(digest));
+            assert_eq!(digest.algorithm(), algorithm);
+        }
+        assert_eq!(Digest::of(b""), Algorithm::Sha256.digest(b""));
     }
 
     #[test]
@@ -112,6 +173,8 @@ mod tests {
             "",
             "sha256:",
             "sha512:e3b0",
+            "sha512:e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855",
+            "sha384:e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855",
             &"sha256:".repeat(20),
             "sha256:E3B0C44298FC1C149AFBF4C8996FB92427AE41E4649B934CA495991B7852B855",
         ] {

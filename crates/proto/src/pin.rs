@@ -5,8 +5,8 @@ use std::fmt;
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
+use sha2::{Digest as _, Sha256};
 
-use crate::Digest;
 use crate::digest::{hex, unhex};
 
 /// What a client asks for by ALPN (RFC 7301) if it trusts a pinned authority: a server that has both shows it the
@@ -27,7 +27,7 @@ pub struct InvalidPin;
 impl CaPin {
     /// The pin of the authority with this SubjectPublicKeyInfo.
     pub fn of(public_key_info: &[u8]) -> Self {
-        Self(Digest::of(public_key_info).to_bytes())
+        Self(Sha256::digest(public_key_info).into())
     }
 }
 

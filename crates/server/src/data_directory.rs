@@ -8,9 +8,10 @@ use std::os::unix::fs::{DirBuilderExt as _, OpenOptionsExt as _};
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
+use task_proto::CaPin;
+use task_proto::digest::{hex, unhex};
 use task_proto::envelope::SigningKey;
 use task_proto::token::{Token, TokenKind};
-use task_proto::{CaPin, Digest};
 
 const LOCK: &str = "taskd.lock";
 const SIGNING_KEY: &str = "signing.key";
@@ -209,10 +210,8 @@ impl DataDirectory {
     /// 32 bytes in a file of their own, made on the first call.
     fn secret(&self, name: &str, expected: &'static str, make: fn() -> [u8; 32]) -> Result<[u8; 32], DataError> {
         let path = self.path.join(name);
-        // A digest's text form is as good as any for 32 bytes, and its parser is at hand.
-        let text = self.read_or_make(&path, || Digest::from_bytes(make()).hex())?;
-        let bytes: Result<Digest, _> = format!("sha256:{}", text.trim()).parse();
-        bytes.map(|bytes| bytes.to_bytes()).map_err(|_| DataError::Content { path, expected })
+        let text = self.read_or_make(&path, || hex(&make()))?;
+        unhex(text.trim()).ok_or(DataError::Content { path, expected })
     }
 
     fn read_or_make(&self, path: &Path, make: impl FnOnce() -> String) -> Result<String, DataError> {

@@ -6,7 +6,7 @@ use std::io::{self, Read as _, Write as _};
 use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
 use std::path::{Path, PathBuf};
 
-use task_proto::Digest;
+use task_proto::digest::{hex, unhex};
 use task_proto::envelope::{PublicKey, SigningKey};
 
 /// What a file with a private key begins with, so that whoever looks for lost secrets finds it.
@@ -47,8 +47,7 @@ pub enum KeyError {
 /// Makes a key: the private half at `path`, the public one at `path` and `.pub`. Nothing that is there is replaced.
 pub fn create(path: &Path) -> Result<PublicKey, KeyError> {
     let key = SigningKey::random();
-    // A digest's text form is as good as any for 32 bytes, and its parser is at hand.
-    let private = format!("{PRIVATE}{}\n", Digest::from_bytes(key.to_bytes()).hex());
+    let private = format!("{PRIVATE}{}\n", hex(&key.to_bytes()));
     let public = key.public_key();
     write_new(path, &private, 0o600)?;
     let written = write_new(&public_path(path), &format!("{public}\n"), 0o644);
@@ -66,12 +65,12 @@ pub fn read(path: &Path) -> Result<SigningKey, KeyError> {
     let mode = file.metadata().map_err(failed)?.mode() & 0o777;
     let mut text = String::new();
     file.take(MAX_BYTES).read_to_string(&mut text).map_err(failed)?;
-    let seed = text.strip_prefix(PRIVATE).and_then(|hex| format!("sha256:{}", hex.trim()).parse::<Digest>().ok());
+    let seed = text.strip_prefix(PRIVATE).and_then(|digits| unhex(digits.trim()));
     let seed = seed.ok_or_else(|| KeyError::NotPrivate { path: path.to_owned() })?;
     if mode & 0o077 != 0 {
         return Err(KeyError::Exposed { path: path.to_owned(), mode });
     }
-    Ok(SigningKey::from_bytes(seed.to_bytes()))
+    Ok(SigningKey::from_bytes(seed))
 }
 
 /// A public key as people name it: its text, or a file that holds it, or the private key beside such a file.

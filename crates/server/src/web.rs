@@ -61,7 +61,7 @@ fn serve(path: &str, headers: &HeaderMap) -> Result<Response, ApiError> {
 }
 
 fn tag(file: &EmbeddedFile) -> String {
-    format!("\"{}\"", Digest::from_bytes(file.metadata.sha256_hash()).hex())
+    format!("\"{}\"", Digest::from_sha256(file.metadata.sha256_hash()).hex())
 }
 
 /// Whether the caller has the file already: one of its tags is this one, compared weakly as RFC 9110 asks for.

@@ -94,7 +94,7 @@ impl Intake {
         if let Some(failure) = bytes.failure {
             return Err(failure);
         }
-        let found = Digest::from_bytes(bytes.hasher.finalize().into());
+        let found = Digest::from_sha256(bytes.hasher.finalize().into());
         if found != blob.digest {
             return Err(FetchError::DigestMismatch { digest: blob.digest, reason: format!("they hash to {found}") });
         }

@@ -120,7 +120,7 @@ fn hash(path: &Path, found: u64) -> io::Result<BlobRef> {
     let mut buffer = vec![0; 256 * 1024];
     loop {
         match file.read(&mut buffer)? {
-            0 => return Ok(BlobRef { digest: Digest::from_bytes(hash.finalize().into()), size }),
+            0 => return Ok(BlobRef { digest: Digest::from_sha256(hash.finalize().into()), size }),
             count => {
                 hash.update(&buffer[..count]);
                 size += count as u64;

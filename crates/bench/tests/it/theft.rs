@@ -11,11 +11,12 @@ use axum::http::StatusCode;
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
 use serde_json::{Value, json};
+use task_proto::DeploymentId;
 use task_proto::api::{DeploymentView, RobotView};
 use task_proto::desired::{BlobRef, DesiredState, PackageRef};
+use task_proto::digest::unhex;
 use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
 use task_proto::report::{FailureCode, Phase, Report, TaskReport};
-use task_proto::{DeploymentId, Digest};
 use tokio::task::JoinHandle;
 
 use crate::harness::{Server, eventually, open_directory, write_package};
@@ -94,8 +95,7 @@ async fn signed_state(site: &Site) -> Envelope {
 /// The server's own key, which signs desired states.
 fn stolen_key(server: &Server) -> SigningKey {
     let seed = std::fs::read_to_string(server.data().join("signing.key")).expect("the server's key");
-    let seed: Digest = format!("sha256:{}", seed.trim()).parse().expect("64 hex digits");
-    SigningKey::from_bytes(seed.to_bytes())
+    SigningKey::from_bytes(unhex(seed.trim()).expect("64 hex digits"))
 }
 
 async fn stolen_blob(server: &Server, blob: BlobRef) -> Vec<u8> {

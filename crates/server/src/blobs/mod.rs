@@ -1,4 +1,4 @@
-//! The blob store: bytes on disk under the digest they hash to, in `blobs/sha256/<hex>`. A blob is renamed into place
+//! The blob store: bytes on disk under the digest they hash to, in `blobs/<algorithm>/<hex>`. A blob is renamed into place
 //! when it is whole, verified and synced, and never modified afterwards. It knows no references: what may be deleted is
 //! [`crate::collector`]'s decision. A blob's modification time is when it was last asked for by someone
 //! who pushes; its content is never judged by it.
@@ -16,6 +16,7 @@ use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
 use task_proto::Digest;
+use task_proto::digest::Algorithm;
 use tokio::sync::{OwnedRwLockReadGuard, OwnedRwLockWriteGuard, RwLock, Semaphore};
 
 pub use body::BlobBody;
@@ -103,9 +104,9 @@ pub enum BlobError {
     #[error("the bytes hash to {actual}, not to {expected}")]
     WrongDigest {
         /// What was announced.
-        expected: Digest,
+        expected: Box<Digest>,
         /// What they hash to.
-        actual: Digest,
+        actual: Box<Digest>,
     },
     /// The sender went away.
     #[error("the upload's body broke off")]
@@ -182,8 +183,11 @@ pub struct Collection {
 impl Blobs {
     /// Opens the store in `data`, which gets the directories `blobs` and `uploads`.
     pub fn open(data: &Path, settings: BlobSettings) -> Result<Self, BlobError> {
-        let directory = data.join("blobs/sha256");
-        fs::create_dir_all(&directory).map_err(BlobError::disk("create", &directory))?;
+        let directory = data.join("blobs");
+        for algorithm in Algorithm::ALL {
+            let directory = directory.join(algorithm.as_str());
+            fs::create_dir_all(&directory).map_err(BlobError::disk("create", &directory))?;
+        }
         let uploads = Uploads::open(data.join("uploads"), settings)?;
         let open = Mutex::new(VecDeque::with_capacity(settings.max_open_blobs));
         let disk = Arc::new(Semaphore::new(DISK_READS));
@@ -221,8 +225,8 @@ impl Blobs {
     }
 
     /// Stores small bytes that are in memory already, and says what they hash to.
-    pub async fn put(&self, bytes: Bytes) -> Result<Digest, BlobError> {
-        let digest = Digest::of(&bytes);
+    pub async fn put(&self, algorithm: Algorithm, bytes: Bytes) -> Result<Digest, BlobError> {
+        let digest = algorithm.digest(&bytes);
         let partial = self.shared.uploads.fresh_path();
         let target = self.path(digest);
         on_disk(move || {
@@ -261,19 +265,21 @@ impl Blobs {
     pub async fn untouched_since(&self, before_ms: u64) -> Result<Vec<Digest>, BlobError> {
         let directory = self.shared.directory.clone();
         on_disk(move || {
-            let list = || {
-                let mut found = Vec::new();
-                for entry in fs::read_dir(&directory)? {
+            let mut found = Vec::new();
+            let mut list = |algorithm: Algorithm| {
+                for entry in fs::read_dir(directory.join(algorithm.as_str()))? {
                     let entry = entry?;
                     let name = entry.file_name();
-                    let Some(Ok(digest)) = name.to_str().map(|hex| format!("sha256:{hex}").parse()) else { continue };
+                    let named = name.to_str().map(|hex| format!("{}:{hex}", algorithm.as_str()).parse());
+                    let Some(Ok(digest)) = named else { continue };
                     if modified_ms(&entry.metadata()?)? < before_ms {
                         found.push(digest);
                     }
                 }
-                Ok(found)
+                Ok(())
             };
-            list().map_err(BlobError::disk("list", &directory))
+            Algorithm::ALL.into_iter().try_for_each(&mut list).map_err(BlobError::disk("list", &directory))?;
+            Ok(found)
         })
         .await
     }
@@ -282,12 +288,12 @@ impl Blobs {
     pub async fn used_bytes(&self) -> Result<u64, BlobError> {
         let directory = self.shared.directory.clone();
         on_disk(move || {
-            let sum = || {
+            let sum = |algorithm: Algorithm| {
                 // One that is deleted meanwhile takes no room.
-                let sizes = fs::read_dir(&directory)?.flatten().filter_map(|entry| entry.metadata().ok());
-                Ok(sizes.map(|metadata| metadata.len()).sum())
+                let entries = fs::read_dir(directory.join(algorithm.as_str()))?.flatten();
+                Ok(entries.filter_map(|entry| entry.metadata().ok()).map(|metadata| metadata.len()).sum::<u64>())
             };
-            sum().map_err(BlobError::disk("list", &directory))
+            Algorithm::ALL.into_iter().map(sum).sum::<io::Result<u64>>().map_err(BlobError::disk("list", &directory))
         })
         .await
     }
@@ -318,7 +324,7 @@ impl Blobs {
     }
 
     fn path(&self, digest: Digest) -> PathBuf {
-        self.shared.directory.join(digest.hex())
+        self.shared.directory.join(digest.algorithm().as_str()).join(digest.hex())
     }
 
     /// The blob, if it is open; it then is the last to be closed.
@@ -477,7 +483,7 @@ mod tests {
     async fn readers_share_one_mapping() {
         let data = tempfile::tempdir().expect("a directory");
         let blobs = Blobs::open(data.path(), BlobSettings::default()).expect("opened");
-        let digest = blobs.put(Bytes::from_static(b"content")).await.expect("stored");
+        let digest = blobs.put(Algorithm::Sha256, Bytes::from_static(b"content")).await.expect("stored");
         let readers: Vec<_> = (0..64)
             .map(|_| {
                 tokio::spawn({

@@ -1,10 +1,10 @@
-//! Unfinished uploads: `uploads/<id>` holds the bytes that came, memory holds their running hash; a restart ends them all.
+//! Unfinished uploads: `uploads/<id>` holds the bytes that came, memory holds their running hash by SHA-256; a restart ends them all.
 //! It never lets bytes become a blob before they hash to what was announced, nor robots take more than is theirs, nor uploads
 //! that somebody left keep others from pushing.
 
 use std::collections::HashMap;
 use std::fs::{self, File};
-use std::io;
+use std::io::{self, Read as _};
 use std::os::unix::fs::FileExt as _;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
@@ -14,7 +14,8 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use futures_util::{Stream, StreamExt as _};
-use sha2::{Digest as _, Sha256};
+use sha2::{Digest as _, Sha256, Sha512};
+use task_proto::digest::Algorithm;
 use task_proto::output::owner;
 use task_proto::{Digest, RepositoryName, RobotId};
 use tokio::sync::OwnedMutexGuard;
@@ -125,18 +126,29 @@ impl Upload {
 
     fn finish(&mut self, expected: Digest, target: &Path) -> Result<u64, BlobError> {
         self.ended = true;
-        let actual = Digest::from_bytes(self.hasher.clone().finalize().into());
-        if actual != expected {
-            return Err(BlobError::WrongDigest { expected, actual });
-        }
-        let sync = || {
-            // A write that failed half way may have left bytes behind the end.
-            self.file.set_len(self.offset)?;
-            self.file.sync_all()
+        // A write that failed half way may have left bytes behind the end.
+        self.file.set_len(self.offset).map_err(BlobError::disk("cut", &self.path))?;
+        let actual = match expected.algorithm() {
+            Algorithm::Sha256 => Digest::from_sha256(self.hasher.clone().finalize().into()),
+            Algorithm::Sha512 => sha512(&self.path).map_err(BlobError::disk("read", &self.path))?,
         };
-        sync().map_err(BlobError::disk("sync", &self.path))?;
+        if actual != expected {
+            return Err(BlobError::WrongDigest { expected: expected.into(), actual: actual.into() });
+        }
+        self.file.sync_all().map_err(BlobError::disk("sync", &self.path))?;
         move_into_place(&self.path, target)?;
         Ok(self.offset)
+    }
+}
+
+/// What a file hashes to by the algorithm that few ask for, and only once everything has come.
+fn sha512(path: &Path) -> io::Result<Digest> {
+    let (mut file, mut hasher, mut piece) = (File::open(path)?, Sha512::new(), vec![0; GATHERED_BYTES]);
+    loop {
+        match file.read(&mut piece)? {
+            0 => return Ok(Digest::from_sha512(hasher.finalize().into())),
+            count => hasher.update(&piece[..count]),
+        }
     }
 }
 

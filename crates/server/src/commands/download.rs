@@ -41,7 +41,7 @@ pub(super) async fn download(
         writer.write_all(&chunk).await.map_err(failed)?;
     }
     writer.flush().await.map_err(failed)?;
-    let got = Digest::from_bytes(hash.finalize().into());
+    let got = Digest::from_sha256(hash.finalize().into());
     if got != digest {
         return Err(failed(std::io::Error::other(format!("the bytes hash to {got}, not to {digest}"))));
     }

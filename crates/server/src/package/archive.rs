@@ -102,7 +102,7 @@ impl<W: Write> Hashing<W> {
     }
 
     fn finish(self) -> (Digest, u64, W) {
-        (Digest::from_bytes(self.hasher.finalize().into()), self.size, self.inner)
+        (Digest::from_sha256(self.hasher.finalize().into()), self.size, self.inner)
     }
 }
 

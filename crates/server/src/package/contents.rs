@@ -30,7 +30,7 @@ pub fn list(content: impl Read, content_size: u64, facts: &ContentFacts) -> Resu
                 hasher.update(bytes);
                 Ok(())
             })?;
-            file.digest = Some(Digest::from_bytes(hasher.finalize().into()));
+            file.digest = Some(Digest::from_sha256(hasher.finalize().into()));
         }
         names_bytes += (path.len() + file.target.as_ref().map_or(0, String::len)) as u64;
         if names_bytes > MAX_NAMES_BYTES {

@@ -7,7 +7,7 @@ use std::process::Stdio;
 use std::time::Duration;
 
 use serde_json::Value;
-use task_proto::Digest;
+use task_proto::digest::hex;
 use task_proto::envelope::SigningKey;
 
 use crate::answering::{Answering, publish_log_and_go};
@@ -70,8 +70,7 @@ impl Lab {
         {
             let key = SigningKey::from_bytes([seed; 32]);
             let private = directory.join(format!("{name}.key"));
-            let seed = Digest::from_bytes([seed; 32]);
-            std::fs::write(&private, format!("taskd-private-key ed25519 {}\n", seed.hex())).unwrap();
+            std::fs::write(&private, format!("taskd-private-key ed25519 {}\n", hex(&[seed; 32]))).unwrap();
             std::fs::set_permissions(&private, std::fs::Permissions::from_mode(mode)).unwrap();
             std::fs::write(directory.join(format!("{name}.key.pub")), format!("{}\n", key.public_key())).unwrap();
             ids.extend([(short, key.public_key().id()), (long, key.public_key().to_string())]);

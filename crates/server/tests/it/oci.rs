@@ -3,6 +3,7 @@
 use reqwest::{Method, Response, StatusCode};
 use serde_json::{Value, json};
 use task_proto::desired::BlobRef;
+use task_proto::digest::Algorithm;
 use task_proto::oci::{INDEX_TYPE, MANIFEST_TYPE};
 use task_proto::{Digest, RepositoryName, RobotId};
 use taskd::blobs::BlobSettings;
@@ -12,7 +13,7 @@ use taskd::http::oci::Registry;
 use taskd::store::{NewManifest, PutManifest, StoredManifest};
 
 use crate::database::{TestDatabase, on_both_databases};
-use crate::registry::{NOW_MS, TestRegistry, header, image, operator, refusal, refused};
+use crate::registry::{GRACE, NOW_MS, TestRegistry, header, image, operator, refusal, refused};
 
 on_both_databases!(referrers_come_in_pages);
 
@@ -88,7 +89,7 @@ async fn a_blob_is_read_whole_and_in_parts_from_either_kind_of_store() {
 async fn nothing_here_has_a_digest_of_another_algorithm() {
     let registry = TestRegistry::start().await;
     let blob = registry.push_blob("a", b"{}").await;
-    let digest = format!("sha512:{}", "0".repeat(128));
+    let digest = format!("sha384:{}", "0".repeat(96));
     for (kind, code) in [("blobs", "BLOB_UNKNOWN"), ("manifests", "MANIFEST_UNKNOWN")] {
         let path = format!("/v2/a/{kind}/{digest}");
         assert_eq!(refusal(registry.get(&path).await).await, refused(404, code));
@@ -105,9 +106,55 @@ async fn nothing_here_has_a_digest_of_another_algorithm() {
         let answer = push.send().await.expect("an answer");
         assert_eq!(answer.status(), StatusCode::BAD_REQUEST);
         let body: Value = answer.json().await.expect("JSON");
-        let error = json!({ "code": "DIGEST_INVALID", "message": "only sha256 is supported" });
+        let error = json!({ "code": "DIGEST_INVALID", "message": "only sha256 and sha512 are supported" });
         assert_eq!(body["errors"], json!([error]));
     }
+}
+
+#[tokio::test]
+async fn what_is_pushed_by_sha512_has_that_name() {
+    let registry = TestRegistry::start().await;
+    let [config, layer] = [&b"{}"[..], &vec![7; 3_000_000]]
+        .map(|bytes| (BlobRef { digest: Algorithm::Sha512.digest(bytes), size: bytes.len() as u64 }, bytes.to_vec()));
+    let push = async |begin: &str, (blob, bytes): (BlobRef, Vec<u8>)| {
+        let answer = registry.ask(Method::POST, begin).send().await.expect("an answer");
+        assert_eq!(answer.status(), StatusCode::ACCEPTED);
+        let finish = format!("{}?digest={}", header(&answer, "location"), blob.digest);
+        let answer = registry.ask(Method::PUT, &finish).body(bytes).send().await.expect("an answer");
+        let is_created = answer.status() == StatusCode::CREATED;
+        if is_created {
+            assert_eq!(header(&answer, "docker-content-digest"), blob.digest.to_string());
+        }
+        is_created
+    };
+    let begin = "/v2/a/blobs/uploads/?digest-algorithm=sha512";
+    assert!(!push(begin, (layer.0, b"other".to_vec())).await, "bytes that hash to something else");
+    assert!(push(begin, layer.clone()).await);
+    assert!(push("/v2/a/blobs/uploads/", config.clone()).await, "the algorithm may be said at the end alone");
+    let answer = registry.get(&format!("/v2/a/blobs/{}", layer.0.digest)).await;
+    assert_eq!(header(&answer, "docker-content-digest"), layer.0.digest.to_string());
+    assert!(answer.bytes().await.expect("a body") == layer.1);
+    let by_other_name = format!("/v2/a/blobs/{}", Digest::of(&layer.1));
+    assert_eq!(registry.status(Method::HEAD, &by_other_name).await, StatusCode::NOT_FOUND);
+
+    let image = image(config.0, layer.0);
+    let digest = Algorithm::Sha512.digest(&serde_json::to_vec(&image).expect("JSON"));
+    let path = format!("/v2/a/manifests/{digest}");
+    assert_eq!(registry.put_manifest(&path, MANIFEST_TYPE, &image).await.status(), StatusCode::CREATED);
+    let answer = registry.get(&path).await;
+    assert_eq!(header(&answer, "docker-content-digest"), digest.to_string());
+    assert_eq!(Algorithm::Sha512.digest(&answer.bytes().await.expect("a body")), digest);
+
+    let later_ms = NOW_MS + 2 * u64::try_from(GRACE.as_millis()).expect("a time");
+    assert_eq!(registry.collect(later_ms).await.blobs, 0, "all of it is referred to");
+    assert_eq!(registry.status(Method::DELETE, &path).await, StatusCode::ACCEPTED);
+    for (blob, _) in [&config, &layer] {
+        let path = format!("/v2/a/blobs/{}", blob.digest);
+        assert_eq!(registry.status(Method::DELETE, &path).await, StatusCode::ACCEPTED);
+    }
+    assert_eq!(registry.collect(later_ms).await.blobs, 3);
+    let left = std::fs::read_dir(registry.data.path().join("blobs/sha512")).expect("a directory");
+    assert_eq!(left.count(), 0);
 }
 
 #[tokio::test]
@@ -283,7 +330,7 @@ async fn a_manifest_that_was_taken_as_a_page_is_served_as_bytes() {
     let registry = TestRegistry::start().await;
     let Registry { store, blobs, .. } = &registry.registry;
     let page = "<script>fetch('/api/v1/users')</script>";
-    let digest = blobs.put(page.into()).await.expect("stored");
+    let digest = blobs.put(Algorithm::Sha256, page.into()).await.expect("stored");
     let new = NewManifest {
         manifest: StoredManifest { digest, size: page.len() as u64, media_type: "text/html".to_owned() },
         artifact_type: None,

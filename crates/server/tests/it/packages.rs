@@ -5,6 +5,7 @@ use std::time::Duration;
 use futures_util::FutureExt as _;
 use reqwest::{Method, StatusCode};
 use serde_json::{Value, json};
+use task_proto::digest::Algorithm;
 use task_proto::oci::{ImageManifest, MANIFEST_TYPE};
 use task_proto::person::{Role, Roles};
 use task_proto::{Digest, RepositoryName, RobotId};
@@ -16,7 +17,7 @@ use taskd::store::{NewManifest, PutManifest, StoredManifest};
 
 use crate::database::{TestDatabase, on_both_databases};
 use crate::fleet::{Fleet, order_of, random_key};
-use crate::registry::{GRACE, NOW_MS, TestRegistry, operator, serve};
+use crate::registry::{GRACE, NOW_MS, TestRegistry, operator, refusal, refused, serve};
 
 const YEAR_MS: u64 = 365 * 24 * 3_600_000;
 
@@ -45,10 +46,13 @@ async fn a_task_package_is_checked_and_listed() {
         assert_eq!(body["errors"][0]["code"], "MANIFEST_INVALID");
         assert!(body["errors"][0]["message"].as_str().expect("text").contains(reason), "{body} for {reason}");
     }
-    assert_eq!(registry.registry.store.packages().await.expect("packages"), []);
-
     let config = registry.push_blob("talker", task("talker").to_string().as_bytes()).await;
     let package = ImageManifest::package(config, content);
+    let name = Algorithm::Sha512.digest(&serde_json::to_vec(&package).expect("JSON"));
+    let answer = registry.put_manifest(&format!("/v2/talker/manifests/{name}"), MANIFEST_TYPE, &package).await;
+    assert_eq!(refusal(answer).await, refused(400, "MANIFEST_INVALID"), "no robot knows it by that name");
+    assert_eq!(registry.registry.store.packages().await.expect("packages"), []);
+
     for _ in 0..2 {
         let answer = registry.put_manifest("/v2/talker/manifests/1.0.0", MANIFEST_TYPE, &package).await;
         assert_eq!(answer.status(), StatusCode::CREATED);

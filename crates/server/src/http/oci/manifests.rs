@@ -82,14 +82,10 @@ pub(super) async fn push(
     bytes: Bytes,
 ) -> Result<NewManifest, OciError> {
     let Push { repository, reference, by, only } = push;
-    let digest = Digest::of(&bytes);
-    if let Reference::Digest(expected) = reference
-        && expected != digest
-    {
-        return Err(OciError::digest_invalid(format!("the manifest hashes to {digest}, not to {expected}")));
-    }
+    let digest = digest_of(&bytes, &reference)?;
     let content_type = headers.get(CONTENT_TYPE).and_then(|value| value.to_str().ok());
     let parsed = Parsed::new(content_type, &bytes)?;
+    parsed.check_for_robots(digest)?;
     if only.is_some_and(|only| parsed.artifact_type.as_deref() != Some(only)) {
         return Err(OciError::denied("a robot may only push outputs"));
     }
@@ -121,7 +117,7 @@ pub(super) async fn push(
     registry.blobs.check_room(repository, 0, kept_bytes(registry, repository).await?)?;
     // First, for whoever hangs up in the middle has it counted as well.
     registry.store.count_blob(repository, &manifest).await?;
-    registry.blobs.put(bytes).await?;
+    registry.blobs.put(digest.algorithm(), bytes).await?;
     registry.blobs.touch(digest, now_ms).await?;
     let new = NewManifest {
         manifest: StoredManifest { digest, size: manifest.size, media_type: parsed.media_type },
@@ -146,6 +142,16 @@ pub(super) async fn push(
             Ok(new)
         }
     }
+}
+
+/// What a manifest hashes to, which must be what it is pushed as.
+fn digest_of(bytes: &[u8], reference: &Reference) -> Result<Digest, OciError> {
+    let Reference::Digest(expected) = reference else { return Ok(Digest::of(bytes)) };
+    let digest = expected.algorithm().digest(bytes);
+    if digest != *expected {
+        return Err(OciError::digest_invalid(format!("the manifest hashes to {digest}, not to {expected}")));
+    }
+    Ok(digest)
 }
 
 /// The push of a manifest, as the audit tells of it.

@@ -15,6 +15,7 @@ use axum::extract::{Path, Request, State};
 use axum::response::{IntoResponse, Response};
 use http::{HeaderMap, HeaderValue, Method, StatusCode, Uri};
 use serde::de::DeserializeOwned;
+use task_proto::digest::Algorithm;
 use task_proto::output::{self, OUTPUT_TYPE};
 use task_proto::person::Permission;
 use task_proto::publisher::LIST_REPOSITORY;
@@ -30,6 +31,9 @@ use crate::clock::Clock;
 use crate::person::Person;
 use crate::store::{Reference, Store};
 use crate::transfers::Transfers;
+
+/// What is said of digests by another algorithm.
+const ALGORITHMS: &str = "only sha256 and sha512 are supported";
 
 /// What the registry works on.
 #[derive(Clone)]
@@ -239,7 +243,7 @@ fn may_push(robot: &RobotId, repository: &RepositoryName, method: &Method, endpo
 
 fn parse_digest(text: &str) -> Result<Digest, OciError> {
     text.parse().map_err(|error: task_proto::digest::InvalidDigest| match is_of_another_algorithm(text) {
-        true => OciError::digest_invalid("only sha256 is supported"),
+        true => OciError::digest_invalid(ALGORITHMS),
         false => OciError::digest_invalid(error.to_string()),
     })
 }
@@ -251,7 +255,8 @@ fn digest_of_blob(text: &str) -> Result<Digest, OciError> {
 
 /// Whether this is a digest, but not one of those that things have here.
 fn is_of_another_algorithm(text: &str) -> bool {
-    !text.starts_with("sha256:") && lists::is_digest(text)
+    let is_known = |algorithm: &str| Algorithm::ALL.iter().any(|known| known.as_str() == algorithm);
+    lists::is_digest(text) && text.split_once(':').is_some_and(|(algorithm, _)| !is_known(algorithm))
 }
 
 fn parse_reference(text: &str) -> Result<Reference, OciError> {

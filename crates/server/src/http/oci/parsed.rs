@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 
 use serde::Deserialize;
 use task_proto::Digest;
+use task_proto::digest::Algorithm;
 use task_proto::oci::{INDEX_TYPE, ImageManifest, MANIFEST_TYPE, PACKAGE_TYPE};
 use task_proto::output::OUTPUT_TYPE;
 use task_proto::publisher::{LIST_ARTIFACT, SIGNATURE_ARTIFACT};
@@ -53,7 +54,7 @@ struct Document {
     annotations: Option<BTreeMap<String, String>>,
 }
 
-/// A descriptor. Its digest may be of any algorithm; only sha-256 can be here.
+/// A descriptor. Its digest may be of any algorithm; only what has one of two can be here.
 #[derive(Deserialize)]
 #[serde(rename_all = "camelCase")]
 struct Part {
@@ -99,6 +100,22 @@ impl Parsed {
         Ok(parsed)
     }
 
+    /// What robots get or bring has the digests that robots of every version know.
+    pub(super) fn check_for_robots(&self, manifest: Digest) -> Result<(), OciError> {
+        let documents = [&self.package, &self.output, &self.signature, &self.publishers];
+        if documents.into_iter().all(Option::is_none) {
+            return Ok(());
+        }
+        let mut digests = self.parts.iter().chain([&manifest]);
+        match digests.find(|digest| digest.algorithm() != Algorithm::Sha256) {
+            Some(other) => {
+                let message = format!("{other}: robots know the digests by sha256 alone");
+                Err(OciError::manifest_invalid(message))
+            }
+            None => Ok(()),
+        }
+    }
+
     /// These go into headers and columns, which not every character can.
     fn check_texts(&self) -> Result<(), OciError> {
         let texts = [("artifactType", self.artifact_type.as_ref()), ("subject", self.subject.as_ref())];
@@ -139,7 +156,7 @@ impl Document {
         for part in needed {
             let digest = part.digest.parse().map_err(|_| {
                 OciError::manifest_invalid(format!(
-                    "{:?} is not a sha256 digest; others are not supported",
+                    "{:?} is not a digest of sha256 or sha512; others are not supported",
                     part.digest
                 ))
             })?;

@@ -7,11 +7,12 @@ use http::request::Parts;
 use http::{HeaderMap, StatusCode};
 use serde::Deserialize;
 use task_proto::desired::BlobRef;
+use task_proto::digest::Algorithm;
 use task_proto::output::owner;
 use task_proto::{Digest, RepositoryName};
 
 use super::blobs::decimal;
-use super::{Answer, OciError, Registry, empty, parse_digest, query};
+use super::{ALGORITHMS, Answer, OciError, Registry, empty, parse_digest, query};
 use crate::blobs::UploadId;
 
 #[derive(Deserialize)]
@@ -38,8 +39,9 @@ pub(super) async fn begin(
     may_mount: bool,
 ) -> Answer {
     let query: BeginQuery = query(&parts.uri)?;
-    if query.digest_algorithm.is_some_and(|algorithm| algorithm != "sha256") {
-        return Err(OciError::digest_invalid("only sha256 is supported"));
+    let is_known = |asked: &String| Algorithm::ALL.iter().any(|algorithm| algorithm.as_str() == asked);
+    if query.digest_algorithm.as_ref().is_some_and(|asked| !is_known(asked)) {
+        return Err(OciError::digest_invalid(ALGORITHMS));
     }
     if let Some(digest) = &query.mount {
         let digest = parse_digest(digest)?;

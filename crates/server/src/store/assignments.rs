@@ -152,7 +152,7 @@ impl Write {
     ) -> Result<Vec<(DeploymentId, RobotId)>, StoreError> {
         let begun = grown_by(Phase::Assigned, "$3");
         let restart = format!(
-            "SET wanted = 'running', run = run + 1, phase = 'assigned', ended = 0, progress = NULL, failure = NULL,
+            "SET wanted = 'running', run = CASE WHEN last_run > run THEN last_run ELSE run END + 1, phase = 'assigned', ended = 0, progress = NULL, failure = NULL,
                  attempts = 0, expires_at_ms = $2, updated_at_ms = $3, timeline = {begun} FROM v WHERE desired = 1"
         );
         let start = format!("{restart} AND (wanted = 'stopped' OR ended = 1)");

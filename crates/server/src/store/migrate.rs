@@ -27,6 +27,7 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[
     (17, "robot_blobs", include_str!("../migrations/0017_robot_blobs.sql")),
     (18, "referrers", include_str!("../migrations/0018_referrers.sql")),
     (19, "needs", include_str!("../migrations/0019_needs.sql")),
+    (20, "last_run", include_str!("../migrations/0020_last_run.sql")),
 ];
 
 /// Applies what has not been applied yet.

@@ -117,13 +117,15 @@ impl Write {
         Ok(robots)
     }
 
-    /// Ends what was ordered of tasks that stay on their robots.
+    /// Ends what was ordered of tasks that stay on their robots. A run that a robot never spoke of may have begun there, so its
+    /// number is not given out again.
     async fn leave(&mut self, rows: &[&Revocable], phase: Phase, now_ms: u64) -> Result<(), StoreError> {
         let rows: Vec<_> = rows.iter().filter_map(|row| Some((*row, row.left.as_ref()?))).collect();
         for group in groups(&rows) {
             let sql = format!(
                 "WITH v (deployment_id, robot_id, run, wanted, phase, ended, failure) AS ({})
-                 UPDATE assignments SET run = v.run, wanted = v.wanted, phase = v.phase, ended = v.ended,
+                 UPDATE assignments SET run = v.run,
+                     last_run = CASE WHEN assignments.run > last_run THEN assignments.run ELSE last_run END, wanted = v.wanted, phase = v.phase, ended = v.ended,
                      failure = v.failure, progress = NULL, expires_at_ms = NULL, updated_at_ms = $1, timeline = {}
                  FROM v WHERE assignments.deployment_id = v.deployment_id AND assignments.robot_id = v.robot_id",
                 values(2, group.len(), LEFT),

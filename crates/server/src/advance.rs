@@ -39,6 +39,8 @@ pub async fn advance(
                     };
                 }
                 waiting.extend(released.superseded);
+                // Should it have begun on robots only that nothing is waited for.
+                waiting.insert(deployment.clone());
             }
         }
         consequences.deployments.insert(deployment);

@@ -18,7 +18,7 @@ pub struct Rollout {
 pub struct Tally {
     /// Their batch has not begun.
     pub waiting: u64,
-    /// Released and not settled.
+    /// Released, not settled, and waited for.
     pub busy: u64,
     /// Settled by failing.
     pub failed: u64,

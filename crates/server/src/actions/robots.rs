@@ -16,7 +16,7 @@ use super::approval::check_room;
 use super::bulk::removal;
 use super::{ActionError, Actions, MAX_LIFETIME_MS, check_scope, quoted};
 use crate::advance::advance;
-use crate::changes::Change;
+use crate::changes::{Change, Consequences};
 use crate::person::Person;
 use crate::store::{Act, Deed, EnrolmentTerms, KnownRobot, StoreError, Write};
 
@@ -223,8 +223,13 @@ impl Actions {
         }
         let deed = Deed::by(by, Act::RobotRevoke, robot).with("name", &known.name).with("mac", known.mac);
         write.audit(&deed, now_ms).await?;
+        // No batch waits for it any more.
+        let touched = write.begun_on(robot).await?;
+        let mut consequences = Consequences::default();
+        advance(&mut write, &self.chooser, touched, now_ms, &mut consequences).await?;
         write.commit().await?;
         self.changes.announce(Change::Robot(known.id));
+        self.changes.publish(consequences);
         Ok(())
     }
 

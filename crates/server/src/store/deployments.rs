@@ -1,6 +1,6 @@
 //! Deployments: the operators' orders, and how far they have come.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 
 use sqlx::{AssertSqlSafe, Row as _};
 use task_proto::api::{AssignmentView, CreateDeployment, DeploymentView, PhaseCount};
@@ -254,22 +254,41 @@ impl Write {
             forgiven: number(row.try_get("forgiven")?),
             paused: row.try_get::<i64, _>("paused")? == 1,
         };
-        let counted: Vec<(i64, String, i64)> = sqlx::query_as(
-            "SELECT released, phase, COUNT(*) FROM assignments WHERE deployment_id = $1 GROUP BY released, phase",
+        let counted: Vec<(i64, String, i64, i64, i64)> = sqlx::query_as(
+            "SELECT v.released, v.phase, v.ran, v.is_revoked, COUNT(*) FROM (
+                 SELECT a.released, a.phase, a.ran,
+                     CAST(CASE WHEN r.revoked_at_ms IS NULL THEN 0 ELSE 1 END AS BIGINT) AS is_revoked
+                 FROM assignments a JOIN robots r ON r.id = a.robot_id WHERE a.deployment_id = $1) v
+             GROUP BY v.released, v.phase, v.ran, v.is_revoked",
         )
         .bind(id.as_str())
         .fetch_all(self.connection())
         .await?;
         let mut tally = Tally::default();
-        for (released, phase, count) in counted {
+        for (released, phase, ran, is_revoked, count) in counted {
             let (phase, count) = (Phase::from_text(&phase), number(count));
+            // A service that ran has shown what its batch was to show, whatever is ordered of it since; who is put out shows nothing.
+            let has_had_its_turn = is_revoked == 1 || (ran == 1 && kind == TaskKind::Service);
             if deployment::is_failure(phase, kind) {
                 tally.failed += count;
-            } else if !phase.is_settled(kind) {
-                *(if released == 1 { &mut tally.busy } else { &mut tally.waiting }) += count;
+            } else if !phase.is_settled(kind) && released == 0 {
+                tally.waiting += count;
+            } else if !phase.is_settled(kind) && !has_had_its_turn {
+                tally.busy += count;
             }
         }
         Ok(Some((rollout, tally)))
+    }
+
+    /// The deployments that have begun on `robot` and have not ended there.
+    pub async fn begun_on(&mut self, robot: &RobotId) -> Result<BTreeSet<DeploymentId>, StoreError> {
+        let rows: Vec<String> = sqlx::query_scalar(
+            "SELECT deployment_id FROM assignments WHERE robot_id = $1 AND released = 1 AND ended = 0",
+        )
+        .bind(robot.as_str())
+        .fetch_all(self.connection())
+        .await?;
+        rows.iter().map(|row| id("assignments.deployment_id", row)).collect()
     }
 
     /// Stops a deployment from beginning further batches.

@@ -15,6 +15,7 @@ on_both_databases! {
     a_restart_that_comes_too_late_leaves_what_runs,
     what_was_stopped_stays_so,
     a_silent_robot_holds_up_its_batch_and_no_later_one,
+    no_batch_waits_for_who_has_run_it_or_was_put_out,
     nobody_takes_over_robots_that_are_not_theirs,
     a_robots_word_opens_no_blob,
     what_was_taken_over_can_be_rolled_back_to,
@@ -112,6 +113,26 @@ async fn a_silent_robot_holds_up_its_batch_and_no_later_one(database: TestDataba
     fleet.actions.expire().await.expect("done");
     fleet.follow(&mut robots[1], Phase::Running).await;
     assert_eq!(fleet.desired(&robots[2]).await.expect("state").tasks[0].deployment, id);
+}
+
+async fn no_batch_waits_for_who_has_run_it_or_was_put_out(database: TestDatabase) {
+    let fleet = Fleet::new(database).await;
+    let mut robots = fleet.enroll(5).await;
+    let first = fleet.deploy("1", |order| order.batch = Some(1)).await;
+    fleet.follow(&mut robots[0], Phase::Running).await;
+    // What the first robot ran is desired again, and it never says so.
+    let other = fleet.deploy("2", |order| order.selector = "r0".parse().expect("valid")).await;
+    fleet.actions.cancel_deployment(&fleet.operator, &other).await.expect("cancelled");
+    assert_eq!(fleet.phases(&first).await[0], Phase::Assigned);
+    let has_it = async |robot: &Robot| fleet.desired(robot).await.is_ok_and(|state| !state.tasks.is_empty());
+    assert!(has_it(&robots[1]).await && !has_it(&robots[2]).await);
+    fleet.follow(&mut robots[1], Phase::Running).await;
+    assert!(has_it(&robots[2]).await);
+    // Nor does the next one, nor does it get anything if it is put out before its turn.
+    fleet.actions.revoke_robot(&fleet.operator, &robots[3].id).await.expect("revoked");
+    assert!(!has_it(&robots[4]).await);
+    fleet.actions.revoke_robot(&fleet.operator, &robots[2].id).await.expect("revoked");
+    assert!(has_it(&robots[4]).await);
 }
 
 /// A fleet whose robots run version 1 of orders that its database has never seen.

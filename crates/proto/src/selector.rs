@@ -8,7 +8,7 @@
 //! assert_eq!(selector.to_string(), "site=lab&base=turtlebot,spare-1,!arm");
 //! ```
 
-use std::collections::HashSet;
+use std::collections::{HashMap, HashSet};
 use std::fmt;
 use std::str::FromStr;
 
@@ -36,7 +36,9 @@ struct Parsed {
 struct Terms {
     /// Terms that are but a name or an id: as many as there are robots, and so looked up.
     named: HashSet<RobotName>,
-    /// The others: a robot has to meet all conditions of one.
+    /// Terms that are but a label: looked up as well.
+    labelled: HashMap<LabelKey, HashSet<LabelValue>>,
+    /// The others: a robot has to meet all conditions of one. Each is tried on every robot, so they are few.
     described: Vec<Vec<Condition>>,
 }
 
@@ -58,10 +60,17 @@ pub enum InvalidSelector {
     /// It is longer than [`MAX_SELECTOR_BYTES`].
     #[error("a selector of {0} bytes is too long: it may have {MAX_SELECTOR_BYTES}")]
     TooLong(usize),
+    /// More than [`MAX_CONDITIONS`].
+    #[error(
+        "the selector has more than {MAX_CONDITIONS} conditions in terms that are more than a name, an id or a label"
+    )]
+    TooManyConditions,
 }
 
 /// The most bytes a selector's text may have: ten thousand robots by their ids.
 pub const MAX_SELECTOR_BYTES: usize = 200 * 1024;
+/// The most conditions in those of a selector's terms that are more than a name, an id or a label.
+pub const MAX_CONDITIONS: usize = 256;
 
 impl Selector {
     /// Whether a robot with this id, name and labels is meant.
@@ -73,7 +82,7 @@ impl Selector {
 
 impl Terms {
     fn is_empty(&self) -> bool {
-        self.named.is_empty() && self.described.is_empty()
+        self.named.is_empty() && self.labelled.is_empty() && self.described.is_empty()
     }
 
     fn have(&self, id: &RobotId, name: &RobotName, labels: &Labels) -> bool {
@@ -84,14 +93,20 @@ impl Terms {
         };
         self.named.contains(name.as_str())
             || self.named.contains(id.as_str())
+            || labels.iter().any(|(key, value)| self.labelled.get(key).is_some_and(|values| values.contains(value)))
             || self.described.iter().any(|all| all.iter().all(is_met))
     }
 
     fn add(&mut self, mut all: Vec<Condition>) {
         match (all.pop(), all.is_empty()) {
             (Some(Condition::NameOrId(text)), true) => _ = self.named.insert(text),
+            (Some(Condition::Label(key, value)), true) => _ = self.labelled.entry(key).or_default().insert(value),
             (last, _) => self.described.push(all.into_iter().chain(last).collect()),
         }
+    }
+
+    fn conditions(&self) -> usize {
+        self.described.iter().map(Vec::len).sum()
     }
 }
 
@@ -121,6 +136,9 @@ impl FromStr for Selector {
             let without = term.trim_start().strip_prefix('!');
             let all = without.unwrap_or(term).split('&').map(|part| part.trim().parse()).collect::<Result<_, _>>()?;
             if without.is_some() { takes_away.add(all) } else { adds.add(all) }
+        }
+        if adds.conditions() + takes_away.conditions() > MAX_CONDITIONS {
+            return Err(InvalidSelector::TooManyConditions);
         }
         // Within what is valid there are none.
         let text = text.split_whitespace().collect();
@@ -212,6 +230,18 @@ mod tests {
         }
         let text = "a,".repeat(MAX_SELECTOR_BYTES / 2) + "a";
         assert_eq!(text.parse::<Selector>(), Err(InvalidSelector::TooLong(MAX_SELECTOR_BYTES + 1)));
+    }
+
+    #[test]
+    fn what_is_tried_on_every_robot_is_little() {
+        let text = "b=c,".repeat(50_000) + "b=d";
+        let selector: Selector = text.parse().expect("a label is looked up");
+        assert_eq!(selector.0.adds.conditions(), 0);
+        let most = ["a&b=c"; MAX_CONDITIONS / 2].join(",");
+        assert!(most.parse::<Selector>().is_ok());
+        for more in ["*", "!*", "!a&b"] {
+            assert_eq!(format!("{most},{more}").parse::<Selector>(), Err(InvalidSelector::TooManyConditions), "{more}");
+        }
     }
 
     #[test]

@@ -1,5 +1,7 @@
 //! The last things that are worth a look, as far as they concern the person who asks.
 
+use std::collections::HashSet;
+
 use axum::Json;
 use axum::extract::State;
 use serde::Deserialize;
@@ -10,7 +12,8 @@ use super::App;
 use super::error::ApiError;
 use super::extract::QueryParams;
 use crate::feed::FeedAudience;
-use crate::person::Person;
+use crate::person::{Person, Scope};
+use crate::store::KnownRobot;
 
 /// How many are listed where nobody says how many.
 const LISTED: usize = 100;
@@ -37,13 +40,25 @@ pub(super) async fn feed(
     if !(1..=MAX_FEED_ENTRIES).contains(&limit) {
         return Err(ApiError::invalid(format!("limit: expected 1 to {MAX_FEED_ENTRIES}, not {limit}")));
     }
+    let mut theirs = HashSet::new();
+    let mut known = HashSet::new();
+    if !by.scope.is_everything() {
+        theirs.extend(app.store.robots_in(&by.scope).await?);
+        known.extend(app.store.robots_in(&Scope::everything()).await?);
+    }
+    // What a robot is labelled now counts, as everywhere else. An entry knows what it was labelled then: all that is left of
+    // one that was removed.
+    let is_theirs_now = |robot: &KnownRobot| match known.contains(&robot.id) {
+        true => theirs.contains(&robot.id),
+        false => by.scope.covers(&robot.id, &robot.name, &robot.labels),
+    };
     let mut entries = Vec::new();
     for (entry, audience) in app.feed.after(query.after.unwrap_or(0)) {
         let is_theirs = match audience {
             FeedAudience::Everybody => true,
             _ if by.scope.is_everything() => true,
             FeedAudience::Unlimited => false,
-            FeedAudience::Robot(robot) => by.scope.covers(&robot.id, &robot.name, &robot.labels),
+            FeedAudience::Robot(robot) => is_theirs_now(&robot),
         };
         if is_theirs {
             entries.push(entry);

@@ -7,7 +7,7 @@ use serde_json::json;
 use task_proto::api::{FeedEntry, FeedKind, FeedPage};
 use task_proto::report::{Condition, Phase, Report};
 
-use crate::harness::{TestRobot, TestServer, refusal};
+use crate::harness::{TestRobot, TestServer, answer, refusal};
 
 /// Longer than anything waits to be told with others.
 const PATIENCE: Duration = Duration::from_secs(30);
@@ -31,6 +31,16 @@ async fn told_times(server: &TestServer, kind: FeedKind, times: usize) -> Vec<Fe
         }
     };
     tokio::time::timeout(PATIENCE, asking).await.expect("it is told")
+}
+
+/// The token of somebody who may see these robots.
+async fn limited_to(server: &TestServer, scope: &str) -> String {
+    let carol = json!({ "name": "carol", "roles": ["viewer"], "scope": scope, "password": "correct horse battery" });
+    let added = server.request(Method::POST, "/api/v1/users").json(&carol).send().await.expect("an answer");
+    assert!(added.status().is_success());
+    let login = json!({ "user": "carol", "password": "correct horse battery" });
+    let token: serde_json::Value = answer(server.bare(Method::POST, "/api/v1/login").json(&login)).await;
+    token["token"].as_str().expect("a token").to_owned()
 }
 
 async fn poll(server: &TestServer, robot: &TestRobot) {
@@ -92,17 +102,11 @@ async fn many_that_come_are_told_together_and_not_to_whom_some_are_hidden() {
     }
     let online = told(&server, FeedKind::RobotOnline).await;
     assert_eq!((online.len(), online[0].text.as_str(), online[0].robot.as_ref()), (1, "8 robots came online", None));
-    let carol = json!({ "name": "carol", "roles": ["viewer"], "scope": "r3", "password": "correct horse battery" });
-    let added = server.request(Method::POST, "/api/v1/users").json(&carol).send().await.expect("an answer");
-    assert!(added.status().is_success());
-    let login = json!({ "user": "carol", "password": "correct horse battery" });
-    let token: serde_json::Value =
-        crate::harness::answer(server.bare(Method::POST, "/api/v1/login").json(&login)).await;
-    let token = token["token"].as_str().expect("a token").to_owned();
+    let token = limited_to(&server, "r3").await;
     let gone = server.request(Method::DELETE, "/api/v1/robots/r3").send().await.expect("an answer");
     assert_eq!(gone.status(), 204);
     told(&server, FeedKind::RobotRevoked).await;
-    let page: FeedPage = crate::harness::answer(server.bare(Method::GET, "/api/v1/feed").bearer_auth(token)).await;
+    let page: FeedPage = answer(server.bare(Method::GET, "/api/v1/feed").bearer_auth(token)).await;
     // How full this machine's disk is concerns everybody.
     let of_robots: Vec<_> = page.entries.iter().filter(|entry| entry.kind != FeedKind::Disk).collect();
     assert!(of_robots.iter().all(|entry| entry.robot.as_ref() == Some(&robots[3].id)), "{of_robots:?}");
@@ -114,4 +118,20 @@ async fn many_that_come_are_told_together_and_not_to_whom_some_are_hidden() {
     assert_eq!(gone.status(), 200);
     let removed = told_times(&server, FeedKind::RobotRevoked, 2).await;
     assert_eq!((removed.len(), removed[1].text.as_str()), (2, "7 robots were removed"));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_was_told_of_a_robot_is_for_those_whose_it_is_now() {
+    let server = TestServer::start().await;
+    let robot = server.enroll("atlas").await;
+    told(&server, FeedKind::RobotEnrolled).await;
+    let token = limited_to(&server, "site=lab").await;
+    for (site, is_told) in [("secret", false), ("lab", true), ("secret", false)] {
+        let edit = server.request(Method::PATCH, &format!("/api/v1/robots/{}", robot.id));
+        let edited = edit.json(&json!({ "labels": { "site": site } })).send().await.expect("an answer");
+        assert!(edited.status().is_success());
+        let page: FeedPage = answer(server.bare(Method::GET, "/api/v1/feed").bearer_auth(&token)).await;
+        let has_it = page.entries.iter().any(|entry| entry.robot.as_ref() == Some(&robot.id));
+        assert_eq!(has_it, is_told, "{site}: {:?}", page.entries);
+    }
 }

@@ -92,10 +92,12 @@ impl Actions {
         Ok(Enrolled { robot_id: robot.id, name: robot.name, token: robot_token, awaits_approval })
     }
 
-    /// Makes a token that `robot` may go over to. The one it uses ends when that one is first used.
-    pub async fn next_robot_token(&self, robot: &RobotId) -> Result<Token, ActionError> {
+    /// Makes a token that `robot` may go over to. The one it uses, which is that of `token_number`, ends when that one is first
+    /// used.
+    pub async fn next_robot_token(&self, robot: &RobotId, token_number: u64) -> Result<Token, ActionError> {
         let mut write = self.store.begin().await?;
         known_robot(&mut write, robot.as_str()).await?;
+        write.check_token(robot, token_number).await?;
         if write.awaits_first_use(robot, None).await? {
             return Err(ActionError::EnrolledAnew(robot.clone()));
         }

@@ -193,9 +193,10 @@ pub(super) async fn report(
     responses((status = 409, description = "`enrolled_anew`: another agent has enrolled as this robot meanwhile.")))]
 pub(super) async fn next_token(
     State(app): State<App>,
+    Extension(TokenNumber(token_number)): Extension<TokenNumber>,
     PathParam(robot): PathParam<RobotId>,
 ) -> Result<Created<RobotToken>, ApiError> {
-    let token = app.actions.next_robot_token(&robot).await?;
+    let token = app.actions.next_robot_token(&robot, token_number).await?;
     Ok(Created(RobotToken { token: token.reveal() }))
 }
 

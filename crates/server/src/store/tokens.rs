@@ -253,6 +253,19 @@ impl Write {
         Ok(())
     }
 
+    /// Refuses what `robot` asked by a token that has ended since.
+    pub async fn check_token(&mut self, robot: &RobotId, token_number: u64) -> Result<(), StoreError> {
+        let found: Option<String> = sqlx::query_scalar(
+            "SELECT id FROM tokens
+             WHERE robot_id = $1 AND number = $2 AND kind = 'robot' AND used_at_ms IS NOT NULL AND revoked_at_ms IS NULL",
+        )
+        .bind(robot.as_str())
+        .bind(stored(token_number))
+        .fetch_optional(self.connection())
+        .await?;
+        found.map(drop).ok_or(StoreError::RightsEnded)
+    }
+
     /// The key that `robot` registered when it was given the token it uses.
     pub async fn client_key(&mut self, robot: &RobotId) -> Result<Option<PublicKey>, StoreError> {
         let row = sqlx::query(

@@ -4,10 +4,10 @@
 use task_proto::RobotId;
 use task_proto::api::CreateEnrollmentToken;
 use task_proto::token::{Token, TokenKind};
-use taskd::actions::Enrolled;
+use taskd::actions::{ActionError, Enrolled};
 use taskd::person::Person;
 use taskd::report_writer::ReportError;
-use taskd::store::{Admitted, Store, TokenHolder};
+use taskd::store::{Admitted, Store, StoreError, TokenHolder};
 use taskd::tls::ClientProof;
 
 use crate::database::{TestDatabase, on_both_databases};
@@ -123,7 +123,7 @@ async fn a_new_token_ends_the_old_one_when_it_is_first_used(database: TestDataba
     // Both are good, and the old agent's reports count, until the new one is used.
     assert_eq!(admit(&old.token).await, Some((old_number, false)));
     fleet.writer.submit(old_agent.next_report(), old_number).await.expect("stored");
-    assert_eq!(code(fleet.actions.next_robot_token(&old.robot_id).await), "enrolled_anew");
+    assert_eq!(code(fleet.actions.next_robot_token(&old.robot_id, old_number).await), "enrolled_anew");
     let (new_number, is_first_use) = admit(&new.token).await.expect("valid");
     assert!(is_first_use && new_number > old_number);
     assert_eq!(admit(&old.token).await, None);
@@ -140,8 +140,10 @@ async fn a_new_token_ends_the_old_one_when_it_is_first_used(database: TestDataba
     drop(write);
 
     // The robot goes over by itself: its reports go on counting, and there are never more than two.
-    let next = fleet.actions.next_robot_token(&new.robot_id).await.expect("made");
-    let later = fleet.actions.next_robot_token(&new.robot_id).await.expect("made");
+    let late = fleet.actions.next_robot_token(&new.robot_id, old_number).await;
+    assert!(matches!(late, Err(ActionError::Store(StoreError::RightsEnded))), "{late:?}");
+    let next = fleet.actions.next_robot_token(&new.robot_id, new_number).await.expect("made");
+    let later = fleet.actions.next_robot_token(&new.robot_id, new_number).await.expect("made");
     assert_eq!(admit(&next).await, None, "the one after it took its place");
     assert_eq!(admit(&new.token).await, Some((new_number, false)));
     let (later_number, is_first_use) = admit(&later).await.expect("valid");
@@ -241,7 +243,7 @@ async fn a_revoked_robots_tokens_end_and_its_late_reports_come_too_late(database
     let came = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("enrols");
     let admitted = store.admit(&came.token, &ClientProof::NotAsked, 1_000_000).await.expect("reads").expect("valid");
     let TokenHolder::Robot { token_number, .. } = admitted.holder else { panic!("{admitted:?}") };
-    let next = fleet.actions.next_robot_token(&came.robot_id).await.expect("a token");
+    let next = fleet.actions.next_robot_token(&came.robot_id, token_number).await.expect("a token");
     let before = fleet.enrolment_token(order()).await;
     let mut robot = Robot::new(came.robot_id.clone());
     fleet.writer.submit(robot.next_report(), token_number).await.expect("stored");
@@ -251,6 +253,8 @@ async fn a_revoked_robots_tokens_end_and_its_late_reports_come_too_late(database
     }
     let late = fleet.writer.submit(robot.next_report(), token_number).await;
     assert!(matches!(late, Err(ReportError::TokenEnded(_))), "{late:?}");
+    let late = fleet.actions.next_robot_token(&came.robot_id, token_number).await;
+    assert!(matches!(late, Err(ActionError::Store(StoreError::RightsEnded))), "{late:?}");
     assert!(fleet.desired(&robot).await.is_err(), "nothing is signed for it");
     fleet.actions.expire().await.expect("forgets what has ended, but for these");
     for token in [&came.token, &next] {

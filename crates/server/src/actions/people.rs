@@ -201,12 +201,14 @@ impl Actions {
         Ok(AccessToken { id, token: token.reveal(), user: user.clone(), expires_at_ms })
     }
 
-    /// Ends a token: one of one's own, or by an administrator anybody's. Doing it twice is harmless. Gives whose it was.
+    /// Ends a token: one of one's own, or by an administrator anybody's. Doing it twice is harmless. Gives whose it was. A token
+    /// made for something that is less than its user ends itself alone: it may have leaked.
     pub async fn revoke_token(&self, by: &Person, id: &TokenId) -> Result<UserName, ActionError> {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
         let token: Option<TokenView> = write.person_token(id).await?;
-        let token = token.filter(|token| token.user == by.name || by.may(Permission::Administer));
+        let is_own = |token: &TokenView| token.user == by.name && (by.origin != TokenOrigin::Token || *id == by.token);
+        let token = token.filter(|token| is_own(token) || by.may(Permission::Administer));
         let token = token.ok_or_else(|| ActionError::TokenNotFound(id.clone()))?;
         if token.revoked_at_ms.is_some() {
             return Ok(token.user);

@@ -6,6 +6,7 @@ use std::time::Duration;
 use futures_util::StreamExt as _;
 use reqwest::{Method, RequestBuilder, StatusCode};
 use serde_json::{Value, json};
+use task_proto::TokenId;
 use task_proto::api::{AccessToken, DeploymentList, DeploymentView, OutputList, RobotList};
 use task_proto::report::Phase;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
@@ -256,6 +257,28 @@ async fn a_revoked_token_ends_its_mqtt_session_at_once() {
     session.expect_close().await;
     let (_, refused) = mqtt(&sites, &alice.token).await;
     assert_eq!(refused, [0x20, 2, 0, 4]);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_token_made_for_less_ends_no_other() {
+    let sites = Sites::new().await;
+    sites.add("alice", &["viewer"], None).await;
+    let alice = sites.log_in("alice").await;
+    let made =
+        sites.server.bare(Method::POST, "/api/v1/tokens").bearer_auth(&alice.token).json(&json!({ "title": "wall" }));
+    let made: AccessToken = answer(made).await;
+    let end = async |with: &str, id: &TokenId| {
+        let request = sites.server.bare(Method::DELETE, &format!("/api/v1/tokens/{id}")).bearer_auth(with);
+        request.send().await.expect("an answer").status()
+    };
+    assert_eq!(end(&made.token, &alice.id).await, StatusCode::NOT_FOUND);
+    let alice_asks = sites.server.bare(Method::GET, "/api/v1/robots").bearer_auth(&alice.token);
+    assert_eq!(alice_asks.send().await.expect("an answer").status(), StatusCode::OK);
+    assert_eq!(end(&made.token, &made.id).await, StatusCode::NO_CONTENT, "itself");
+    let again =
+        sites.server.bare(Method::POST, "/api/v1/tokens").bearer_auth(&alice.token).json(&json!({ "title": "wall" }));
+    let again: AccessToken = answer(again).await;
+    assert_eq!(end(&alice.token, &again.id).await, StatusCode::NO_CONTENT);
 }
 
 #[tokio::test(flavor = "multi_thread")]

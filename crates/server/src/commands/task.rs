@@ -76,12 +76,12 @@ pub(super) async fn run(session: &Session, verb: Verb, order: TaskOrder) -> Resu
 
 pub(super) async fn remove(session: &Session, order: RemoveOrder) -> Result<Outcome, CommandError> {
     let RemoveOrder { order, wait, timeout } = order;
-    let (task, on) = (order.task.clone(), order.on.clone());
+    let task = order.task.clone();
     let ordered = give(session, Verb::Remove, order).await?;
     if !wait {
         return Ok(Outcome::Succeeded);
     }
-    until_gone(session, &task, &on, &ordered, timeout).await
+    until_gone(session, &task, &ordered, timeout).await
 }
 
 /// Brings each robot back to the package it had before the one it has now.
@@ -145,18 +145,19 @@ fn say_without(without: &[MatchedRobot]) {
     say(&format!("no earlier version ran on {}", names.join(", ")));
 }
 
-/// Waits until none of `ordered` has the task any more. Whoever was removed meanwhile has not.
+/// Waits until none of `ordered` has the task any more. Whoever was removed meanwhile has not, whoever was labelled or named
+/// anew may have.
 async fn until_gone(
     session: &Session,
     task: &TaskName,
-    on: &Selector,
     ordered: &MatchedRobots,
     timeout: Duration,
 ) -> Result<Outcome, CommandError> {
     let deadline = Instant::now() + timeout;
+    let still_meant = by_id(&ordered.robots);
     let mut left: Option<Vec<RobotView>> = None;
     while Instant::now() < deadline {
-        match timeout_at(deadline, robot::matching(session, on)).await {
+        match timeout_at(deadline, robot::matching(session, &still_meant)).await {
             Err(_) => break,
             Ok(Err(CommandError::Client(error))) if wait::may_pass(&error) => {}
             Ok(Err(error)) => return Err(error),
@@ -183,6 +184,14 @@ async fn until_gone(
         }
     }
     Ok(Outcome::TimedOut)
+}
+
+/// These robots, whatever becomes of their names and labels; where they are too many to be listed in a question, all.
+fn by_id(robots: &[MatchedRobot]) -> Selector {
+    const MAX_LISTED: usize = 200;
+    let ids: Vec<&str> = robots.iter().take(MAX_LISTED + 1).map(|robot| robot.id.as_str()).collect();
+    let listed = if ids.len() > MAX_LISTED { "*".to_owned() } else { ids.join(",") };
+    listed.parse().expect("ids are a selector")
 }
 
 /// Whether the robot has not followed its newest order yet, or is still getting rid of the task.

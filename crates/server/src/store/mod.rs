@@ -264,6 +264,11 @@ async fn is_there(url: &str) -> Result<(), sqlx::Error> {
     connection.close().await
 }
 
+/// What Postgres does by itself with a session of a server that is gone without a word, for it may hold the write lock, which
+/// the next one waits for. By default it keeps such a session for hours.
+const POSTGRES_SESSION: &str = "SET idle_in_transaction_session_timeout = '60s'; SET lock_timeout = '30s';
+     SET tcp_keepalives_idle = 30; SET tcp_keepalives_interval = 10; SET tcp_keepalives_count = 3";
+
 fn pool_options(url: &str, connections: u32, cache: &'static str) -> AnyPoolOptions {
     let is_sqlite = url.starts_with("sqlite:");
     AnyPoolOptions::new().max_connections(connections).acquire_timeout(PATIENCE).after_connect(move |connection, _| {
@@ -277,6 +282,8 @@ fn pool_options(url: &str, connections: u32, cache: &'static str) -> AnyPoolOpti
                 .execute(&mut *connection)
                 .await?;
                 sqlx::raw_sql(cache).execute(connection).await?;
+            } else {
+                sqlx::raw_sql(POSTGRES_SESSION).execute(connection).await?;
             }
             Ok(())
         })

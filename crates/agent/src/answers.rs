@@ -16,6 +16,7 @@ use crate::graph_answers::GraphAnswers;
 use crate::link::Message;
 use crate::logs::Logs;
 use crate::logs::archive::Wanted;
+use crate::orders::Orders;
 use crate::{clock, vitals};
 
 /// Questions answered at the same time; a lifecycle transition may take seconds and should not hold up a list.
@@ -25,6 +26,8 @@ const AT_A_TIME: usize = 8;
 pub struct Answers {
     /// The robot.
     pub robot_id: RobotId,
+    /// From whom it takes what changes something.
+    pub orders: Orders,
     /// What its tasks said.
     pub logs: Logs,
     /// Its ROS graph.
@@ -34,7 +37,7 @@ pub struct Answers {
 }
 
 /// A refusal with `code` and `text`.
-fn refusal(code: &str, text: impl Into<String>) -> Refusal {
+pub(crate) fn refusal(code: &str, text: impl Into<String>) -> Refusal {
     Refusal { code: code.to_owned(), text: text.into() }
 }
 
@@ -59,13 +62,17 @@ impl Answers {
 
     /// Answers what came at `came`, as long as somebody waits for it.
     async fn reply(&self, request: Request, came: Instant, messages: &mpsc::Sender<Message>) {
-        let Request { id, ttl_ms, ask } = request;
+        let meant = self.orders.meant(&request);
+        let Request { id, ttl_ms, .. } = request;
         let until = came + Duration::from_millis(ttl_ms.min(MAX_TTL_MS));
         let late = || Err(refusal("timeout", "the robot had no answer in time"));
         // Nothing is begun for who does not wait any more.
-        let answer = match Instant::now() < until {
-            true => tokio::time::timeout_at(until, self.answer(ask)).await.unwrap_or_else(|_| late()),
-            false => late(),
+        let answer = match meant {
+            Ok(ask) if Instant::now() < until => {
+                tokio::time::timeout_at(until, self.answer(ask)).await.unwrap_or_else(|_| late())
+            }
+            Ok(_) => late(),
+            Err(refusal) => Err(refusal),
         };
         let written = |answer: Result<Answer, Refusal>| {
             let outcome = answer.map_or_else(Outcome::Refusal, Outcome::Answer);

@@ -33,6 +33,7 @@ pub mod link_meter;
 pub mod logs;
 pub mod mqtt;
 pub mod observed;
+pub mod orders;
 pub mod outputs;
 pub mod parts;
 pub mod permanent_address;

@@ -3,7 +3,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::id::{GraphName, RequestId};
+use crate::envelope::Envelope;
+use crate::id::{GraphName, InstanceId, RequestId};
 use crate::log::{LogBatch, LogLevel};
 use crate::ros::{LifecycleState, NodeDetail, NodeSummary, Parameter, TopicSummary, Transition};
 use crate::vitals::Vitals;
@@ -13,6 +14,8 @@ use crate::{RobotId, TaskName};
 pub const MAX_REPLY_BYTES: usize = 240 * 1024;
 /// The longest a robot may take for an answer, in milliseconds.
 pub const MAX_TTL_MS: u64 = 60_000;
+/// The payload type of a signed [`Action`].
+pub const ACTION_TYPE: &str = "application/vnd.taskd.action.v1+json";
 
 /// What the server publishes on a robot's `request` topic.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -21,6 +24,23 @@ pub struct Request {
     pub id: RequestId,
     /// Milliseconds from its arrival in which an answer is of use; nothing is begun after that.
     pub ttl_ms: u64,
+    /// What is asked.
+    pub ask: Ask,
+    /// The [`Action`], where the question changes something: a broker that is not the server's, or who listens in, must not
+    /// be able to ask that.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub signed: Option<Envelope>,
+}
+
+/// What the server signs of a question that changes something. It is good for one robot, one start of its agent, and once.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Action {
+    /// Whom it is for.
+    pub robot_id: RobotId,
+    /// The start of the agent that is to do it.
+    pub instance: InstanceId,
+    /// The request's.
+    pub id: RequestId,
     /// What is asked.
     pub ask: Ask,
 }

@@ -98,6 +98,11 @@ impl Presence {
         sightings.instances.is_duplicate(now_ms)
     }
 
+    /// The start of its agent that was heard last.
+    pub fn instance(&self, robot: &RobotId) -> Option<InstanceId> {
+        self.robots().get(robot)?.instances.changes.back().map(|last| last.instance.clone())
+    }
+
     /// What is known of the robot; `None` if it was not seen by this process.
     pub fn get(&self, robot: &RobotId, now_ms: u64) -> Option<Sighting> {
         self.robots().get(robot).map(|sightings| sightings.view(self.window_ms, now_ms))

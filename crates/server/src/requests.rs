@@ -6,8 +6,9 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use task_proto::RobotId;
+use task_proto::envelope::Envelope;
 use task_proto::id::RequestId;
-use task_proto::request::{Answer, Ask, MAX_TTL_MS, Outcome, Refusal, Reply, Request};
+use task_proto::request::{Action, Answer, Ask, MAX_TTL_MS, Outcome, Refusal, Reply, Request};
 use tokio::sync::oneshot;
 
 use crate::broker::{Broker, NotAsked};
@@ -58,9 +59,31 @@ impl Requests {
         ask: Ask,
         patience: Duration,
     ) -> Result<Answer, RequestError> {
+        let request = Request { id: RequestId::random(), ttl_ms: ttl_ms(patience), ask, signed: None };
+        self.put(broker, robot, request, patience).await
+    }
+
+    /// The same for what changes something, as it was signed.
+    pub async fn act(
+        &self,
+        broker: &Broker,
+        action: Action,
+        signed: Envelope,
+        patience: Duration,
+    ) -> Result<Answer, RequestError> {
+        let Action { robot_id, id, ask, .. } = action;
+        let request = Request { id, ttl_ms: ttl_ms(patience), ask, signed: Some(signed) };
+        self.put(broker, &robot_id, request, patience).await
+    }
+
+    async fn put(
+        &self,
+        broker: &Broker,
+        robot: &RobotId,
+        request: Request,
+        patience: Duration,
+    ) -> Result<Answer, RequestError> {
         let patience = patience.min(Duration::from_millis(MAX_TTL_MS));
-        let ttl_ms = u64::try_from(patience.as_millis()).unwrap_or(MAX_TTL_MS);
-        let request = Request { id: RequestId::random(), ttl_ms, ask };
         let payload = serde_json::to_vec(&request)?;
         let (place, reply) = self.expect(robot, request.id)?;
         broker.ask(robot, payload.into()).map_err(|error| match error {
@@ -103,6 +126,10 @@ impl Requests {
         // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing half-done.
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
+}
+
+fn ttl_ms(patience: Duration) -> u64 {
+    u64::try_from(patience.as_millis()).unwrap_or(MAX_TTL_MS).min(MAX_TTL_MS)
 }
 
 /// Keeps a question's place; it is free again however the wait ends, also when whoever asked hangs up.

@@ -30,6 +30,7 @@ use crate::link::{self, Heard, Intervals, Message, Shared, Talk};
 use crate::logs::Logs;
 use crate::logs::forwarder::Forwarder;
 use crate::mqtt::{self, MqttAccess, Ways};
+use crate::orders::Orders;
 use crate::outputs::Registry;
 use crate::rotation::Rotation;
 use crate::server::{self, Server};
@@ -87,6 +88,7 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
     let registry = Registry::new(client.clone(), base.clone(), credential.clone());
     let robot = Arc::new(Robot::new(data.clone(), fetcher, registry, &config, &identity.robot_id, identity.mac));
     let instance = InstanceId::random();
+    let orders = Orders::new(identity.robot_id.clone(), instance.clone(), identity.server_key.clone());
     let speaker = Speaker {
         robot_id: identity.robot_id.clone(),
         server_key: identity.server_key.clone(),
@@ -128,7 +130,7 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
         let ways = Ways::new(&base, Arc::new(tls), config.mqtt_transport);
         let access = MqttAccess { host, port, prefix, robot: robot_id, token: credential, status, message_bytes, ways };
         let talk = (said, messages_out);
-        converse(access, shared, heard, data, robot, talk);
+        converse(access, shared, heard, data, robot, orders, talk);
     } else {
         // Nobody is to wait for a session, or for parts.
         shared.mqtt_tried.send_replace(true);
@@ -148,6 +150,7 @@ fn converse(
     heard: mpsc::Sender<Heard>,
     data: Layout,
     robot: Arc<Robot>,
+    orders: Orders,
     (messages, said): (mpsc::Sender<Message>, mpsc::Receiver<Message>),
 ) {
     let robot_id = access.robot.clone();
@@ -156,7 +159,7 @@ fn converse(
     let forwarder = Forwarder::new(robot_id.clone(), data, robot.forward(), logs.following());
     let (requests, asked) = mpsc::channel(QUEUED_QUESTIONS);
     let (batches, lines) = mpsc::channel(1);
-    tokio::spawn(Answers { robot_id, logs, graph: GraphAnswers { robot }, vitals }.run(asked, messages));
+    tokio::spawn(Answers { robot_id, orders, logs, graph: GraphAnswers { robot }, vitals }.run(asked, messages));
     tokio::spawn(forwarder.run(shared.mqtt_up.subscribe(), batches));
     tokio::spawn(mqtt::run(access, shared, heard, Talk { requests, messages: said, lines }));
 }

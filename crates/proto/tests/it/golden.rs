@@ -29,7 +29,7 @@ use task_proto::report::{
     ActiveVersion, Condition, Failure, FailureCode, HostFacts, Isolation, LinkFacts, Phase, Progress, Report, RosFacts,
     Status, TaskReport,
 };
-use task_proto::request::{Answer, Ask, Outcome, Refusal, Reply, Request};
+use task_proto::request::{Action, Answer, Ask, Outcome, Refusal, Reply, Request};
 use task_proto::ros::{Endpoint, LifecycleState, NodeDetail, NodeSummary, Parameter, TopicSummary, Transition};
 use task_proto::topic::TopicPrefix;
 use task_proto::{Digest, Generation, RobotId};
@@ -272,7 +272,15 @@ fn questions_and_answers() {
         Ask::Follow { level: LogLevel::Info, lease_ms: 30_000 },
         Ask::Vitals,
     ];
-    let requests = asks.map(|ask| Request { id: parsed("q00000000000000d4"), ttl_ms: 10_000, ask });
+    let requests = asks.map(|ask| Request { id: parsed("q00000000000000d4"), ttl_ms: 10_000, ask, signed: None });
+    let action = Action {
+        robot_id: parsed("r00000000000000a1"),
+        instance: parsed("i00000000000000c3"),
+        id: parsed("q00000000000000d4"),
+        ask: Ask::Lifecycle { node: parsed("/talker"), transition: Transition::Activate },
+    };
+    check("action.json", &action);
+    check_tolerance::<Action>("action.json");
     check("requests.json", &requests.to_vec());
     check_tolerance::<Vec<Request>>("requests.json");
     let newer = json!({"id": "q00000000000000d4", "ttl_ms": 1, "ask": {"type": "levitate", "height_m": 2}});

@@ -5,8 +5,9 @@ use std::net::IpAddr;
 use task_proto::api::{
     CreateEnrollmentToken, EditRobot, EnrollRequest, EnrollmentToken, EnrollmentTokenList, MatchedRobot,
 };
+use task_proto::envelope::Envelope;
 use task_proto::id::Labels;
-use task_proto::request::Ask;
+use task_proto::request::{ACTION_TYPE, Action};
 use task_proto::selector::Selector;
 use task_proto::settings::RobotSettings;
 use task_proto::token::{Token, TokenKind};
@@ -235,12 +236,15 @@ impl Actions {
         Ok(())
     }
 
-    /// Writes down that the robot is about to be asked to change something, which it then may or may not do.
-    pub async fn note_ask(&self, by: &Person, robot: &RobotId, ask: &Ask) -> Result<(), ActionError> {
+    /// Writes down that a robot is about to be asked to change something, which it then may or may not do, and signs that for
+    /// the robot.
+    pub async fn sign_action(&self, by: &Person, action: &Action) -> Result<Envelope, ActionError> {
         let mut write = self.store.begin_keeping_rights().await?;
-        let ask = serde_json::to_string(ask).expect("a question always has a JSON form");
-        write.audit(&Deed::by(by, Act::RobotAsk, robot).with("ask", ask), self.clock.now_ms()).await?;
-        Ok(write.commit().await?)
+        let ask = serde_json::to_string(&action.ask).expect("a question always has a JSON form");
+        write.audit(&Deed::by(by, Act::RobotAsk, &action.robot_id).with("ask", ask), self.clock.now_ms()).await?;
+        write.commit().await?;
+        let payload = serde_json::to_vec(action).expect("an action always has a JSON form");
+        Ok(Envelope::seal(ACTION_TYPE, &payload, &self.key))
     }
 
     /// The robots an order with this selector would mean now, sorted by name; an error if nobody, or if one of them is not

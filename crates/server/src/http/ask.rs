@@ -6,8 +6,9 @@ use axum::Json;
 use axum::extract::State;
 use http::StatusCode;
 use task_proto::RobotName;
+use task_proto::id::RequestId;
 use task_proto::person::Permission;
-use task_proto::request::{Answer, Ask, Refusal};
+use task_proto::request::{Action, Answer, Ask, Refusal};
 
 use super::App;
 use super::auth::not_permitted;
@@ -36,13 +37,18 @@ pub(super) async fn ask(
         return Err(ApiError::invalid("type: there is no such question"));
     }
     let id = find(&app, &by, &robot).await?;
-    if ask.changes_something() {
+    let mut answer = if ask.changes_something() {
         if !by.may(Permission::Operate) {
             return Err(not_permitted(&by, Permission::Operate));
         }
-        app.actions.note_ask(&by, &id, &ask).await?;
-    }
-    let mut answer = app.requests.ask(&app.broker, &id, ask, PATIENCE).await?;
+        // Every agent says so as soon as it is connected.
+        let instance = app.presence.instance(&id).ok_or(RequestError::NotConnected)?;
+        let action = Action { robot_id: id.clone(), instance, id: RequestId::random(), ask };
+        let signed = app.actions.sign_action(&by, &action).await?;
+        app.requests.act(&app.broker, action, signed, PATIENCE).await?
+    } else {
+        app.requests.ask(&app.broker, &id, ask, PATIENCE).await?
+    };
     if let Answer::Vitals(vitals) = &mut answer {
         // Its clock may lie, and so may its figures.
         *vitals = app.vitals.take(&id, *vitals, app.clock.now_ms());
@@ -66,7 +72,7 @@ impl From<RequestError> for ApiError {
 
 /// The robot's code, if it is one that this version knows.
 fn code(refusal: &Refusal) -> &'static str {
-    const KNOWN: [&str; 9] = [
+    const KNOWN: [&str; 10] = [
         "no_ros",
         "no_such_node",
         "no_such_parameter",
@@ -75,6 +81,7 @@ fn code(refusal: &Refusal) -> &'static str {
         "timeout",
         "too_large",
         "busy",
+        "unsigned",
         "unsupported",
     ];
     KNOWN.into_iter().find(|known| *known == refusal.code).unwrap_or("refused")

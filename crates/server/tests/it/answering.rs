@@ -3,8 +3,11 @@
 use std::time::Duration;
 
 use serde_json::{Value, json};
+use task_proto::digest::unhex;
+use task_proto::envelope::{PublicKey, SigningKey};
+use task_proto::id::InstanceId;
 use task_proto::log::LogLevel;
-use task_proto::request::{Ask, Request};
+use task_proto::request::{ACTION_TYPE, Action, Ask, Request};
 use task_proto::ros::Transition;
 use tokio::task::JoinHandle;
 
@@ -27,10 +30,20 @@ impl Drop for Answering {
 
 impl Answering {
     pub async fn start(bench: &Bench, robot: &Robot) -> Self {
-        let id = robot.identity.robot_id.clone();
+        let (id, key) = (robot.identity.robot_id.clone(), server_key(bench));
         let session = session(bench, robot).await;
+        // As the session says.
+        let instance: InstanceId = "i00000000000000c3".parse().expect("an instance");
         let reply = move |question: &[u8]| {
-            let Request { id: question, ask, .. } = serde_json::from_slice(question).expect("a question");
+            let Request { id: question, ask, signed, .. } = serde_json::from_slice(question).expect("a question");
+            assert_eq!(ask.changes_something(), signed.is_some());
+            if let Some(signed) = signed {
+                let action = signed.open(ACTION_TYPE, &key).expect("signed by the server");
+                let action: Action = serde_json::from_slice(&action).expect("an action");
+                let meant =
+                    Action { robot_id: id.clone(), instance: instance.clone(), id: question.clone(), ask: ask.clone() };
+                assert_eq!(action, meant);
+            }
             let (outcome, told) = match answer(&ask) {
                 Ok(answer) => ("answer", answer),
                 Err((code, text)) => ("refusal", json!({ "code": code, "text": text })),
@@ -39,6 +52,11 @@ impl Answering {
         };
         Self(tokio::spawn(session.answer_all(reply).await))
     }
+}
+
+fn server_key(bench: &Bench) -> PublicKey {
+    let seed = std::fs::read_to_string(bench.data().join("signing.key")).expect("the server's key");
+    SigningKey::from_bytes(unhex(seed.trim()).expect("64 hex digits")).public_key()
 }
 
 async fn session(bench: &Bench, robot: &Robot) -> Session {

@@ -2,7 +2,7 @@
 //! root), all that carry the run directory in their environment (it survives `fork`, `setsid` and the shim's death) and
 //! all that descend from the shim, which is their subreaper (that survives a cleared environment). It signals them and
 //! proves that none is left; it never signals the shim. Out of reach, where there are no control groups, is only a process
-//! that clears its environment, or locks it, leaves its parent and then sees its shim killed.
+//! that clears its environment, locks it or makes it endless, leaves its parent and then sees its shim killed.
 
 use std::collections::HashSet;
 use std::io;

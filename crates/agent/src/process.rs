@@ -25,11 +25,14 @@ use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
 use crate::confinement::Confinement;
+use crate::foreign_file;
 
 pub mod environments;
 
 /// Kernel ticks per second in `/proc/<pid>/stat`: USER_HZ, 100 on every architecture that Linux runs ROS on.
 const TICKS_PER_SECOND: u64 = 100;
+/// The most that is read of an environment. Linux starts nothing with more than 6 MiB of it: a larger one was made up later.
+const MAX_ENVIRONMENT_BYTES: u64 = 6 << 20;
 
 /// A process that can be told from every other, also from a later one with the same pid.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -163,7 +166,7 @@ impl ProcessEntry {
     /// What it was started with as the variable `name`. `None` also where that can't be read. May take for ever, as
     /// [`environments`] says.
     pub fn variable(&self, name: &str) -> Option<String> {
-        let environment = std::fs::read(format!("/proc/{}/environ", self.pid)).ok()?;
+        let environment = self.environment().ok()?;
         let mut entries = environment.split(|byte| *byte == 0);
         let value = entries.find_map(|entry| entry.strip_prefix(name.as_bytes())?.strip_prefix(b"="))?;
         String::from_utf8(value.to_vec()).ok()
@@ -172,8 +175,13 @@ impl ProcessEntry {
     /// Whether it was started with `variable` (`NAME=value`) in its environment. False where that can't be read. May take
     /// for ever likewise.
     pub fn was_started_with(&self, variable: &str) -> bool {
-        let environment = std::fs::read(format!("/proc/{}/environ", self.pid)).unwrap_or_default();
+        let environment = self.environment().unwrap_or_default();
         environment.split(|byte| *byte == 0).any(|entry| entry == variable.as_bytes())
+    }
+
+    /// Where its environment lies in its memory, and how much of that it is, is what the process itself says last.
+    fn environment(&self) -> io::Result<Vec<u8>> {
+        foreign_file::read(Path::new(&format!("/proc/{}/environ", self.pid)), MAX_ENVIRONMENT_BYTES)
     }
 }
 
@@ -471,5 +479,61 @@ mod tests {
         assert!(entry.was_started_with(&format!("PATH={path}")));
         assert!(!entry.was_started_with("PATH="));
         assert_eq!((entry.variable("PATH"), entry.variable("PAT")), (Some(path), None));
+    }
+
+    /// What the kernel calls `prctl_mm_map`: where a process says that its parts lie.
+    #[repr(C)]
+    struct Claim {
+        code_data_and_heap: [u64; 6],
+        stack: u64,
+        arguments: [u64; 2],
+        environment: [u64; 2],
+        auxiliary: u64,
+        auxiliary_bytes: u32,
+        executable: u32,
+    }
+
+    #[test]
+    fn an_environment_larger_than_any_that_something_is_started_with_is_nobodys() {
+        let mut memory = vec![0; 64 << 20];
+        memory[..9].copy_from_slice(b"LIE=told\0");
+        let start = memory.as_ptr() as u64;
+        let claim = |bytes: u64| Claim {
+            code_data_and_heap: [start, start + 1, start, start + 1, start, start],
+            stack: start,
+            arguments: [start; 2],
+            environment: [start, start + bytes],
+            auxiliary: 0,
+            auxiliary_bytes: 0,
+            executable: u32::MAX,
+        };
+        for (bytes, is_read) in [(MAX_ENVIRONMENT_BYTES, true), (64 << 20, false)] {
+            let (mut said, says) = io::pipe().expect("a pipe");
+            let claim = claim(bytes);
+            // SAFETY: the child only makes system calls.
+            let child = match unsafe { nix::unistd::fork() }.expect("forked") {
+                nix::unistd::ForkResult::Parent { child } => child,
+                // SAFETY: the claim and the answer are copies that outlive the calls.
+                nix::unistd::ForkResult::Child => unsafe {
+                    let size = size_of::<Claim>();
+                    let refused = libc::prctl(libc::PR_SET_MM, libc::PR_SET_MM_MAP, &raw const claim, size, 0);
+                    let answer = [u8::from(refused == 0)];
+                    libc::write(says.as_raw_fd(), answer.as_ptr().cast(), 1);
+                    loop {
+                        libc::pause();
+                    }
+                },
+            };
+            let mut answer = [0];
+            io::Read::read_exact(&mut said, &mut answer).expect("said");
+            let entry = ProcessEntry::of(number(child)).expect("stat").expect("alive");
+            let found = (entry.was_started_with("LIE=told"), entry.variable("LIE").is_some());
+            nix::sys::signal::kill(child, Signal::SIGKILL).expect("killed");
+            waitpid(child, None).expect("collected");
+            if answer == [0] {
+                return eprintln!("unavailable: this kernel lets no process say where its environment lies");
+            }
+            assert_eq!(found, (is_read, is_read), "{bytes} bytes");
+        }
     }
 }

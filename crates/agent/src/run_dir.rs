@@ -1,6 +1,7 @@
 //! The run directory: where one start of a task is written down, by the supervisor before it and by the shim during it.
-//! One directory is one start; it is never used again. It holds `spec.json` (what to run), `pid.json` (who runs it),
-//! `exit.json` (how it ended) and `lock` (held while the start is in progress). It never starts or signals a process.
+//! One directory is one start; it is never used again. It holds `spec.json` (what to run), `begun` (it may run from now on),
+//! `pid.json` (who runs it), `exit.json` (how it ended) and `lock` (held while the start is in progress). It never starts or
+//! signals a process.
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
@@ -148,6 +149,23 @@ impl RunDir {
     /// Writes down what to run.
     pub fn write_spec(&self, spec: &RunSpec) -> Result<(), RunDirError> {
         self.write("spec.json", spec)
+    }
+
+    /// Writes down that it is about to be run: until it is known by whom, nobody can tell whether it was.
+    pub fn write_begun(&self) -> Result<(), RunDirError> {
+        let path = self.0.join("begun");
+        durable::write(&path, b"", 0o600).map_err(|source| RunDirError::Io { path, source })
+    }
+
+    /// Takes that back, because nothing was run after all.
+    pub fn forget_begun(&self) -> Result<(), RunDirError> {
+        let path = self.0.join("begun");
+        durable::remove_file(&path).map_err(|source| RunDirError::Io { path, source })
+    }
+
+    /// Whether it may have been run.
+    pub fn has_begun(&self) -> bool {
+        self.0.join("begun").exists()
     }
 
     /// Writes down who runs it.

@@ -114,10 +114,17 @@ fn begin(dir: &RunDir) -> Result<Task, ShimError> {
     let containment = Containment::new(dir.path(), Some(own.clone()), spec.cgroup.clone());
     let (output, writer) = io::pipe()?;
     let (errors, error_writer) = io::pipe()?;
-    let pid = start(&spec, writer, error_writer).map_err(|source| {
-        let (script, directory) = (spec.script.display().to_string(), spec.directory.display().to_string());
-        ShimError::Start { script, directory, source }
-    })?;
+    // A power cut may come before it is on the disk who runs it, and a job must not run twice.
+    dir.write_begun()?;
+    let pid = match start(&spec, writer, error_writer) {
+        Ok(pid) => pid,
+        Err(source) => {
+            // Where it stays, the run counts as one that was lost: that of a job is not made again.
+            let _ = dir.forget_begun();
+            let (script, directory) = (spec.script.display().to_string(), spec.directory.display().to_string());
+            return Err(ShimError::Start { script, directory, source });
+        }
+    };
     let (done, drained) = mpsc::channel();
     std::thread::spawn(move || {
         capture::copy(spec.log, output, errors);

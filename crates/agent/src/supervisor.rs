@@ -117,9 +117,11 @@ impl Supervisor {
         let begun = tokio::task::spawn_blocking(move || {
             let dir = RunDir::create(&path)?;
             let lock = dir.lock()?;
-            if let Some(started) = dir.started()? {
-                let runs = dir.ended()?.is_none() && started.shim.is_alive();
-                return if runs { Ok(started) } else { Err(SupervisorError::Used(path)) };
+            let started = dir.started()?;
+            if started.is_some() || dir.has_begun() {
+                let runs = dir.ended()?.is_none();
+                let running = started.filter(|started| runs && started.shim.is_alive());
+                return running.ok_or(SupervisorError::Used(path));
             }
             spec.environment.insert(ASSIGNMENT_VARIABLE.to_owned(), spec.assignment.to_string());
             spec.environment.insert(RUN_DIR_VARIABLE.to_owned(), dir.path().display().to_string());
@@ -155,9 +157,9 @@ impl Supervisor {
         }
         let (dir, started, cgroup) = read(path).await?;
         let Some(started) = started else {
-            // The shim died before it wrote who it had started.
+            // The shim died, or the machine went down, before it was written who runs it.
             Containment::new(dir.path(), None, cgroup).end(KILL_TIMEOUT).await?;
-            return Ok(Observed::NeverStarted);
+            return Ok(if dir.has_begun() { Observed::Gone } else { Observed::NeverStarted });
         };
         // The order matters: a shim that is gone has written `exit.json` before, if it could.
         let shim_lives = started.shim.is_alive();

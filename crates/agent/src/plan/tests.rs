@@ -172,6 +172,30 @@ fn a_job_that_the_robot_lost_is_interrupted_unless_it_is_idempotent() {
 }
 
 #[test]
+fn a_start_that_a_power_cut_met_is_made_again_unless_it_may_have_been_that_of_a_job() {
+    let job = |idempotent| Run { kind: TaskKind::Job, idempotent, ..Run::default() };
+    for (run, may_have_begun, expected) in [
+        (job(false), true, Phase::Failed),
+        (job(false), false, Phase::Starting),
+        (job(true), true, Phase::Starting),
+        (Run::default(), true, Phase::Starting),
+    ] {
+        let mut world = World::new(run);
+        world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+        while !matches!(world.steps[..], [(Step::Start(_), false)]) {
+            world.happen(Happening::Effect { well: true });
+            world.happen(Happening::Learn);
+        }
+        if may_have_begun {
+            world.happen(Happening::Effect { well: true });
+        }
+        world.happen(Happening::Reboot);
+        assert_eq!(phase(&world), expected, "{may_have_begun}");
+        assert_eq!(matches!(world.steps[..], [(Step::Start(_), false)]), expected == Phase::Starting);
+    }
+}
+
+#[test]
 fn a_service_that_never_gets_ready_fails_with_its_exit_code() {
     let mut world = World::new(Run::default());
     world.happen(Happening::Order { deployment: 1, run: 1, stop: false });

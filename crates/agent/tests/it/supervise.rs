@@ -72,6 +72,20 @@ async fn a_start_that_cannot_be_says_why_and_leaves_nothing() {
 }
 
 #[tokio::test]
+async fn a_run_of_which_nobody_wrote_down_who_runs_it_is_gone_and_not_started_again() {
+    let run = TestRun::of("echo up; sleep 1000");
+    // In the way of the file that says it, as a power cut would be.
+    std::fs::create_dir_all(run.run_dir().join("pid.json.tmp")).expect("made");
+    let error = run.supervisor.start(&run.run_dir(), &run.spec).await.expect_err("refused").to_string();
+    assert!(error.contains("pid.json"), "{error}");
+    std::fs::remove_dir(run.run_dir().join("pid.json.tmp")).expect("removed");
+    assert_eq!(run.supervisor.observe(&run.run_dir()).await.expect("observed"), Observed::Gone);
+    let again = run.supervisor.start(&run.run_dir(), &run.spec).await;
+    assert!(matches!(again, Err(SupervisorError::Used(_))), "{again:?}");
+    assert_eq!(run.survivors(), Vec::<u32>::new());
+}
+
+#[tokio::test]
 async fn a_run_is_started_once_however_often_it_is_asked_for() {
     let run = TestRun::of("echo up; sleep 1000");
     let dir = run.run_dir();

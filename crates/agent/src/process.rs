@@ -292,7 +292,7 @@ pub fn spawn_task(
     Ok(command.spawn()?.id())
 }
 
-/// Starts a build script under bash, confined, in its own process group, `nice`, out of the way of everything that matters more.
+/// Starts a build script under bash, confined, in its own session, `nice`, out of the way of everything that matters more.
 pub fn spawn_build(
     script: &Path,
     directory: &Path,
@@ -302,10 +302,10 @@ pub fn spawn_build(
     output: PipeWriter,
 ) -> io::Result<tokio::process::Child> {
     let mut command = command(Path::new("/bin/bash"), environment);
-    command.arg(script).current_dir(directory).process_group(0);
+    command.arg(script).current_dir(directory);
     command.stdin(Stdio::null()).stdout(output.try_clone()?).stderr(output);
     let prepare = move || {
-        reset_for_exec()?;
+        enter_session()?;
         // Being nice is a courtesy: where it is refused the build still runs.
         // SAFETY: both calls take integers only. The second is ioprio_set(this process, best effort, last).
         let _ = unsafe {
@@ -319,7 +319,7 @@ pub fn spawn_build(
     tokio::process::Command::from(command).spawn()
 }
 
-/// Starts the robot's gate with exactly `environment`, in its own process group.
+/// Starts the robot's gate with exactly `environment`, in its own session.
 pub fn spawn_gate(
     words: &[String],
     directory: &Path,
@@ -328,10 +328,10 @@ pub fn spawn_gate(
 ) -> io::Result<tokio::process::Child> {
     let (program, arguments) = words.split_first().ok_or(io::ErrorKind::InvalidInput)?;
     let mut command = command(Path::new(program), environment);
-    command.args(arguments).current_dir(directory).process_group(0);
+    command.args(arguments).current_dir(directory);
     command.stdin(Stdio::null()).stdout(output.try_clone()?).stderr(output);
-    // SAFETY: `reset_for_exec` only makes async-signal-safe system calls and allocates nothing.
-    unsafe { command.pre_exec(reset_for_exec) };
+    // SAFETY: `enter_session` only makes async-signal-safe system calls and allocates nothing.
+    unsafe { command.pre_exec(enter_session) };
     tokio::process::Command::from(command).spawn()
 }
 
@@ -398,6 +398,13 @@ fn command(program: &Path, environment: &BTreeMap<String, String>) -> std::proce
     let mut command = std::process::Command::new(program);
     command.env_clear().envs(environment);
     command
+}
+
+/// Makes a child the leader of a session and process group of its own. An agent that was started by hand has a terminal,
+/// and whoever shares it could type there in the name of root.
+fn enter_session() -> io::Result<()> {
+    nix::unistd::setsid()?;
+    reset_for_exec()
 }
 
 /// Gives a child what a login shell would give it: default signal dispositions, nothing blocked, no stray descriptors.
@@ -479,6 +486,27 @@ mod tests {
         assert!(entry.was_started_with(&format!("PATH={path}")));
         assert!(!entry.was_started_with("PATH="));
         assert_eq!((entry.variable("PATH"), entry.variable("PAT")), (Some(path), None));
+    }
+
+    #[tokio::test]
+    async fn a_build_and_the_gate_lead_sessions_of_their_own() {
+        let temp = tempfile::tempdir().expect("a directory");
+        let script = temp.path().join("script");
+        // Process group and session.
+        std::fs::write(&script, "read -r line < /proc/$$/stat; set -- $line; echo $$ $5 $6").expect("written");
+        let environment = BTreeMap::new();
+        let (mut built, output) = io::pipe().expect("a pipe");
+        let confinement = Confinement::new(&script, None, &Default::default(), None).expect("confined");
+        let build = spawn_build(&script, temp.path(), &environment, 0, confinement, output);
+        let (mut said, output) = io::pipe().expect("a pipe");
+        let words = ["/bin/bash".to_owned(), script.display().to_string()];
+        let gate = spawn_gate(&words, temp.path(), &environment, output);
+        for (child, said) in [(build, &mut built), (gate, &mut said)] {
+            let mut child = child.expect("started");
+            let pid = child.id().expect("not collected yet");
+            assert!(child.wait().await.expect("collected").success());
+            assert_eq!(io::read_to_string(said).expect("read"), format!("{pid} {pid} {pid}\n"));
+        }
     }
 
     /// What the kernel calls `prctl_mm_map`: where a process says that its parts lie.

@@ -67,6 +67,11 @@ impl Need {
         Self { blob: package.content.size.saturating_sub(present), tree, build, reserve }
     }
 
+    /// What one more small file needs.
+    pub fn of_file(bytes: u64) -> Self {
+        Self { blob: bytes.saturating_add(BYTES_PER_ENTRY), tree: 0, build: 0, reserve: 0 }
+    }
+
     /// All of it.
     pub fn total(&self) -> u64 {
         [self.tree, self.build, self.reserve].into_iter().fold(self.blob, u64::saturating_add)

@@ -172,8 +172,10 @@ impl Fetcher {
         let manifest = read_manifest(&bytes, package)?;
         let version = self.data.task(&package.name).version(&package.manifest.digest);
         let path = version.manifest();
-        durable::create_dir_all(version.root()).map_err(|source| FetchError::disk(version.root(), source))?;
-        durable::write(&path, &bytes, 0o644).map_err(|source| FetchError::disk(&path, source))?;
+        let kept = durable::create_dir_all(version.root()).and_then(|()| durable::write(&path, &bytes, 0o644));
+        kept.map_err(|source| {
+            FetchError::disk(&path, source).for_want_of_room(self.data.root(), Need::of_file(bytes.len() as u64))
+        })?;
         self.offered.forget(&package.config.digest);
         Ok(manifest)
     }

@@ -2,6 +2,8 @@
 //! used. What to make of the bytes is [`crate::trust`]'s to say; where they come from proves nothing.
 
 use std::collections::HashSet;
+use std::io;
+use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -14,6 +16,7 @@ use tokio::task::AbortHandle;
 use tokio_util::sync::CancellationToken;
 
 use crate::clock;
+use crate::disk::Need;
 use crate::effects::chain;
 use crate::fetch::{FetchError, Fetcher};
 use crate::layout::DataDir;
@@ -131,9 +134,11 @@ impl Vouching {
             Ok(Ok(())) => (None, distrust),
             Err(error) => (Some(error), distrust),
         };
-        // By what could not be had it might be otherwise.
+        // By what could not be had, or not be kept, it might be otherwise.
         let missing = [lists.err(), signatures].into_iter().flatten();
-        let may_come = |error: &FetchError| error.is_retryable() || matches!(error, FetchError::Cancelled);
+        let may_come = |error: &FetchError| {
+            error.is_retryable() || matches!(error, FetchError::Cancelled | FetchError::Disk { .. })
+        };
         Err(missing.filter(may_come).map(NotVouched::Fetch).next().unwrap_or(distrust.into()))
     }
 
@@ -180,7 +185,7 @@ impl Vouching {
                     Ok(()) => None,
                     // Whoever follows the lists and whoever waits for one may have got it both.
                     Err(_) if self.trust.counting() == Some(blob.digest) => None,
-                    Err(NotTaken::Disk(source)) => return Err(FetchError::disk(&self.data.publishers(), source)),
+                    Err(NotTaken::Disk(source)) => return Err(self.not_kept(&self.data.publishers(), source)),
                     Err(NotTaken::Refused(why)) => Some(why.to_string()),
                 },
                 Err(error) => Some(format!("it is no envelope: {error}")),
@@ -225,7 +230,7 @@ impl Vouching {
             Err(distrust) => return failed.map_or(Ok(Err(distrust)), Err),
         };
         let path = self.data.task(&package.name).signatures(&package.manifest.digest);
-        trust::write_signatures(&path, &counted).map_err(|source| FetchError::disk(&path, source))?;
+        trust::write_signatures(&path, &counted).map_err(|source| self.not_kept(&path, source))?;
         self.epoch.fetch_add(1, Ordering::AcqRel);
         Ok(Ok(()))
     }
@@ -237,6 +242,10 @@ impl Vouching {
         let counting = self.trust.counting();
         let known = lists.iter().rposition(|list| Some(list.digest) == counting).map_or(0, |at| at + 1);
         lists[known..].iter().filter(|list| !told.judged.contains(&list.digest)).copied().collect()
+    }
+
+    fn not_kept(&self, path: &Path, source: io::Error) -> FetchError {
+        FetchError::disk(path, source).for_want_of_room(self.data.root(), Need::of_file(MAX_SIGNATURE_BYTES))
     }
 
     fn kept(&self, package: &PackageRef) -> Vec<Envelope> {

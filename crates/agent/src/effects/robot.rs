@@ -18,12 +18,13 @@ use tokio_util::sync::CancellationToken;
 
 use self::held::Held;
 pub(crate) use self::outcomes::chain;
-use self::outcomes::{build_failure, fetch_failure, finally, later, millis, outputs_code, pulled};
+use self::outcomes::{build_failure, fetch_failure, later, millis, outputs_code, pulled};
 use super::{Effects, Now};
 use crate::builder::{self, BuildOrder};
 use crate::cgroup::{Cgroups, RunLimits};
 use crate::config::{Config, ForwardSettings};
-use crate::fetch::{self, Asks, Fetcher};
+use crate::disk::Need;
+use crate::fetch::{self, Asks, FetchError, Fetcher};
 use crate::gate::Gate;
 use crate::graph_access::GraphAccess;
 use crate::installation::Installation;
@@ -372,7 +373,10 @@ impl Effects for Robot {
         };
         builder::build(&order, cancel).await.map_err(|error| build_failure(error, self.data.root()))?;
         let marker = version.root().join(BUILT_MARKER);
-        durable::write(&marker, b"", 0o600).map_err(|error| finally(FailureCode::IO_ERROR, &error))
+        durable::write(&marker, b"", 0o600).map_err(|source| {
+            let error = FetchError::disk(&marker, source);
+            fetch_failure(error.for_want_of_room(self.data.root(), Need::of_file(0)))
+        })
     }
 
     async fn ask_gate(&self, task: &TaskName, question: &GateQuestion) -> Result<(), StepFailure> {

@@ -149,7 +149,7 @@ impl FetchError {
     }
 
     /// A write that failed because the disk is full is told with the figures of the file system that holds `path`.
-    pub(super) fn for_want_of_room(self, path: &Path, need: Need) -> Self {
+    pub(crate) fn for_want_of_room(self, path: &Path, need: Need) -> Self {
         match self {
             Self::Disk { source, .. }
                 if matches!(source.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded) =>

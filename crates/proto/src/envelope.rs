@@ -11,6 +11,7 @@ use ed25519_dalek::{Signature, Signer as _};
 use serde::{Deserialize, Serialize};
 
 use crate::Digest;
+use crate::publisher::MAX_KEYS;
 
 /// The payload type of a signed [`crate::desired::DesiredState`].
 pub const DESIRED_STATE_TYPE: &str = "application/vnd.taskd.desired.v1+json";
@@ -135,8 +136,9 @@ impl Envelope {
     }
 }
 
-/// More signatures than this are not looked at: each costs a verification.
-const MAX_SIGNATURES: usize = 8;
+/// More signatures than this are not looked at: each costs a verification. All keepers of a list of publishers may have to
+/// sign one that hands over to as many others, who sign it too.
+const MAX_SIGNATURES: usize = 2 * MAX_KEYS;
 
 /// DSSE's `PAE(type, body)`: "DSSEv1", then each field's length and bytes, separated by single spaces.
 fn pre_authentication_encoding(payload_type: &str, payload: &[u8]) -> Vec<u8> {

@@ -388,6 +388,29 @@ mod tests {
     }
 
     #[test]
+    fn whatever_roles_there_can_be_can_sign() {
+        let most = MAX_KEYS as u8;
+        let seeds = |from: u8| (from..from + most).collect::<Vec<_>>();
+        let all_of = |from: u8| role(&seeds(from), u32::from(most));
+        // The longest list there can be, which all keepers hand on to as many others.
+        let withdrawn = vec![Digest::of(b"x"); MAX_WITHDRAWN];
+        let next = PublisherList {
+            issued_at_ms: u64::MAX - 1,
+            expires_at_ms: u64::MAX,
+            withdrawn,
+            ..list(u64::MAX, all_of(0), all_of(most))
+        };
+        let envelope = sealed(&next, &(0..2 * most).collect::<Vec<_>>());
+        assert_eq!(PublisherList::follow(&envelope, &all_of(0), 1), Ok(next));
+        assert!(serde_json::to_vec_pretty(&envelope).expect("json").len() as u64 <= MAX_LIST_BYTES);
+        let talker = package("talker");
+        let mut envelope = said_by(0, &talker);
+        seeds(1).iter().for_each(|seed| envelope.sign_also(STATEMENT_TYPE, &key(*seed)).expect("signed"));
+        assert!(serde_json::to_vec_pretty(&envelope).expect("json").len() as u64 <= MAX_SIGNATURE_BYTES);
+        assert!(vouching(&all_of(0), &talker, &[envelope]).is_ok());
+    }
+
+    #[test]
     fn an_older_list_never_follows() {
         let keepers = role(&[1], 1);
         for (version, known) in [(1, 1), (1, 2), (0, 0)] {

@@ -36,6 +36,8 @@ mod watching;
 const TICK: Duration = Duration::from_secs(1);
 /// When to try again after the ledger could not be written.
 const LEDGER_RETRY: Duration = Duration::from_secs(5);
+/// When to look again at a process of which nothing could be told.
+const LOOK_AGAIN: Duration = Duration::from_millis(plan::LOOK_AGAIN_MS);
 /// More turns than this for one task mean that the plan goes in circles.
 const MAX_TURNS: u32 = 64;
 /// What watchers have seen and the driver has not taken yet; beyond it they wait.
@@ -69,6 +71,8 @@ struct View {
     prepared: Option<Prepared>,
     /// What became of the active run's process; `None` likewise.
     process: Option<ProcessState>,
+    /// When to look at it again, should nothing have been told of it: a look may take long, and all tasks wait for it.
+    look_again: Option<Instant>,
     /// Who looks at that process.
     watched: Option<Watched>,
     /// What ROS says of it.
@@ -408,11 +412,17 @@ impl<E: Effects> Driver<E> {
             }
             view.prepared = Some(prepared);
         }
-        if view.process.is_none() || view.process == Some(ProcessState::Unknown) {
+        let is_due = match view.process {
+            None => true,
+            Some(ProcessState::Unknown) => view.look_again.is_none_or(|at| at <= Instant::now()),
+            Some(_) => false,
+        };
+        if is_due {
             view.process = Some(match record.active.as_ref().and_then(|active| active.process.as_ref()) {
                 Some(process) => self.effects.process(task, process).await,
                 None => ProcessState::None,
             });
+            view.look_again = Some(Instant::now() + LOOK_AGAIN);
         }
         if let Some(ProcessState::Alive { pid }) = view.process {
             // An agent that died during the start did not write it down.

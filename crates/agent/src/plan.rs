@@ -218,7 +218,7 @@ pub const CALM_MS: u64 = 10 * 60 * 1000;
 pub const MAX_RESTARTS_IN_A_ROW: u32 = 100;
 
 /// When to look again at a process of which nothing could be told.
-const LOOK_AGAIN_MS: u64 = 5000;
+pub const LOOK_AGAIN_MS: u64 = 5000;
 
 /// Tasks in the order in which they get what not all can have at once: those of higher priority first, then by name.
 pub fn in_turn(mut tasks: Vec<(TaskName, i32)>) -> Vec<TaskName> {

@@ -4,7 +4,7 @@
 //! signals a process.
 
 use std::collections::BTreeMap;
-use std::fs::{File, OpenOptions};
+use std::fs::{File, OpenOptions, TryLockError};
 use std::io;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
@@ -178,20 +178,34 @@ impl RunDir {
         self.write("exit.json", ended)
     }
 
-    /// Takes the start lock, waiting for a start in progress. The lock goes with the file, also into a child that
-    /// inherits it, so there is no moment at which a start is under way and the lock is free. Where nothing can be written
-    /// any more, what runs can still be looked at and stopped.
-    pub fn lock(&self) -> Result<File, RunDirError> {
+    /// Takes the start lock; `None` while a start is in progress. Nobody waits for it in here: a start may hang, and takes
+    /// who waits with it. The lock goes with the file, also into a child that inherits it, so there is no moment at which a
+    /// start is under way and the lock is free. Where nothing can be written any more, what runs can still be looked at and
+    /// stopped.
+    pub fn try_lock(&self) -> Result<Option<File>, RunDirError> {
+        self.locked(File::try_lock)
+    }
+
+    /// The same for who only reads, beside others who do.
+    pub fn try_lock_shared(&self) -> Result<Option<File>, RunDirError> {
+        self.locked(File::try_lock_shared)
+    }
+
+    fn locked(&self, lock: impl Fn(&File) -> Result<(), TryLockError>) -> Result<Option<File>, RunDirError> {
         let path = self.0.join("lock");
-        let locked = || {
-            let file = match OpenOptions::new().write(true).create(true).truncate(false).mode(0o600).open(&path) {
-                Err(error) if error.kind() == io::ErrorKind::ReadOnlyFilesystem => File::open(&path)?,
-                opened => opened?,
-            };
-            file.lock()?;
-            Ok(file)
+        let failed = |source| RunDirError::Io { path: path.clone(), source };
+        let mut anew = OpenOptions::new();
+        anew.read(true).write(true).create(true).truncate(false).mode(0o600);
+        let file = match anew.open(&path) {
+            Err(error) if error.kind() == io::ErrorKind::ReadOnlyFilesystem => File::open(&path),
+            opened => opened,
         };
-        locked().map_err(|source| RunDirError::Io { path: path.clone(), source })
+        let file = file.map_err(failed)?;
+        match lock(&file) {
+            Ok(()) => Ok(Some(file)),
+            Err(TryLockError::WouldBlock) => Ok(None),
+            Err(TryLockError::Error(source)) => Err(failed(source)),
+        }
     }
 
     fn read<T: DeserializeOwned>(&self, name: &str) -> Result<Option<T>, RunDirError> {
@@ -234,11 +248,11 @@ mod tests {
             let mounted = |flags| mount(Some("tmpfs"), temp.path(), Some("tmpfs"), flags, None::<&str>);
             mounted(MsFlags::empty()).expect("mounted");
             let dir = RunDir::create(&temp.path().join("run")).expect("create");
-            drop(dir.lock().expect("locked"));
+            drop(dir.try_lock().expect("locked").expect("nobody has it"));
             mounted(MsFlags::MS_REMOUNT | MsFlags::MS_RDONLY).expect("mounted anew");
-            let held = RunDir::create(dir.path()).expect("it is there").lock().expect("locked");
-            let other = File::open(dir.path().join("lock")).expect("opened");
-            assert!(other.try_lock().is_err());
+            let held = RunDir::create(dir.path()).expect("it is there").try_lock_shared().expect("locked");
+            assert!(dir.try_lock().expect("looked at").is_none());
+            assert!(dir.try_lock_shared().expect("locked").is_some(), "readers do not wait for each other");
             drop(held);
         });
     }

@@ -7,11 +7,14 @@
 //!                                └──▶ Gone
 //! ```
 
-use std::io::{self, Read};
+use std::io::{self, PipeReader};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use nix::sys::signal::Signal;
+use tokio::io::AsyncReadExt as _;
+use tokio::net::unix::pipe;
+use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
 use crate::cgroup::Cgroups;
@@ -24,6 +27,8 @@ use crate::shim::Answer;
 
 /// How long a start may take; it is a fork, an exec and two small files.
 const START_TIMEOUT: Duration = Duration::from_secs(20);
+/// When to try again to take the lock of a run whose start is in progress.
+const LOCK_PAUSE: Duration = Duration::from_millis(20);
 /// How long killed processes may take to be gone.
 const KILL_TIMEOUT: Duration = Duration::from_secs(10);
 /// The longest answer a shim gives.
@@ -60,6 +65,14 @@ pub enum Observed {
     Gone,
 }
 
+/// How far a start has come.
+enum Begun {
+    /// It was made before.
+    Runs(Started),
+    /// The shim says on this pipe what comes of it.
+    Asked(PipeReader),
+}
+
 /// Why a run could not be started, looked at or ended.
 #[derive(Debug, thiserror::Error)]
 pub enum SupervisorError {
@@ -75,6 +88,9 @@ pub enum SupervisorError {
     /// The shim said nothing within its time.
     #[error("the task's shim did not answer within {} s", START_TIMEOUT.as_secs())]
     NoAnswer,
+    /// Nobody can tell yet what comes of it.
+    #[error("a start of the task is in progress, or hangs")]
+    Starting,
     /// Processes could not be found or ended.
     #[error(transparent)]
     Containment(#[from] ContainmentError),
@@ -110,18 +126,22 @@ impl Supervisor {
     /// the caller from the moment the shim exists: dropping this future takes it back only before that. After
     /// [`SupervisorError::NoAnswer`] it may be one or the other, and [`Self::observe`] tells which.
     pub async fn start(&self, path: &Path, spec: &RunSpec) -> Result<Started, SupervisorError> {
+        let started = tokio::time::timeout(START_TIMEOUT, self.start_shim(path, spec));
+        started.await.unwrap_or(Err(SupervisorError::NoAnswer))
+    }
+
+    async fn start_shim(&self, path: &Path, spec: &RunSpec) -> Result<Started, SupervisorError> {
         let (program, cgroups) = (self.program.clone(), self.cgroups.clone());
         let (path, mut spec) = (path.to_owned(), spec.clone());
+        let (dir, lock) = once_locked(&path, START_TIMEOUT, |dir| Ok(dir.try_lock()?)).await?;
         let given_up = CancellationToken::new();
         let _when_dropped = given_up.clone().drop_guard();
-        let begun = tokio::task::spawn_blocking(move || {
-            let dir = RunDir::create(&path)?;
-            let lock = dir.lock()?;
+        let begun = in_background("start the shim", move || {
             let started = dir.started()?;
             if started.is_some() || dir.has_begun() {
                 let runs = dir.ended()?.is_none();
                 let running = started.filter(|started| runs && started.shim.is_alive());
-                return running.ok_or(SupervisorError::Used(path));
+                return running.map(Begun::Runs).ok_or(SupervisorError::Used(path));
             }
             spec.environment.insert(ASSIGNMENT_VARIABLE.to_owned(), spec.assignment.to_string());
             spec.environment.insert(RUN_DIR_VARIABLE.to_owned(), dir.path().display().to_string());
@@ -134,28 +154,35 @@ impl Supervisor {
             if given_up.is_cancelled() {
                 return Err(SupervisorError::NoAnswer);
             }
-            let answer = process::spawn_shim(&program, dir.path(), lock).map_err(failed("start the shim"))?;
-            let mut line = Vec::new();
-            answer.take(MAX_ANSWER_BYTES).read_to_end(&mut line).map_err(failed("read the shim's answer"))?;
-            match serde_json::from_slice(&line) {
-                Ok(Answer::Started(started)) => Ok(started),
-                Ok(Answer::Failed(reason)) => Err(SupervisorError::Refused(reason)),
-                Err(_) => Err(SupervisorError::Refused("its shim ended without a word".to_owned())),
-            }
+            process::spawn_shim(&program, dir.path(), lock).map(Begun::Asked).map_err(failed("start the shim"))
         });
-        match tokio::time::timeout(START_TIMEOUT, begun).await {
-            Ok(joined) => joined.map_err(|error| failed("start the shim")(error.into()))?,
-            Err(_) => Err(SupervisorError::NoAnswer),
+        let answer = match begun.await? {
+            Begun::Runs(started) => return Ok(started),
+            Begun::Asked(answer) => answer,
+        };
+        let unread = failed("read the shim's answer");
+        let answer = pipe::Receiver::from_owned_fd(answer.into()).map_err(&unread)?;
+        let mut line = Vec::new();
+        answer.take(MAX_ANSWER_BYTES).read_to_end(&mut line).await.map_err(&unread)?;
+        match serde_json::from_slice(&line) {
+            Ok(Answer::Started(started)) => Ok(started),
+            Ok(Answer::Failed(reason)) => Err(SupervisorError::Refused(reason)),
+            Err(_) => Err(SupervisorError::Refused("its shim ended without a word".to_owned())),
         }
     }
 
     /// What has become of the run at `path`. Waits for a start in progress. When the shim was killed, what it left
     /// behind is ended here: nobody reads its output any more or could tell how it ends.
     pub async fn observe(&self, path: &Path) -> Result<Observed, SupervisorError> {
+        self.observe_within(path, START_TIMEOUT).await
+    }
+
+    /// The same, but waits for a start in progress no longer than that.
+    pub async fn observe_within(&self, path: &Path, patience: Duration) -> Result<Observed, SupervisorError> {
         if !path.join("spec.json").exists() {
             return Ok(Observed::NeverStarted);
         }
-        let (dir, started, cgroup) = read(path).await?;
+        let (dir, started, cgroup) = read_within(path, patience).await?;
         let Some(started) = started else {
             // The shim died, or the machine went down, before it was written who runs it.
             Containment::new(dir.path(), None, cgroup).end(KILL_TIMEOUT).await?;
@@ -203,7 +230,13 @@ impl Supervisor {
     /// Afterwards none of its processes is left, wherever they had hidden. Dropping the future leaves a run that may
     /// still be ending; calling again begins with SIGINT again, and on a run that has ended only makes sure.
     pub async fn stop(&self, path: &Path, grace: Duration) -> Result<Observed, SupervisorError> {
-        let mut observed = self.observe(path).await?;
+        let mut observed = match self.observe(path).await {
+            Err(SupervisorError::Starting) => {
+                self.end_start(path).await?;
+                self.observe(path).await?
+            }
+            observed => observed?,
+        };
         if observed == Observed::NeverStarted && !path.exists() {
             return Ok(observed);
         }
@@ -214,6 +247,18 @@ impl Supervisor {
         }
         containment.end(KILL_TIMEOUT).await?;
         Ok(observed)
+    }
+
+    /// Kills what is in the control group of a run whose start does not end: it hangs before the task's own program, as on
+    /// a file system that does not answer. Its shim then takes it for a task that has ended, and lets go of the lock.
+    async fn end_start(&self, path: &Path) -> Result<(), SupervisorError> {
+        let Some(cgroups) = self.cgroups.clone() else { return Err(SupervisorError::Starting) };
+        let path = path.to_owned();
+        in_background("end the start", move || {
+            let group = cgroups.group(RunDir::create(&path)?.path());
+            group.kill().map_err(failed("end the start"))
+        })
+        .await
     }
 
     async fn end_run(
@@ -248,15 +293,48 @@ impl Supervisor {
 
 /// The run directory, who runs it and in which control group, once no start is in progress; an error where one never ends.
 async fn read(path: &Path) -> Result<(RunDir, Option<Started>, Option<PathBuf>), SupervisorError> {
-    let path = path.to_owned();
-    let reading = tokio::task::spawn_blocking(move || {
-        let dir = RunDir::create(&path)?;
-        let _no_start_in_progress = dir.lock()?;
-        let (started, spec) = (dir.started()?, dir.spec()?);
-        Ok((dir, started, spec.and_then(|spec| spec.cgroup)))
-    });
-    let read = tokio::time::timeout(START_TIMEOUT, reading).await.map_err(|_| SupervisorError::NoAnswer)?;
-    read.map_err(|error| failed("read the run directory")(error.into()))?
+    read_within(path, START_TIMEOUT).await
+}
+
+async fn read_within(
+    path: &Path,
+    patience: Duration,
+) -> Result<(RunDir, Option<Started>, Option<PathBuf>), SupervisorError> {
+    let (dir, (started, spec)) = once_locked(path, patience, |dir| {
+        let Some(_no_start_in_progress) = dir.try_lock_shared()? else { return Ok(None) };
+        Ok(Some((dir.started()?, dir.spec()?)))
+    })
+    .await?;
+    Ok((dir, started, spec.and_then(|spec| spec.cgroup)))
+}
+
+/// What `attempt` gives for the run directory once it has its lock. It is made again and again, since a thread that waited
+/// for the lock of a start that hangs would be gone for good.
+async fn once_locked<T: Send + 'static>(
+    path: &Path,
+    patience: Duration,
+    attempt: impl Fn(&RunDir) -> Result<Option<T>, SupervisorError> + Copy + Send + 'static,
+) -> Result<(RunDir, T), SupervisorError> {
+    let deadline = Instant::now() + patience;
+    loop {
+        let path = path.to_owned();
+        let tried = in_background("read the run directory", move || {
+            let dir = RunDir::create(&path)?;
+            Ok(attempt(&dir)?.map(|found| (dir, found)))
+        });
+        match tried.await? {
+            Some(found) => return Ok(found),
+            None if Instant::now() >= deadline => return Err(SupervisorError::Starting),
+            None => tokio::time::sleep(LOCK_PAUSE).await,
+        }
+    }
+}
+
+async fn in_background<T: Send + 'static>(
+    what: &'static str,
+    work: impl FnOnce() -> Result<T, SupervisorError> + Send + 'static,
+) -> Result<T, SupervisorError> {
+    tokio::task::spawn_blocking(work).await.map_err(|error| failed(what)(error.into()))?
 }
 
 fn failed(what: &'static str) -> impl Fn(io::Error) -> SupervisorError {

@@ -1,6 +1,7 @@
 //! The driver's logic, with a robot whose effects only take notes.
 
 mod fake;
+mod hanging;
 mod removed;
 
 use task_proto::api::ReportReply;

@@ -262,7 +262,8 @@ impl Effects for Robot {
             let last_lines = logs::last_lines(&self.log(task).path, TAIL_BYTES);
             ProcessState::Ended(Exit { status, out_of_memory_bytes, last_lines })
         };
-        match self.supervisor.observe(&self.run_dir(task, process)).await {
+        // Whoever asks is not kept waiting by a start that may hang: it asks again.
+        match self.supervisor.observe_within(&self.run_dir(task, process), Duration::ZERO).await {
             Ok(Observed::NeverStarted) => ProcessState::NeverStarted,
             Ok(Observed::Running { pid, .. }) => ProcessState::Alive { pid },
             Ok(Observed::Exited(status)) => exit(Some(status), None),

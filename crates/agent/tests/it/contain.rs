@@ -5,8 +5,9 @@ use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _};
 use std::time::Duration;
 
 use nix::sys::signal::Signal;
-use task_agent::cgroup::Cgroups;
+use task_agent::cgroup::{Cgroups, RunLimits};
 use task_agent::process::{ExitStatus, ProcessEntry};
+use task_agent::run_dir::RunDir;
 use task_agent::supervisor::Observed;
 use task_agent::task_user::TaskUser;
 
@@ -81,6 +82,25 @@ async fn nothing_outlives_the_stop_of_its_task() {
         assert_eq!(living(&pids), Vec::<u32>::new());
         assert!(run.cgroup().is_none_or(|cgroup| !cgroup.exists()));
     }
+}
+
+#[tokio::test]
+async fn a_start_that_hangs_is_ended_with_its_control_group() {
+    let run = TestRun::grouped("echo up");
+    let Some(cgroups) = Cgroups::find() else { return };
+    let dir = RunDir::create(&run.run_dir()).expect("dir");
+    // What enters a frozen group gets no further, as where its directory is on a file system that does not answer.
+    let group = cgroups.create(dir.path(), &RunLimits::default()).expect("made");
+    std::fs::write(group.path().join("cgroup.freeze"), "1").expect("frozen");
+    tokio::select! {
+        started = run.supervisor.start(dir.path(), &run.spec) => panic!("{started:?}"),
+        () = eventually("it hangs", || group.pids().is_ok_and(|pids| !pids.is_empty()).then_some(())) => {}
+    }
+    let observed = within("the stop", run.supervisor.stop(dir.path(), Duration::ZERO)).await.expect("stopped");
+    assert!(matches!(observed, Observed::Running { .. } | Observed::Exited(ExitStatus::Signal(9))), "{observed:?}");
+    let ended = within("its end", run.supervisor.wait(dir.path())).await.expect("observed");
+    assert_eq!(ended, Observed::Exited(ExitStatus::Signal(9)));
+    assert!(!run.log().contains("up") && !group.path().exists());
 }
 
 #[tokio::test]

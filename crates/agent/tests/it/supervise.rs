@@ -103,21 +103,49 @@ async fn a_run_is_started_once_however_often_it_is_asked_for() {
 async fn a_start_that_was_given_up_before_there_was_a_shim_starts_nothing() {
     let run = TestRun::of("sleep 1000");
     let dir = RunDir::create(&run.run_dir()).expect("dir");
-    let stalled = dir.lock().expect("locked");
+    let stalled = dir.try_lock().expect("locked").expect("nobody has it");
     let start = run.supervisor.start(dir.path(), &run.spec);
     assert!(tokio::time::timeout(Duration::from_millis(50), start).await.is_err());
     drop(stalled);
-    // It has the lock until it is over, with its spec written down.
-    eventually("the end of it", || {
-        let over = dir.lock().expect("locked");
-        let written = dir.spec().expect("readable").is_some();
-        drop(over);
-        written.then_some(())
-    })
-    .await;
-    assert_eq!(dir.started().expect("readable"), None);
+    // Whoever waited for the lock would have it now.
+    let over = dir.try_lock().expect("locked").expect("nobody has it");
+    assert_eq!(dir.spec().expect("readable"), None);
+    drop(over);
     assert_eq!(run.survivors(), Vec::<u32>::new());
     assert_eq!(run.supervisor.observe(&run.run_dir()).await.expect("observed"), Observed::NeverStarted);
+}
+
+#[test]
+fn whoever_waits_for_a_start_that_hangs_takes_no_thread() {
+    // With one thread for all that blocks.
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().max_blocking_threads(1).build();
+    runtime.expect("a runtime").block_on(async {
+        let run = TestRun::of("true");
+        let dir = RunDir::create(&run.run_dir()).expect("dir");
+        dir.write_spec(&run.spec).expect("written");
+        let hangs = dir.try_lock().expect("locked").expect("nobody has it");
+        let (supervisor, path) = (&run.supervisor, dir.path());
+        let look = supervisor.observe_within(path, Duration::ZERO);
+        let looked = within("a look", look).await;
+        assert!(matches!(looked, Err(SupervisorError::Starting)), "{looked:?}");
+        let waiting = async {
+            let all = (
+                supervisor.observe(path),
+                supervisor.pids(path),
+                supervisor.stop(path, SHORT_GRACE),
+                supervisor.start(path, &run.spec),
+            );
+            tokio::join!(all.0, all.1, all.2, all.3)
+        };
+        assert!(tokio::time::timeout(Duration::from_millis(200), waiting).await.is_err());
+        let other = TestRun::of("exit 3");
+        within("another start", other.supervisor.start(&other.run_dir(), &other.spec)).await.expect("started");
+        let ended = within("its end", other.supervisor.wait(&other.run_dir())).await.expect("observed");
+        assert_eq!(ended, Observed::Exited(ExitStatus::Code(3)));
+        drop(hangs);
+        within("the start", run.supervisor.start(path, &run.spec)).await.expect("started");
+        within("its end", run.supervisor.wait(path)).await.expect("observed");
+    });
 }
 
 /// Not a test of its own: it is the agent that the next test runs as a process and kills.

@@ -24,6 +24,8 @@ pub(super) struct Fake {
     exited: watch::Sender<()>,
     /// Pulls of content that were told to come back later.
     pub(super) pulls: watch::Sender<u32>,
+    /// Looks at processes of which nothing can be told.
+    pub(super) looks: watch::Sender<u64>,
     /// What who gathers parts says of those that are lacking.
     pub(super) asks: watch::Sender<Asks>,
 }
@@ -64,6 +66,8 @@ pub(super) struct State {
     pub(super) jobs: bool,
     /// How processes ended.
     exits: Vec<(String, i32)>,
+    /// Of processes that have ended nothing can be told.
+    pub(super) hangs: bool,
     /// Versions that nobody trusted has signed, and what is gone by.
     pub(super) untrusted: BTreeSet<Digest>,
     pub(super) trust: TrustFacts,
@@ -155,6 +159,10 @@ impl Effects for Fake {
 
     async fn process(&self, _task: &TaskName, process: &ProcessRecord) -> ProcessState {
         self.state(|state| match state.exits.iter().find(|(dir, _)| *dir == process.dir) {
+            Some(_) if state.hangs => {
+                self.looks.send_modify(|looks| *looks += 1);
+                ProcessState::Unknown
+            }
             Some((_, code)) => ProcessState::Ended(Exit {
                 status: Some(ExitStatus::Code(*code)),
                 last_lines: String::new(),

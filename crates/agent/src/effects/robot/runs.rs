@@ -123,6 +123,20 @@ mod tests {
     }
 
     #[tokio::test]
+    async fn a_start_that_hangs_keeps_nobody_waiting_who_looks() {
+        let temp = tempfile::tempdir().expect("a directory");
+        let robot = robot(temp.path(), "");
+        let talker = "talker".parse().expect("valid");
+        let process = run_of("boot").process.expect("a process");
+        let dir = run_dir(&robot.run_dir(&talker, &process), BTreeMap::new());
+        let hangs = dir.try_lock().expect("locked").expect("nobody has it");
+        let looking = tokio::time::timeout(Duration::from_secs(10), robot.process(&talker, &process));
+        assert_eq!(looking.await.expect("at once"), ProcessState::Unknown);
+        drop(hangs);
+        assert_eq!(robot.process(&talker, &process).await, ProcessState::NeverStarted);
+    }
+
+    #[tokio::test]
     async fn what_still_runs_of_an_old_run_is_ended_before_its_directory_goes() {
         let temp = tempfile::tempdir().expect("a directory");
         let robot = robot(temp.path(), "");

@@ -20,7 +20,7 @@ use rumqttc::{
 use task_proto::RobotId;
 use task_proto::api::{ExternalBroker, MqttEndpoint};
 use task_proto::desired::{Doorbell, MAX_DOORBELL_BYTES};
-use task_proto::report::Status;
+use task_proto::report::{MAX_REPORT_BYTES, Status};
 use task_proto::request::Request;
 use task_proto::topic::{RobotTopic, Topic, TopicPrefix};
 use task_transport::{Line, LineError, Route};
@@ -54,8 +54,8 @@ const QUEUED_REQUESTS: usize = 16;
 const QUEUED_EVENTS: usize = 2;
 /// Messages that were dealt with and whose acknowledgements wait; brokers have fewer in flight.
 const QUEUED_ACKNOWLEDGEMENTS: usize = 1024;
-/// The largest packet that is sent: a report of very many tasks.
-const MAX_SENT_BYTES: usize = 8 * 1024 * 1024;
+/// The largest packet that is sent: the largest report.
+const MAX_SENT_BYTES: usize = MAX_REPORT_BYTES + AROUND_MESSAGE_BYTES;
 /// The largest message that is read unless the server is seen to send whole packages as one: a part of 1 MiB.
 pub const MESSAGE_BYTES: usize = 1024 * 1024 + AROUND_MESSAGE_BYTES;
 /// The largest that MQTT has.
@@ -479,6 +479,8 @@ impl Session<'_> {
             return;
         }
         match serde_json::to_vec(&*report) {
+            // The server would cut the robot off for it. Over HTTP it says what is wrong, and the session stays.
+            Ok(payload) if payload.len() > MAX_REPORT_BYTES => self.shared.post.notify_one(),
             Ok(payload) => self.publish(RobotTopic::Report, payload, Published::Report { seq: report.seq }),
             Err(error) => tracing::error!(%error, "a report can't be written as JSON"),
         }

@@ -12,6 +12,9 @@ use crate::part::PartRange;
 use crate::settings::{EffectiveSettings, tolerant};
 use crate::{DeploymentId, Digest, Generation, InstanceId, MacAddress, RobotId, TaskName, Version};
 
+/// The largest report, in bytes of JSON, by whatever way it comes.
+pub const MAX_REPORT_BYTES: usize = 1024 * 1024;
+
 /// A robot's whole state. A later one replaces an earlier one; (start, seq) says which is later.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]

@@ -10,7 +10,7 @@ use crate::ros::{LifecycleState, NodeDetail, NodeSummary, Parameter, TopicSummar
 use crate::vitals::Vitals;
 use crate::{RobotId, TaskName};
 
-/// The largest reply, in bytes of JSON; a broker of ours takes packets up to 256 KiB.
+/// The largest reply, in bytes of JSON; older brokers of ours take packets up to 256 KiB.
 pub const MAX_REPLY_BYTES: usize = 240 * 1024;
 /// The longest a robot may take for an answer, in milliseconds.
 pub const MAX_TTL_MS: u64 = 60_000;

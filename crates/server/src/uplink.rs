@@ -11,7 +11,7 @@ use futures_util::future::BoxFuture;
 use serde::de::DeserializeOwned;
 use task_proto::RobotId;
 use task_proto::log::{LogBatch, MAX_BATCH_BYTES};
-use task_proto::report::{Report, Status};
+use task_proto::report::{MAX_REPORT_BYTES, Report, Status};
 use task_proto::request::{MAX_REPLY_BYTES, Reply};
 use task_proto::topic::RobotTopic;
 use task_proto::vitals::{MAX_TELEMETRY_BYTES, Telemetry};
@@ -26,8 +26,7 @@ use crate::requests::Requests;
 use crate::robot_logs::RobotLogs;
 use crate::robot_vitals::RobotVitals;
 
-/// The largest report and status that are read.
-const MAX_REPORT_BYTES: usize = 1024 * 1024;
+/// The largest status that is read.
 const MAX_STATUS_BYTES: usize = 4 * 1024;
 /// A robot that is behind is rung again no sooner, or one that refuses its state would be rung for each report.
 const RING_AGAIN_MS: u64 = 5_000;

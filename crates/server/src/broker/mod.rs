@@ -18,6 +18,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use futures_util::future::BoxFuture;
 use task_proto::api::{MqttTraffic, Subscription, Traffic};
+use task_proto::report::MAX_REPORT_BYTES;
 use task_proto::topic::{RobotTopic, TopicPrefix};
 use task_proto::{Digest, RobotId, UserName};
 use tokio::io::{AsyncRead, AsyncWrite};
@@ -32,6 +33,9 @@ use front::Front;
 /// What reads clients' bytes; public for those who try it with any.
 pub use front::codec;
 use router::Router;
+
+/// What a packet has around its message: the topic and the packet id.
+const AROUND_MESSAGE_BYTES: usize = 1024;
 
 /// What a client shows at the door.
 #[derive(Clone)]
@@ -181,7 +185,7 @@ impl Default for Limits {
             max_silent_per_address: 2048,
             max_operators: 256,
             max_sessions_per_person: 16,
-            max_packet_bytes: 256 * 1024,
+            max_packet_bytes: MAX_REPORT_BYTES + AROUND_MESSAGE_BYTES,
             max_filters: 64,
             connect_timeout: Duration::from_secs(10),
             admit_timeout: Duration::from_secs(10),

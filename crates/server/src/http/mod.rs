@@ -175,7 +175,7 @@ const SMALL_BODY_BYTES: usize = 64 * 1024;
 /// An order has one selector.
 const ORDER_BODY_BYTES: usize = MAX_SELECTOR_BYTES + SMALL_BODY_BYTES;
 /// The largest report.
-pub const REPORT_BODY_BYTES: usize = 1024 * 1024;
+pub const REPORT_BODY_BYTES: usize = task_proto::report::MAX_REPORT_BYTES;
 /// How long a request may take, from its head to its answer.
 const DEADLINE: Duration = Duration::from_secs(30);
 

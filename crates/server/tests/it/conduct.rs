@@ -53,7 +53,7 @@ async fn what_none_of_ours_would_send_cuts_its_robot_off() {
     let refused: Vec<(&str, u8)> = refused.iter().map(|(filter, qos)| (filter.as_str(), *qos)).collect();
     let cases = [
         (publish(&other, 1, 1, b"{}"), "publishes where it may not"),
-        (framed(0x30, &vec![0; 300_000]), "packet of 300000 bytes"),
+        (framed(0x30, &vec![0; 2_000_000]), "packet of 2000000 bytes"),
         (vec![0x36, 2, 0, 0], "what is no MQTT"),
         (subscribe(1, &refused), "subscribing to what is not for it"),
     ];
@@ -71,7 +71,7 @@ async fn what_none_of_ours_would_send_cuts_its_robot_off() {
     let robot = RobotId::random();
     let stranger = Connect { password: Some("pw-".to_owned()), ..Connect::robot(&robot) };
     broker
-        .raw_with(&[stranger.packet(), framed(0x30, &vec![0; 300_000])].concat())
+        .raw_with(&[stranger.packet(), framed(0x30, &vec![0; 2_000_000])].concat())
         .await
         .expect(&[0x20, 2, 0, 4])
         .await;

@@ -7,6 +7,7 @@ use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
 use task_proto::RobotId;
 use task_proto::topic::RobotTopic;
+use taskd::broker::Limits;
 use tokio::io::AsyncReadExt;
 use tokio::time::timeout;
 
@@ -103,7 +104,7 @@ fn violations(robot: &RobotId) -> Vec<Vec<u8>> {
         with_first(0x36, publish(&report, 1, 1, b"x")),
         with_first(0x38, publish(&report, 0, 0, b"x")),
         publish(&report, 1, 0, b"x"),
-        publish(&report, 1, 1, &vec![0; 256 * 1024]),
+        publish(&report, 1, 1, &vec![0; Limits::default().max_packet_bytes]),
         framed(0x30, &binary(b"\xff\xff")),
         framed(0x32, &text(&report)),
         subscribe(0, &[(&own, 0)]),
@@ -247,7 +248,7 @@ async fn floods_are_capped() {
     let own = topic(&robot, RobotTopic::Desired);
 
     let mut wide = broker.robot(&robot).await;
-    wide.send(&subscribe(1, &vec![(own.as_str(), 1); 10_000])).await;
+    wide.send(&subscribe(1, &vec![(own.as_str(), 1); 30_000])).await;
     wide.expect_close().await;
 
     let mut many = broker.operator("taskd/v1/x", 0).await;

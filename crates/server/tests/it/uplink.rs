@@ -8,7 +8,7 @@ use rumqttc::{AsyncClient, Event, EventLoop, MqttOptions, Packet, QoS};
 use serde_json::{Value, json};
 use task_proto::api::{RobotToken, ServerInfo};
 use task_proto::desired::{DesiredState, Doorbell};
-use task_proto::report::Phase;
+use task_proto::report::{MAX_REPORT_BYTES, Phase};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
@@ -44,7 +44,7 @@ impl Session {
     fn dial_at(address: &str, id: &str, token: &str) -> Self {
         let (host, port) = address.rsplit_once(':').expect("host:port");
         let mut options = MqttOptions::new(id, host, port.parse().expect("a port"));
-        options.set_credentials(id, token).set_max_packet_size(256 * 1024, 256 * 1024);
+        options.set_credentials(id, token).set_max_packet_size(256 * 1024, 2 * MAX_REPORT_BYTES);
         let (client, packets) = AsyncClient::new(options, 16);
         Self { client, packets, topics: format!("taskd/v1/r/{id}") }
     }
@@ -178,6 +178,19 @@ async fn a_robot_that_reports_an_old_generation_is_told_again() {
         .await
         .expect("queued");
     assert_eq!(session.told(&server, state.generation.0).await.generation, state.generation);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_largest_report_is_stored_and_acknowledged() {
+    let server = TestServer::start().await;
+    let mut robot = server.enroll("atlas").await;
+    let mut session = Session::open(&server, &robot).await;
+    let state = session.told(&server, 0).await;
+    let mut report = serde_json::to_vec(&robot.next_report(&state, Phase::Running)).expect("json");
+    // Space behind a value is JSON as well.
+    report.resize(MAX_REPORT_BYTES, b' ');
+    session.publish("report", report).await;
+    assert!(server.robot(&robot).await.host.is_some());
 }
 
 #[tokio::test(flavor = "multi_thread")]

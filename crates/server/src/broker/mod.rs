@@ -84,8 +84,8 @@ pub enum Refusal {
 
 /// Decides who may come in.
 pub trait Gatekeeper: Send + Sync + 'static {
-    /// Who this is, or why they may not enter. Given up on after [`Limits::admit_timeout`], which counts as
-    /// [`Refusal::Unavailable`].
+    /// Who this is, or why they may not enter. After [`Limits::admit_timeout`] the client is told
+    /// [`Refusal::Unavailable`]; what was asked goes on to its end.
     fn admit(&self, login: Login) -> BoxFuture<'_, Result<Principal, Refusal>>;
 }
 

@@ -24,7 +24,7 @@ use super::conduct::hold_up;
 use super::error::{ApiError, ROBOT_REVOKED};
 use crate::gatekeeper::ended_others;
 use crate::person::Person;
-use crate::store::{Admitted, TokenHolder};
+use crate::store::{Admitted, StoreError, TokenHolder};
 use crate::tls::ClientProof;
 use crate::visits::Line;
 
@@ -243,7 +243,7 @@ async fn identify_on_line(app: &App, showing: &Showing<'_>) -> Result<(Caller, T
 
 /// Who sent this request. `Anyone` if it does not say; an error if it says it wrongly.
 async fn identify(app: &App, showing: &Showing<'_>) -> Result<(Caller, TokenNumber), ApiError> {
-    let &Showing { method, headers, proof, line } = showing;
+    let &Showing { method, headers, .. } = showing;
     let now_ms = app.clock.now_ms();
     let token = if let Some(value) = headers.get(header::AUTHORIZATION) {
         token_of(value)?
@@ -255,7 +255,7 @@ async fn identify(app: &App, showing: &Showing<'_>) -> Result<(Caller, TokenNumb
     } else {
         return Ok((Caller::Anyone, TokenNumber(0)));
     };
-    let Some(Admitted { holder, is_first_use }) = app.store.admit(&token, proof, now_ms).await? else {
+    let Some(holder) = let_in(app, &token, showing, now_ms).await? else {
         if app.store.is_of_revoked_robot(&token).await? {
             return Err(ApiError::robot_revoked());
         }
@@ -265,18 +265,39 @@ async fn identify(app: &App, showing: &Showing<'_>) -> Result<(Caller, TokenNumb
         TokenHolder::Person(person) => (Caller::Person(person), TokenNumber(0)),
         TokenHolder::Enrolment => (Caller::Enrolment(Box::new(token)), TokenNumber(0)),
         TokenHolder::Pending { .. } => return Err(ApiError::awaits_approval()),
-        TokenHolder::Robot { robot, token_number, .. } => {
-            if is_first_use {
-                // Whoever is connected came in by the token that has just ended; this request's own connection stays.
-                app.broker.disconnect(&robot);
-                if let Some(line) = line {
-                    line.leave();
-                }
-                ended_others(&app.presence, &app.visits, &app.changes, &robot);
-            }
-            (Caller::Robot(robot), TokenNumber(token_number))
-        }
+        TokenHolder::Robot { robot, token_number, .. } => (Caller::Robot(robot), TokenNumber(token_number)),
     })
+}
+
+/// Whose token this is, if it is good. Goes on to its end even if the client does not wait for it: a robot's first use of a
+/// token has ended its others by then, and who came in by those has to go.
+async fn let_in(
+    app: &App,
+    token: &Token,
+    showing: &Showing<'_>,
+    now_ms: u64,
+) -> Result<Option<TokenHolder>, StoreError> {
+    let (app, token, proof, line) = (app.clone(), token.clone(), showing.proof.clone(), showing.line.cloned());
+    let admitting = tokio::spawn(async move {
+        let Some(Admitted { holder, is_first_use }) = app.store.admit(&token, &proof, now_ms).await? else {
+            return Ok(None);
+        };
+        if let TokenHolder::Robot { robot, .. } = &holder
+            && is_first_use
+        {
+            // Whoever is connected came in by the token that has just ended; this request's own connection stays.
+            app.broker.disconnect(robot);
+            if let Some(line) = line {
+                line.leave();
+            }
+            ended_others(&app.presence, &app.visits, &app.changes, robot);
+        }
+        Ok(Some(holder))
+    });
+    match admitting.await {
+        Ok(admitted) => admitted,
+        Err(panic) => std::panic::resume_unwind(panic.into_panic()),
+    }
 }
 
 /// The token that these headers show.

@@ -356,3 +356,15 @@ async fn who_is_put_out_on_the_way_to_its_seat_gets_none() {
     raw.expect(&[0x20, 2, 0, 5]).await;
     raw.expect_close().await;
 }
+
+#[tokio::test]
+async fn a_new_token_ends_the_old_session_though_its_guest_is_given_up_on() {
+    let broker = TestBroker::with(|limits| limits.admit_timeout = Duration::from_millis(50)).await;
+    let robot = RobotId::random();
+    let mut old = broker.robot(&robot).await;
+    let connect = Connect { password: Some(format!("new-{robot}")), ..Connect::robot(&robot) };
+    let mut new = broker.raw_with(&connect.packet()).await;
+    new.expect(&[0x20, 2, 0, 3]).await;
+    broker.door.go_on.notify_one();
+    old.expect_close().await;
+}

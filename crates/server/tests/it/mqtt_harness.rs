@@ -29,7 +29,7 @@ pub const PATIENCE: Duration = Duration::from_secs(10);
 #[derive(Default)]
 pub struct Door {
     /// Says that somebody with `once-<robot id>` is being let in, for the first time, which [`Door::go_on`] ends. The second
-    /// time they are not.
+    /// time they are not. Somebody with `new-<robot id>` waits for that as well, and is a new token's first use.
     pub asked: Notify,
     pub go_on: Notify,
     was_asked: AtomicBool,
@@ -55,6 +55,11 @@ impl Gatekeeper for Door {
                     self.go_on.notified().await;
                     let robot = user.parse().expect("a robot's id");
                     Ok(Principal::Robot { robot, token_number: 0, is_first_use: false })
+                }
+                password if password.starts_with("new-") => {
+                    self.go_on.notified().await;
+                    let robot = user.parse().expect("a robot's id");
+                    Ok(Principal::Robot { robot, token_number: 1, is_first_use: true })
                 }
                 password => match password.strip_prefix("pw-").map(str::parse) {
                     Some(Ok(robot)) if !user.is_empty() => {

@@ -9,6 +9,7 @@ use serde_json::{Value, json};
 use task_proto::api::{RobotToken, ServerInfo};
 use task_proto::desired::{DesiredState, Doorbell};
 use task_proto::report::{MAX_REPORT_BYTES, Phase};
+use taskd::store::{Store, sqlite_url};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
@@ -256,6 +257,33 @@ async fn a_new_token_leaves_the_old_session_alone_until_it_is_used() {
     session.hung_up().await;
     assert!(!Session::is_let_in(&server, &robot, &old).await);
     assert!(server.report(&mut robot, &state, Phase::Running).await.status().is_success());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_new_token_ends_the_old_session_though_the_request_that_shows_it_first_is_broken_off() {
+    let server = TestServer::start().await;
+    let robot = server.enroll("atlas").await;
+    let mut session = Session::open(&server, &robot).await;
+    session.told(&server, 0).await;
+    let path = format!("/api/v1/robots/{}", robot.id);
+    let next: RobotToken = answer(server.bare(Method::POST, &format!("{path}/token")).bearer_auth(&robot.token)).await;
+    let requests = async || server.get::<ServerInfo>("/api/v1/server").await.http.requests;
+    // As long as somebody writes the token is not marked as used.
+    let store = Store::open(&sqlite_url(&server.data().join("taskd.sqlite"))).await.expect("opens");
+    let write = store.begin().await.expect("begins");
+    let mut counted = requests().await;
+    let request = format!("GET {path}/desired HTTP/1.1\r\nHost: taskd\r\nAuthorization: Bearer {}\r\n\r\n", next.token);
+    let mut line = TcpStream::connect(&server.server.addresses().http).await.expect("listens");
+    line.write_all(request.as_bytes()).await.expect("sent");
+    // Until it is under way there are only these questions.
+    while requests().await == counted + 1 {
+        counted += 1;
+    }
+    line.shutdown().await.expect("hung up");
+    assert_eq!(line.read(&mut [0]).await.expect("an end"), 0, "nobody answers it any more");
+    drop(write);
+    session.hung_up().await;
+    assert!(!Session::is_let_in(&server, &robot, &robot.token).await);
 }
 
 /// A robot and another machine with its identity, which displace each other.

@@ -3,7 +3,7 @@
 
 use std::io;
 use std::net::SocketAddr;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use bytes::BytesMut;
@@ -143,7 +143,7 @@ impl CanaryPass {
 }
 
 /// Reads CONNECT and finds out who it is.
-pub(super) async fn welcome<S>(context: &Context, stream: &mut S, arrival: Arrival) -> Result<Guest, Rejection>
+pub(super) async fn welcome<S>(context: &Arc<Context>, stream: &mut S, arrival: Arrival) -> Result<Guest, Rejection>
 where
     S: AsyncRead + AsyncWrite + Unpin,
 {
@@ -238,7 +238,7 @@ async fn read_connect<S: AsyncRead + Unpin>(stream: &mut S, input: &mut BytesMut
     }
 }
 
-async fn admit(context: &Context, connect: &Connect, login: Login) -> Result<Visitor, Rejection> {
+async fn admit(context: &Arc<Context>, connect: &Connect, login: Login) -> Result<Visitor, Rejection> {
     if connect.client_id == CANARY_ID {
         let pass = connect.password.as_deref().unwrap_or_default();
         return match context.canary_pass.redeem(pass) {
@@ -248,12 +248,7 @@ async fn admit(context: &Context, connect: &Connect, login: Login) -> Result<Vis
             }
         };
     }
-    let principal = timeout(context.limits.admit_timeout, context.gatekeeper.admit(login)).await;
-    if let Ok(Ok(Principal::Robot { robot, is_first_use: true, .. })) = &principal {
-        // Nobody who came by a token that has ended keeps a seat, or gets one; this guest has none yet.
-        context.seats.ask_to_leave(robot);
-    }
-    match principal.unwrap_or(Err(Refusal::Unavailable)) {
+    match ask(context, login).await {
         Err(Refusal::BadCredentials) => {
             Err(answer(ConnectReturnCode::BadUserNamePassword, "a bad user name or password"))
         }
@@ -275,6 +270,25 @@ async fn admit(context: &Context, connect: &Connect, login: Login) -> Result<Vis
             Err(answer(ConnectReturnCode::NotAuthorized, "a client id or user name that is not the token's robot id"))
         }
         Ok(Principal::Robot { robot, token_number, .. }) => Ok(Visitor::Robot { robot, token_number }),
+    }
+}
+
+/// Asks the gatekeeper who this is. That goes on to its end even if the client is not waited for any more: a robot's first use
+/// of a token has ended its others by then, and who came in by those has to go.
+async fn ask(context: &Arc<Context>, login: Login) -> Result<Principal, Refusal> {
+    let shared = context.clone();
+    let asked = tokio::spawn(async move {
+        let principal = shared.gatekeeper.admit(login).await;
+        if let Ok(Principal::Robot { robot, is_first_use: true, .. }) = &principal {
+            // Nobody who came by a token that has ended keeps a seat, or gets one; this guest has none yet.
+            shared.seats.ask_to_leave(robot);
+        }
+        principal
+    });
+    match timeout(context.limits.admit_timeout, asked).await {
+        Ok(Ok(principal)) => principal,
+        // It took too long, or panicked.
+        Ok(Err(_)) | Err(_) => Err(Refusal::Unavailable),
     }
 }
 

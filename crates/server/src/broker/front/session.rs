@@ -108,7 +108,7 @@ where
 
 /// Everything before the session is live: who it is, the seat, and a link to the router if it needs one.
 async fn enter<S>(
-    context: &Context,
+    context: &Arc<Context>,
     stream: &mut S,
     arrival: Arrival,
     meter: &Arc<Meter>,

@@ -1,11 +1,14 @@
 //! What a robot says: whole snapshots of its tasks, ordered by (start, seq), and its connection status.
 //! Times are elapsed milliseconds, because a robot's clock may lie.
 
+mod tidy;
+
 use std::borrow::Cow;
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
+use self::tidy::{MAX_FAILURE_CHARS, clean};
 use crate::desired::{DesiredTask, PackageRef, Wanted};
 use crate::manifest::TaskKind;
 use crate::part::PartRange;
@@ -383,9 +386,7 @@ pub struct Failure {
 impl Failure {
     /// A failure with `code` and `text`; control characters, which a package could smuggle in, become spaces.
     pub fn new(code: FailureCode, text: impl Into<String>) -> Self {
-        let text: String =
-            text.into().chars().map(|c| if c.is_control() && c != '\n' { ' ' } else { c }).take(4096).collect();
-        Self { code, text }
+        Self { code, text: clean(&text.into(), MAX_FAILURE_CHARS) }
     }
 }
 

@@ -79,10 +79,10 @@ impl ReportWriter {
         (Self { queue, meter }, tokio::spawn(write_all(submissions, store, clock, changes, chooser)))
     }
 
-    /// Stores `report`, whose `robot_id` the caller has authenticated by the robot's token of this number. Resolves after
+    /// Stores `report`, as far as it is kept, whose `robot_id` the caller has authenticated by the robot's token of this number. Resolves after
     /// the commit.
     pub async fn submit(&self, report: Report, token_number: u64) -> Result<ReportReply, ReportError> {
-        let came = Instant::now();
+        let (came, report) = (Instant::now(), report.tidied());
         let (answer, answered) = oneshot::channel();
         let submission = Submission { fingerprint: fingerprint(&report), report, token_number, answer };
         self.queue.send_timeout(submission, PATIENCE).await.map_err(|_| ReportError::Busy)?;

@@ -1,9 +1,10 @@
 //! The event stream: notices of change, gathered for a moment, read once from the store and sent to every listener whose
 //! robots they concern. It never replays: whoever missed something is told so and fetches the lists again.
 
-use std::collections::{BTreeSet, HashSet};
+use std::collections::{BTreeSet, HashSet, VecDeque};
 use std::convert::Infallible;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::Duration;
 
 use axum::extract::State;
@@ -34,6 +35,8 @@ use crate::store::{KnownRobot, Store, StoreError, TokenHolder};
 const GATHER: Duration = Duration::from_millis(200);
 /// Events a slow listener may fall behind before it misses some.
 const BACKLOG: usize = 16 * 1024;
+/// And their bytes; of more than that the oldest go, and who has not taken them yet has missed them.
+const BACKLOG_BYTES: usize = 64 << 20;
 /// The most listeners at once.
 const MOST_LISTENERS: usize = 512;
 /// Of these the most that are one person's, or one person could keep everybody else out.
@@ -46,8 +49,59 @@ const KEEP_ALIVE: Duration = Duration::from_secs(15);
 #[derive(Debug, Clone)]
 struct Line {
     name: &'static str,
-    data: Arc<str>,
+    text: Arc<Text>,
     audience: Audience,
+}
+
+/// An event's text, for as long as somebody has not taken it and there is room for it.
+#[derive(Debug)]
+struct Text {
+    text: Mutex<Option<Arc<str>>>,
+    kept_bytes: Arc<AtomicUsize>,
+}
+
+impl Text {
+    fn get(&self) -> Option<Arc<str>> {
+        self.text.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    fn let_go(&self) {
+        if let Some(text) = self.text.lock().unwrap_or_else(PoisonError::into_inner).take() {
+            self.kept_bytes.fetch_sub(text.len(), Ordering::Relaxed);
+        }
+    }
+}
+
+impl Drop for Text {
+    fn drop(&mut self) {
+        self.let_go();
+    }
+}
+
+/// The texts that wait for listeners, the oldest first. Those that all have taken are gone from it by themselves.
+#[derive(Debug, Clone, Default)]
+struct Backlog {
+    texts: Arc<Mutex<VecDeque<Weak<Text>>>>,
+    kept_bytes: Arc<AtomicUsize>,
+}
+
+impl Backlog {
+    /// Keeps one more, in the place of the oldest if there are too many bytes.
+    fn keep(&self, text: Arc<str>) -> Arc<Text> {
+        self.kept_bytes.fetch_add(text.len(), Ordering::Relaxed);
+        let kept = Arc::new(Text { text: Mutex::new(Some(text)), kept_bytes: self.kept_bytes.clone() });
+        let mut texts = self.texts.lock().unwrap_or_else(PoisonError::into_inner);
+        texts.push_back(Arc::downgrade(&kept));
+        while let Some(oldest) = texts.front() {
+            match oldest.upgrade() {
+                Some(text) if self.kept_bytes.load(Ordering::Relaxed) > BACKLOG_BYTES => text.let_go(),
+                Some(_) => break,
+                None => {}
+            }
+            texts.pop_front();
+        }
+        kept
+    }
 }
 
 /// Whom an event is for.
@@ -120,6 +174,7 @@ impl Drop for Place {
 #[derive(Clone)]
 pub struct EventFeed {
     lines: broadcast::Sender<Line>,
+    backlog: Backlog,
     listeners: Listeners,
 }
 
@@ -142,7 +197,8 @@ pub struct EventSource {
 impl EventFeed {
     /// A feed without listeners; [`EventFeed::run`] fills it.
     pub fn new() -> Self {
-        Self { lines: broadcast::Sender::new(BACKLOG), listeners: Listeners::default() }
+        let (lines, backlog) = (broadcast::Sender::new(BACKLOG), Backlog::default());
+        Self { lines, backlog, listeners: Listeners::default() }
     }
 
     /// A place among the listeners for a person with this scope, for as long as it is held.
@@ -270,10 +326,14 @@ impl EventFeed {
 
     fn send(&self, event: &Event, audience: Audience) {
         match serde_json::to_string(event) {
-            // Nobody listening is fine.
-            Ok(data) => drop(self.lines.send(Line { name: name_of(event), data: data.into(), audience })),
+            Ok(text) => self.send_text(name_of(event), text.into(), audience),
             Err(error) => tracing::error!(%error, "an event could not be written"),
         }
+    }
+
+    fn send_text(&self, name: &'static str, text: Arc<str>, audience: Audience) {
+        // Nobody listening is fine.
+        let _ = self.lines.send(Line { name, text: self.backlog.keep(text), audience });
     }
 }
 
@@ -307,13 +367,20 @@ pub(super) async fn stream(
     // The place is free again when the stream is dropped.
     let place = app.events.place(&by.name, &by.scope)?;
     let lines = BroadcastStream::new(app.events.lines.subscribe());
+    let mut has_missed = false;
     let events = lines.filter_map(move |line| {
-        let event = match line {
-            Ok(line) if !line.audience.includes(&place.listener.scope) => None,
-            Ok(line) => Some(SentEvent::default().event(line.name).data(line.data)),
-            Err(_) => Some(SentEvent::default().event("missed").data(r#"{"type":"missed"}"#)),
+        let (name, text) = match line {
+            Ok(line) if !line.audience.includes(&place.listener.scope) => return std::future::ready(None),
+            Ok(line) => (line.name, line.text.get()),
+            Err(_) => ("missed", None),
         };
-        std::future::ready(event.map(Ok))
+        // Of many that were missed in a row it is said once.
+        let is_said = std::mem::replace(&mut has_missed, text.is_none()) && has_missed;
+        let event = match text {
+            Some(text) => SentEvent::default().event(name).data(text),
+            None => SentEvent::default().event("missed").data(r#"{"type":"missed"}"#),
+        };
+        std::future::ready((!is_said).then_some(Ok(event)))
     });
     // A first line, so that proxies pass the headers on and the page knows that it is connected.
     let greeting =
@@ -376,6 +443,25 @@ mod tests {
 
     fn name(text: &str) -> UserName {
         text.parse().expect("a name")
+    }
+
+    #[test]
+    fn what_waits_for_slow_listeners_is_bounded_in_bytes() {
+        const LINE_BYTES: usize = 1 << 20;
+        let feed = EventFeed::new();
+        let kept_bytes = || feed.backlog.kept_bytes.load(Ordering::Relaxed);
+        let send = || feed.send_text("robot", "x".repeat(LINE_BYTES).into(), Audience::Everybody);
+        send();
+        assert_eq!(kept_bytes(), 0, "nobody listens");
+        let mut slow = feed.lines.subscribe();
+        let lines = BACKLOG_BYTES / LINE_BYTES + 3;
+        for _ in 0..lines {
+            send();
+        }
+        assert_eq!(kept_bytes(), BACKLOG_BYTES);
+        let heard: Vec<bool> = (0..lines).map(|_| slow.try_recv().expect("a line").text.get().is_some()).collect();
+        assert!(heard[..3].iter().all(|was_kept| !was_kept) && heard[3..].iter().all(|was_kept| *was_kept));
+        assert_eq!(kept_bytes(), 0, "all of them were taken");
     }
 
     #[test]

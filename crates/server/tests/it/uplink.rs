@@ -8,7 +8,7 @@ use rumqttc::{AsyncClient, Event, EventLoop, MqttOptions, Packet, QoS};
 use serde_json::{Value, json};
 use task_proto::api::{RobotToken, ServerInfo};
 use task_proto::desired::{DesiredState, Doorbell};
-use task_proto::report::{MAX_REPORT_BYTES, Phase};
+use task_proto::report::{Condition, MAX_REPORT_BYTES, Phase};
 use taskd::store::{Store, sqlite_url};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
@@ -192,6 +192,25 @@ async fn the_largest_report_is_stored_and_acknowledged() {
     report.resize(MAX_REPORT_BYTES, b' ');
     session.publish("report", report).await;
     assert!(server.robot(&robot).await.host.is_some());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn of_what_a_report_says_so_much_is_kept() {
+    let server = TestServer::start().await;
+    let mut robot = server.enroll("atlas").await;
+    let state = server.desired(&robot).await;
+    let mut report = robot.next_report(&state, Phase::Running);
+    let text = "\u{1b}ä".repeat(500);
+    report.conditions = vec![Condition { code: text.clone(), text: text.clone() }; 40];
+    report.host.hostname = text.clone();
+    report.host.ros_distros = vec![text; 40];
+    assert_eq!(server.send_report(&robot, &report).await.status(), 200);
+    let view = server.robot(&robot).await;
+    assert_eq!(view.conditions.len(), 32);
+    let Condition { code, text } = &view.conditions[31];
+    assert_eq!((code.chars().count(), text.as_str()), (64, " ä".repeat(250).as_str()));
+    let host = view.host.expect("it has reported");
+    assert_eq!((host.hostname.chars().count(), host.ros_distros.len()), (200, 32));
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -1,0 +1,61 @@
+//! What of a report is kept: texts and lists in their bounds, and no control characters in them.
+
+use super::{Condition, HostFacts, MAX_CODE_BYTES, Report};
+
+/// The most conditions of a robot, or entries of another list of its own, that are kept.
+const MAX_ENTRIES: usize = 32;
+/// The longest text of a failure, of a condition and of a fact about the machine, in characters.
+pub(super) const MAX_FAILURE_CHARS: usize = 4096;
+const MAX_CONDITION_CHARS: usize = 500;
+const MAX_FACT_CHARS: usize = 200;
+
+impl Report {
+    /// The same as far as it is kept: texts without control characters and no longer than they may be, lists with their first
+    /// entries. What it says of a robot is shown to everybody who may see that one, each time something changes.
+    #[must_use]
+    pub fn tidied(mut self) -> Self {
+        self.boot_id = fact(&self.boot_id);
+        self.host.tidy();
+        self.conditions.truncate(MAX_ENTRIES);
+        for Condition { code, text } in &mut self.conditions {
+            (*code, *text) = (clean(code, MAX_CODE_BYTES), clean(text, MAX_CONDITION_CHARS));
+        }
+        for task in &mut self.tasks {
+            for failure in [&mut task.failure, &mut task.degraded].into_iter().flatten() {
+                failure.text = clean(&failure.text, MAX_FAILURE_CHARS);
+            }
+        }
+        self
+    }
+}
+
+impl HostFacts {
+    fn tidy(&mut self) {
+        for text in [&mut self.agent_version, &mut self.hostname, &mut self.arch] {
+            *text = fact(text);
+        }
+        tidy_list(&mut self.ros_distros);
+        if let Some(ros) = &mut self.ros {
+            ros.distro = fact(&ros.distro);
+            ros.rmw = ros.rmw.as_deref().map(fact);
+        }
+        if let Some(settings) = &mut self.settings {
+            tidy_list(&mut settings.own);
+            tidy_list(&mut settings.refused);
+        }
+    }
+}
+
+fn tidy_list(texts: &mut Vec<String>) {
+    texts.truncate(MAX_ENTRIES);
+    texts.iter_mut().for_each(|text| *text = fact(text));
+}
+
+fn fact(text: &str) -> String {
+    clean(text, MAX_FACT_CHARS)
+}
+
+/// So much of a text; control characters, which a package could smuggle in, become spaces.
+pub(super) fn clean(text: &str, max_chars: usize) -> String {
+    text.chars().map(|c| if c.is_control() && c != '\n' { ' ' } else { c }).take(max_chars).collect()
+}

@@ -20,6 +20,7 @@ pub struct Visits {
 #[derive(Debug, Clone, Default)]
 pub struct Line {
     cut: CancellationToken,
+    bytes_out: Arc<AtomicU64>,
     /// The robot that came by it last.
     visit: Arc<Mutex<Option<Visit>>>,
 }
@@ -81,6 +82,21 @@ impl Line {
     /// Somebody else comes by it now, as behind a proxy.
     pub fn leave(&self) {
         *self.visit.lock().unwrap_or_else(PoisonError::into_inner) = None;
+    }
+
+    /// The other side took so much, as far as the system can tell.
+    pub fn wrote(&self, bytes: usize) {
+        self.bytes_out.fetch_add(bytes as u64, Ordering::Relaxed);
+    }
+
+    /// How much that was so far.
+    pub fn bytes_out(&self) -> u64 {
+        self.bytes_out.load(Ordering::Relaxed)
+    }
+
+    /// Cuts it, in the middle of whatever it carries.
+    pub fn end(&self) {
+        self.cut.cancel();
     }
 
     /// Resolves when the connection has to end.

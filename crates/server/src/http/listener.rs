@@ -74,6 +74,7 @@ struct Guest {
     proof: ClientProof,
     /// Whether its place is needed.
     crowded: watch::Receiver<bool>,
+    line: Line,
 }
 
 /// Serves until `stop`, then lets requests under way end, for at most `patience`.
@@ -99,7 +100,7 @@ pub async fn serve(
         };
         let silent = anteroom.enter(peer.ip(), Instant::now());
         let proof = ClientProof::NotAsked;
-        let guest = Guest { peer, silent, proof, crowded: places.crowded.subscribe() };
+        let guest = Guest { peer, silent, proof, crowded: places.crowded.subscribe(), line: Line::default() };
         let site = site.clone();
         // Two kinds of task, so that a plain connection's does not need the room of an encrypted one's.
         if site.tls.is_some() {
@@ -109,7 +110,7 @@ pub async fn serve(
             });
         } else {
             connections.spawn(async move {
-                site.attend(site.patient(stream), guest).await;
+                site.attend(site.patient(stream, guest.line.clone()), guest).await;
                 drop(place);
             });
         }
@@ -123,18 +124,18 @@ pub async fn serve(
 }
 
 impl Site {
-    fn patient(&self, stream: TcpStream) -> PatientStream {
+    fn patient(&self, stream: TcpStream, line: Line) -> PatientStream {
         // Answers are small and wanted at once; a failure here costs only latency.
         let _ = stream.set_nodelay(true);
         self.traffic.connection();
-        PatientStream { stream, stalled: None, traffic: self.traffic.clone() }
+        PatientStream { stream, stalled: None, traffic: self.traffic.clone(), line }
     }
 
     /// Shakes hands, then serves the connection to its end.
     async fn attend_encrypted(&self, stream: TcpStream, guest: Guest) {
         let Some(tls) = &self.tls else { return };
         let shaken = tokio::select! {
-            shaken = timeout(self.handshake_timeout, tls.accept(self.patient(stream))) => shaken,
+            shaken = timeout(self.handshake_timeout, tls.accept(self.patient(stream, guest.line.clone()))) => shaken,
             () = guest.silent.leave().cancelled() => return,
             () = self.stop.cancelled() => return,
         };
@@ -149,9 +150,9 @@ impl Site {
     where
         S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
     {
-        let Guest { peer, silent, proof, crowded } = guest;
+        let Guest { peer, silent, proof, crowded, line } = guest;
         let (leave, spoken) = (silent.leave().clone(), CancellationToken::new());
-        let (line, router, traffic) = (Line::default(), self.router.clone(), self.traffic.clone());
+        let (router, traffic) = (self.router.clone(), self.traffic.clone());
         let origin = Origin { peer, proof, line: line.clone() };
         let mut connection = pin!(connection(stream, origin, silent, spoken.clone(), router, traffic));
         let ended = async {
@@ -283,12 +284,15 @@ struct PatientStream {
     stream: TcpStream,
     stalled: Option<Pin<Box<Sleep>>>,
     traffic: Arc<HttpTotals>,
+    line: Line,
 }
 
 impl PatientStream {
     fn watch_write(&mut self, context: &mut Context<'_>, polled: Poll<io::Result<usize>>) -> Poll<io::Result<usize>> {
         if let Poll::Ready(written) = &polled {
-            self.traffic.bytes_out(*written.as_ref().unwrap_or(&0));
+            let bytes = *written.as_ref().unwrap_or(&0);
+            self.traffic.bytes_out(bytes);
+            self.line.wrote(bytes);
             self.stalled = None;
             return polled;
         }

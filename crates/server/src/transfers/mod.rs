@@ -18,9 +18,10 @@ use tokio::time::{Instant, timeout};
 pub use body::TransferBody;
 use pace::Pace;
 pub use queue::Claim;
-use queue::{Asking, Place, Queue, jittered};
+use queue::{Asking, Place, Progress, Queue, Turn, jittered};
 
 use crate::config::TransferLimits;
+use crate::visits::Line;
 
 /// How long a request waits for its turn.
 const PATIENCE: Duration = Duration::from_secs(2);
@@ -50,6 +51,16 @@ struct Turns {
     queue: Queue,
     /// Whom to tell that it is their turn.
     asking: HashMap<Asking, oneshot::Sender<Transfer>>,
+    /// Those whose bytes are on their way.
+    carried: HashMap<u64, Carried>,
+    last_number: u64,
+}
+
+/// A transfer and the connection it goes by.
+struct Carried {
+    robot: RobotId,
+    line: Line,
+    progress: Progress,
 }
 
 struct Paces {
@@ -68,8 +79,10 @@ pub struct NotYet {
 /// A robot's turn; it ends when this is dropped.
 pub struct Transfer {
     shared: Arc<Shared>,
-    site: Option<LabelValue>,
+    turn: Turn,
     begun_ms: u64,
+    /// Its number among those that are carried.
+    number: Option<u64>,
 }
 
 impl Transfers {
@@ -79,7 +92,8 @@ impl Transfers {
         let pace = |bytes_per_s: Option<u64>| bytes_per_s.map(|bytes_per_s| Pace::new(bytes_per_s, now));
         let sites = limits.sites.iter().filter_map(|(site, limits)| Some((site.clone(), pace(limits.bytes_per_s)?)));
         let paces = Paces { all: pace(limits.all.bytes_per_s), sites: sites.collect() };
-        let turns = Turns { queue: Queue::new(limits), asking: HashMap::new() };
+        let turns =
+            Turns { queue: Queue::new(limits), asking: HashMap::new(), carried: HashMap::new(), last_number: 0 };
         let (turns, paces) = (Mutex::new(turns), Mutex::new(paces));
         let (sent, looks) = (AtomicU64::new(0), Mutex::default());
         Self { shared: Arc::new(Shared { started: now, site_label, turns, paces, sent, looks }) }
@@ -108,8 +122,10 @@ impl Transfers {
         if seconds > 0.0 { (sent.saturating_sub(*sent_before) as f64 / seconds) as u64 } else { 0 }
     }
 
-    /// Looks how much was sent so far. To be called every second or so: the speed shown is over the last looks.
+    /// Looks how much was sent so far, and ends transfers that take next to nothing while others wait. To be called every
+    /// second or so: the speed shown is over the last looks.
     pub fn look(&self) {
+        self.shared.end_too_slow(self.shared.now_ms());
         let mut looks = self.shared.looks.lock().unwrap_or_else(PoisonError::into_inner);
         if looks.len() >= LOOKS {
             looks.pop_front();
@@ -170,17 +186,27 @@ impl Drop for Request<'_> {
 }
 
 impl Shared {
+    fn end_too_slow(&self, now_ms: u64) {
+        let Turns { queue, carried, .. } = &mut *self.turns();
+        for Carried { robot, line, progress } in carried.values_mut() {
+            if progress.is_too_slow(line.bytes_out(), queue.others_wait(robot), now_ms) {
+                tracing::debug!(%robot, "it takes next to nothing, and others wait: its connection is cut");
+                line.end();
+            }
+        }
+    }
+
     /// Begins what may begin. Whoever is told and has gone meanwhile gives the turn back by dropping it.
     fn begin_what_may(self: &Arc<Self>) {
         let now_ms = self.now_ms();
         let told: Vec<_> = {
             let mut turns = self.turns();
-            let Turns { queue, asking } = &mut *turns;
+            let Turns { queue, asking, .. } = &mut *turns;
             let begun = queue.begin(now_ms).into_iter();
-            begun.map(|(request, site)| (asking.remove(&request), site)).collect()
+            begun.map(|(request, turn)| (asking.remove(&request), turn)).collect()
         };
-        for (tell, site) in told {
-            let transfer = Transfer { shared: self.clone(), site, begun_ms: now_ms };
+        for (tell, turn) in told {
+            let transfer = Transfer { shared: self.clone(), turn, begun_ms: now_ms, number: None };
             // Without anybody to tell it is dropped, and its turn is another's.
             drop(tell.map(|tell| tell.send(transfer)));
         }
@@ -201,6 +227,19 @@ impl Shared {
 }
 
 impl Transfer {
+    /// Goes by this connection, which ends if too little of it is taken while others wait.
+    pub fn by(mut self, line: Option<&Line>) -> Self {
+        let Some(line) = line.cloned() else { return self };
+        let progress = Progress::from(self.shared.now_ms(), line.bytes_out());
+        let mut turns = self.shared.turns();
+        turns.last_number += 1;
+        let number = turns.last_number;
+        turns.carried.insert(number, Carried { robot: self.turn.robot.clone(), line, progress });
+        drop(turns);
+        self.number = Some(number);
+        self
+    }
+
     fn sent(&self, bytes: u64) {
         self.shared.sent.fetch_add(bytes, Ordering::Relaxed);
     }
@@ -209,7 +248,7 @@ impl Transfer {
     fn reserve(&self, bytes: u64) -> Option<(u64, Instant)> {
         let mut paces = self.shared.paces();
         let Paces { all, sites } = &mut *paces;
-        let site = self.site.as_ref().and_then(|site| sites.get_mut(site));
+        let site = self.turn.site.as_ref().and_then(|site| sites.get_mut(site));
         let mut limits: Vec<&mut Pace> = all.as_mut().into_iter().chain(site).collect();
         let running = self.shared.turns().queue.running();
         let piece = limits.iter().map(|pace| pace.piece(running)).min()?.min(bytes);
@@ -222,7 +261,43 @@ impl Transfer {
 impl Drop for Transfer {
     fn drop(&mut self) {
         let lasted_ms = self.shared.now_ms().saturating_sub(self.begun_ms);
-        self.shared.turns().queue.end(self.site.as_ref(), lasted_ms);
+        let mut turns = self.shared.turns();
+        turns.queue.end(&self.turn, lasted_ms);
+        self.number.and_then(|number| turns.carried.remove(&number));
+        drop(turns);
         self.shared.begin_what_may();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use futures_util::{FutureExt as _, poll};
+
+    use super::*;
+    use crate::config::SiteLimits;
+
+    #[tokio::test]
+    async fn the_connection_of_a_stalled_transfer_is_cut_for_another_robot() {
+        let all = SiteLimits { max: Some(1), bytes_per_s: None };
+        let limits = TransferLimits { all, ..TransferLimits::default() };
+        let transfers = Transfers::new(&limits, "site".parse().expect("valid"));
+        let (robot, other, claim) = (RobotId::random(), RobotId::random(), Claim::default());
+        let (blob, line) = (Digest::of(b"x"), Line::default());
+        let stalled = transfers.admit(&robot, blob, &claim).await.expect("its turn").by(Some(&line));
+        let mut again = Box::pin(transfers.admit(&robot, Digest::of(b"y"), &claim));
+        assert!(poll!(again.as_mut()).is_pending());
+        transfers.shared.end_too_slow(60_000);
+        assert_eq!(line.cut().now_or_never(), None, "no other robot waits");
+        let mut waits = Box::pin(transfers.admit(&other, blob, &claim));
+        assert!(poll!(waits.as_mut()).is_pending());
+        transfers.shared.end_too_slow(89_999);
+        line.wrote(16 * 1024);
+        transfers.shared.end_too_slow(90_000);
+        assert_eq!(line.cut().now_or_never(), None, "it takes something");
+        transfers.shared.end_too_slow(120_000);
+        assert_eq!(line.cut().now_or_never(), Some(()));
+        drop((again, stalled));
+        waits.await.expect("its turn");
+        assert!(transfers.shared.turns().carried.is_empty());
     }
 }

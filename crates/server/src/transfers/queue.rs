@@ -3,9 +3,12 @@
 //!
 //! A place in the queue belongs to a robot and a blob, whether the robot asks just now or was told to come back later. Where
 //! the next in line is away, one behind it that is there goes first; after a few times its transfer is kept free.
+//!
+//! A robot that has a turn gets another only while there is more room than all others that wait would take, and loses one in
+//! which it takes next to nothing while others wait.
 
 use std::cmp::Reverse;
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, HashMap, HashSet};
 
 use task_proto::id::LabelValue;
 use task_proto::{Digest, RobotId};
@@ -23,6 +26,9 @@ const LOOK_INTERVAL_MS: u64 = 1_000;
 /// The shortest and the longest time to stay away.
 const MIN_AWAY_MS: u64 = 1_000;
 const MAX_AWAY_MS: u64 = 60_000;
+/// What a transfer has to take, and in which time, as robots ask it of the server; else it ends when others wait.
+const LEAST_BYTES: u64 = 16 * 1024;
+const LEAST_WITHIN_MS: u64 = 30_000;
 /// What a transfer is taken to last before any has ended.
 const FIRST_GUESS_MS: u64 = 1_000;
 
@@ -47,6 +53,36 @@ pub struct Claim {
 /// A request that waits for its turn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) struct Asking(u64);
+
+/// A transfer that runs.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Turn {
+    pub(super) robot: RobotId,
+    pub(super) site: Option<LabelValue>,
+}
+
+/// What a transfer took lately.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Progress {
+    since_ms: u64,
+    taken_before: u64,
+}
+
+impl Progress {
+    /// From now on, with so much taken already.
+    pub(super) fn from(now_ms: u64, taken_before: u64) -> Self {
+        Self { since_ms: now_ms, taken_before }
+    }
+
+    /// Whether it has taken too little while others waited, all of the time. `taken`: in all.
+    pub(super) fn is_too_slow(&mut self, taken: u64, others_wait: bool, now_ms: u64) -> bool {
+        let is_enough = taken.saturating_sub(self.taken_before) >= LEAST_BYTES;
+        if is_enough || !others_wait {
+            *self = Self::from(now_ms, taken);
+        }
+        now_ms.saturating_sub(self.since_ms) >= LEAST_WITHIN_MS
+    }
+}
 
 /// The order of places: priority, age of the deployment, arrival.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -81,12 +117,37 @@ impl Load {
     }
 }
 
+/// What may begin yet, of all and on each site with limits.
+struct Free<'a> {
+    all: u64,
+    sites: HashMap<&'a LabelValue, u64>,
+}
+
+impl<'a> Free<'a> {
+    fn of(all: &Load, sites: &'a HashMap<LabelValue, Load>) -> Self {
+        Self { all: all.free(), sites: sites.iter().map(|(site, load)| (site, load.free())).collect() }
+    }
+
+    fn is_on(&self, site: Option<&LabelValue>) -> bool {
+        self.all > 0 && site.and_then(|site| self.sites.get(site)) != Some(&0)
+    }
+
+    fn take(&mut self, site: Option<&LabelValue>) {
+        self.all -= 1;
+        if let Some(free) = site.and_then(|site| self.sites.get_mut(site)) {
+            *free -= 1;
+        }
+    }
+}
+
 /// All transfers of robots.
 #[derive(Debug)]
 pub(super) struct Queue {
     all: Load,
     /// Sites that have limits.
     sites: HashMap<LabelValue, Load>,
+    /// How many transfers of each robot run.
+    turns: HashMap<RobotId, u64>,
     waiting: BTreeMap<Rank, Waiting>,
     ranks: HashMap<Place, Rank>,
     /// Where those stand that are there.
@@ -104,6 +165,7 @@ impl Queue {
         Self {
             all: load(&limits.all),
             sites: limits.sites.iter().map(|(site, limits)| (site.clone(), load(limits))).collect(),
+            turns: HashMap::new(),
             waiting: BTreeMap::new(),
             ranks: HashMap::new(),
             asking: HashMap::new(),
@@ -121,6 +183,11 @@ impl Queue {
     /// Robots that wait for their turn, here or away.
     pub(super) fn waiting(&self) -> u64 {
         self.waiting.len() as u64
+    }
+
+    /// Whether any robot but this one waits for its turn, here or away.
+    pub(super) fn others_wait(&self, robot: &RobotId) -> bool {
+        self.waiting.values().any(|waiting| waiting.place.robot != *robot)
     }
 
     /// A robot asks. Its request waits from now on, in the place that it has if it was here before; an earlier request of
@@ -147,34 +214,53 @@ impl Queue {
     }
 
     /// Begins the transfers that may begin now. To be called after whatever may have made room.
-    pub(super) fn begin(&mut self, now_ms: u64) -> Vec<(Asking, Option<LabelValue>)> {
-        let mut free = self.all.free();
-        if free == 0 {
+    pub(super) fn begin(&mut self, now_ms: u64) -> Vec<(Asking, Turn)> {
+        if self.all.free() == 0 {
             return Vec::new();
         }
         self.forget_lost(now_ms);
-        let mut free_on: HashMap<&LabelValue, u64> =
-            self.sites.iter().map(|(site, load)| (site, load.free())).collect();
-        let (mut begun, mut away) = (Vec::new(), Vec::new());
+        let mut free = Free::of(&self.all, &self.sites);
+        let (mut begun, mut away, mut further) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut served, mut kept_for): (HashSet<&RobotId>, HashSet<&RobotId>) = Default::default();
         for (rank, waiting) in &self.waiting {
-            let on_site = waiting.site.as_ref().and_then(|site| free_on.get_mut(site));
-            if free == 0 {
+            if free.all == 0 {
                 break;
             }
-            if on_site.as_deref() == Some(&0) {
+            if !free.is_on(waiting.site.as_ref()) {
+                continue;
+            }
+            let robot = &waiting.place.robot;
+            if self.turns.contains_key(robot) || served.contains(robot) {
+                further.push(*rank);
                 continue;
             }
             match waiting.asking {
-                Some(_) => begun.push((*rank, away.len())),
-                // One that others have passed too often is waited for.
-                None if waiting.passed >= MAX_PASSED => {}
+                Some(_) => {
+                    begun.push((*rank, away.len()));
+                    served.insert(robot);
+                }
+                // One that others have passed too often is waited for, in one of its places.
+                None if waiting.passed >= MAX_PASSED && kept_for.insert(robot) => {}
                 None => {
                     away.push(*rank);
                     continue;
                 }
             }
-            free -= 1;
-            on_site.into_iter().for_each(|free| *free -= 1);
+            free.take(waiting.site.as_ref());
+        }
+        // Those that are away would take as much, each robot once.
+        for waiting in away.iter().filter_map(|rank| self.waiting.get(rank)) {
+            let robot = &waiting.place.robot;
+            if free.is_on(waiting.site.as_ref()) && !served.contains(robot) && kept_for.insert(robot) {
+                free.take(waiting.site.as_ref());
+            }
+        }
+        for rank in further {
+            let Some(waiting) = self.waiting.get(&rank).filter(|waiting| waiting.asking.is_some()) else { continue };
+            if free.is_on(waiting.site.as_ref()) {
+                free.take(waiting.site.as_ref());
+                begun.push((rank, 0));
+            }
         }
         for (index, rank) in away.iter().enumerate() {
             let overtakers = begun.iter().filter(|(_, away_before)| *away_before > index).count();
@@ -203,15 +289,21 @@ impl Queue {
     }
 
     /// A transfer has ended after so long.
-    pub(super) fn end(&mut self, site: Option<&LabelValue>, lasted_ms: u64) {
+    pub(super) fn end(&mut self, turn: &Turn, lasted_ms: u64) {
         self.all.running -= 1;
-        if let Some(load) = site.and_then(|site| self.sites.get_mut(site)) {
+        if let Some(load) = turn.site.as_ref().and_then(|site| self.sites.get_mut(site)) {
             load.running -= 1;
+        }
+        if let Some(turns) = self.turns.get_mut(&turn.robot) {
+            *turns -= 1;
+            if *turns == 0 {
+                self.turns.remove(&turn.robot);
+            }
         }
         self.lasts_ms = (self.lasts_ms * 7 + lasted_ms) / 8;
     }
 
-    fn start(&mut self, rank: Rank) -> Option<(Asking, Option<LabelValue>)> {
+    fn start(&mut self, rank: Rank) -> Option<(Asking, Turn)> {
         let waiting = self.waiting.remove(&rank)?;
         self.ranks.remove(&waiting.place);
         if let Some(asking) = waiting.asking {
@@ -221,7 +313,8 @@ impl Queue {
         if let Some(load) = waiting.site.as_ref().and_then(|site| self.sites.get_mut(site)) {
             load.running += 1;
         }
-        Some((waiting.asking?, waiting.site))
+        *self.turns.entry(waiting.place.robot.clone()).or_default() += 1;
+        Some((waiting.asking?, Turn { robot: waiting.place.robot, site: waiting.site }))
     }
 
     fn forget_lost(&mut self, now_ms: u64) {
@@ -270,19 +363,25 @@ mod tests {
         Claim { priority, ..Claim::default() }
     }
 
+    fn turn(number: u8) -> Turn {
+        Turn { robot: place(number).robot, site: None }
+    }
+
     #[test]
     fn priority_comes_before_age_and_age_before_arrival() {
         let mut queue = Queue::new(&limits(1));
         let first = queue.ask(place(0), &claim(0), 0);
-        assert_eq!(queue.begin(0), [(first.expect("room"), None)]);
+        assert_eq!(queue.begin(0), [(first.expect("room"), turn(0))]);
         let mut ask = |number, priority, deployment| {
             queue.ask(place(number), &Claim { priority, deployment, site: None }, 0).expect("room")
         };
         let (late, early, old, high) = (ask(1, 0, 7), ask(2, 0, 7), ask(3, 0, 6), ask(4, 1, 9));
-        for next in [high, old, late, early] {
+        let mut before = 0;
+        for (next, number) in [(high, 4), (old, 3), (late, 1), (early, 2)] {
             assert_eq!(queue.begin(0), []);
-            queue.end(None, 1_000);
-            assert_eq!(queue.begin(0), [(next, None)]);
+            queue.end(&turn(before), 1_000);
+            assert_eq!(queue.begin(0), [(next, turn(number))]);
+            before = number;
         }
     }
 
@@ -313,9 +412,9 @@ mod tests {
         for number in 3..6 {
             queue.ask(place(number), &claim(-1), 0);
         }
-        let begun: Vec<_> = queue.begin(0).into_iter().map(|(_, site)| site).collect();
-        assert_eq!(begun, [Some(site.clone()), None, None]);
-        queue.end(Some(&site), 1_000);
+        let begun: Vec<_> = queue.begin(0).into_iter().map(|(_, turn)| turn).collect();
+        assert_eq!(begun, [Turn { site: Some(site), ..turn(0) }, turn(3), turn(4)]);
+        queue.end(&begun[0], 1_000);
         assert_eq!(queue.begin(0).len(), 1);
     }
 
@@ -331,11 +430,11 @@ mod tests {
         assert_eq!(queue.send_away(asked[6], 0, 1.0), Some(4_500));
         queue.ask(place(7), &claim(0), 3_000);
         let again = queue.ask(place(2), &claim(0), 3_000).expect("room");
-        queue.end(None, 1_000);
-        assert_eq!(queue.begin(3_000), [(again, None)], "first in its old place");
+        queue.end(&turn(0), 1_000);
+        assert_eq!(queue.begin(3_000), [(again, turn(2))], "first in its old place");
         // Who does not come back loses its place.
-        queue.end(None, 1_000);
-        queue.end(None, 1_000);
+        queue.end(&turn(1), 1_000);
+        queue.end(&turn(2), 1_000);
         assert_eq!(queue.begin(3_000).len(), 2);
         assert_eq!(queue.waiting.len(), 3);
         queue.forget_lost(4_500 + GRACE_MS);
@@ -383,12 +482,11 @@ mod tests {
                     mine = queue.ask(place(100), &claim(0), now_ms);
                 }
                 for _ in 0..random(max + 1).min(running.len() as u64) {
-                    running.pop();
-                    queue.end(None, 1_000);
+                    queue.end(&running.pop().expect("it runs"), 1_000);
                 }
-                for (asking, _) in queue.begin(now_ms) {
+                for (asking, turn) in queue.begin(now_ms) {
                     is_done |= Some(asking) == mine;
-                    running.push(asking);
+                    running.push(turn);
                     begun_in_all += u64::from(!is_done);
                 }
                 prop_assert!(running.len() as u64 <= max && queue.running() == running.len() as u64);
@@ -403,5 +501,68 @@ mod tests {
             }
             prop_assert!(begun_in_all <= u64::from(others) + u64::from(MAX_PASSED) + max);
         }
+
+        /// However many blobs a robot asks for: what it gets beyond one turn is what nobody without a turn could have had, and
+        /// all that is asked for is had in the end.
+        #[test]
+        fn one_robot_does_not_take_the_turns_of_others(max in 1u64..5, acts in proptest::collection::vec((0u8..4, 0u8..6, 0u8..6), 1..200)) {
+            let mut queue = Queue::new(&limits(max));
+            let place = |robot, blob: u8| Place { blob: Digest::of(&[blob]), ..place(robot) };
+            let mut asking: HashMap<Asking, Place> = HashMap::new();
+            let mut away: HashSet<Place> = HashSet::new();
+            let mut running: Vec<Turn> = Vec::new();
+            let mut ends = acts.clone();
+            ends.extend(std::iter::repeat_n((3, 0, 0), 100));
+            for (act, robot, blob) in ends {
+                match act {
+                    0 | 1 => {
+                        let wanted = place(robot, blob);
+                        asking.retain(|_, other| *other != wanted);
+                        away.remove(&wanted);
+                        asking.insert(queue.ask(wanted.clone(), &claim(0), 0).expect("room"), wanted);
+                    }
+                    2 => {
+                        if let Some(one) = asking.keys().next().copied() {
+                            prop_assert!(queue.send_away(one, 0, 0.5).is_some());
+                            away.extend(asking.remove(&one));
+                        }
+                    }
+                    _ => {
+                        if let Some(turn) = running.pop() {
+                            queue.end(&turn, 1_000);
+                        }
+                    }
+                }
+                let had: HashSet<RobotId> = running.iter().map(|turn| turn.robot.clone()).collect();
+                let begun = queue.begin(0);
+                let mut has_further = false;
+                let mut first = had.clone();
+                for (one, turn) in begun {
+                    has_further |= !first.insert(turn.robot.clone());
+                    asking.remove(&one).expect("it asked");
+                    running.push(turn);
+                }
+                prop_assert!(running.len() as u64 <= max);
+                if has_further {
+                    let without = |place: &&Place| !first.contains(&place.robot);
+                    let wait: HashSet<_> = away.iter().filter(without).map(|place| place.robot.clone()).collect();
+                    prop_assert!(asking.values().all(|place| first.contains(&place.robot)), "one that is there waits");
+                    prop_assert!(running.len() + wait.len() <= usize::try_from(max).expect("few"));
+                }
+            }
+            prop_assert!(asking.is_empty() || !away.is_empty(), "what is asked for is had");
+            prop_assert_eq!(queue.turns.values().sum::<u64>(), running.len() as u64);
+        }
+    }
+
+    #[test]
+    fn a_transfer_that_takes_next_to_nothing_ends_only_where_others_wait() {
+        let mut progress = Progress::from(0, 0);
+        assert!(!progress.is_too_slow(0, false, 10 * LEAST_WITHIN_MS), "nobody waits");
+        let from = 10 * LEAST_WITHIN_MS;
+        assert!(!progress.is_too_slow(LEAST_BYTES - 1, true, from + LEAST_WITHIN_MS - 1));
+        assert!(!progress.is_too_slow(LEAST_BYTES, true, from + LEAST_WITHIN_MS), "it took enough");
+        assert!(!progress.is_too_slow(2 * LEAST_BYTES - 1, true, from + 2 * LEAST_WITHIN_MS - 1));
+        assert!(progress.is_too_slow(2 * LEAST_BYTES - 1, true, from + 2 * LEAST_WITHIN_MS));
     }
 }

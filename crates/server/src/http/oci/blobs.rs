@@ -61,6 +61,7 @@ pub(super) async fn get_for_robot(registry: &Registry, robot: &RobotId, digest: 
     let site = registry.transfers.site_of(&order.labels);
     let claim = Claim { priority: order.priority, deployment: order.number, site };
     let transfer = registry.transfers.admit(robot, digest, &claim).await?;
+    let transfer = transfer.by(request.extensions.get());
     Ok(read(registry, digest, request).await?.map(|body| Body::new(transfer.carry(body))))
 }
 

@@ -174,6 +174,7 @@ where
         storing: None,
         keep_alive: guest.keep_alive.unwrap_or(context.limits.max_silence),
         heard_at: now,
+        heard_bytes: 0,
         progress_at: now,
     };
     let end = session.run().await;
@@ -224,8 +225,10 @@ struct Session<'a, S> {
     unreleased: Unreleased,
     storing: Option<Storing<'a>>,
     keep_alive: Duration,
-    /// When the last packet came.
+    /// When the last packet came, or enough of the one that is coming.
     heard_at: Instant,
+    /// How much of that one was there then.
+    heard_bytes: usize,
     /// When the client last took something of what it was sent, or there was nothing to take.
     progress_at: Instant,
 }
@@ -359,8 +362,11 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
     fn act_on_input(&mut self) -> Result<(), End> {
         while self.may_read() {
             let before = self.input.len();
-            let Some(received) = decode(&mut self.input, self.context.limits.max_packet_bytes)? else { break };
-            self.heard_at = Instant::now();
+            let Some(received) = decode(&mut self.input, self.context.limits.max_packet_bytes)? else {
+                self.hear_progress();
+                break;
+            };
+            (self.heard_at, self.heard_bytes) = (Instant::now(), 0);
             self.weigh(&received, before - self.input.len())?;
             self.act_on_packet(received)?;
         }

@@ -9,6 +9,8 @@ use crate::conduct::{Offence, Verdict};
 
 /// Subscriptions to what is not for it that a robot may try in one session.
 const MAX_REFUSED_FILTERS: u32 = 16;
+/// How much more of an unfinished packet has to come for the client to count as heard: who trickles is silent.
+const HEARD_BYTES: usize = 1024;
 
 impl End {
     /// What a robot did that ended like this, if none of ours would do that. (A flood has been noticed before.)
@@ -34,6 +36,13 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
             Verdict::Cut(_) => return Err(End::Flood),
         }
         Ok(())
+    }
+
+    /// Whoever sends a large packet over a slow way is not silent meanwhile.
+    pub(super) fn hear_progress(&mut self) {
+        if self.input.len() >= self.heard_bytes + HEARD_BYTES {
+            (self.heard_at, self.heard_bytes) = (Instant::now(), self.input.len());
+        }
     }
 
     /// A robot's subscription to what is not for it is refused.

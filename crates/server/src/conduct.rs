@@ -21,6 +21,8 @@ const MAX_DEBT: Duration = Duration::from_secs(10);
 const MAX_HELD: Duration = Duration::from_secs(2);
 /// How often the time that a robot has to stay away doubles.
 const MAX_DOUBLINGS: u32 = 6;
+/// How many more requests a robot may make for what it brings back: a run has up to 256 files, each of which takes some.
+const OUTPUT_REQUESTS: u64 = 10;
 /// What beginning a session costs, in messages.
 pub const SESSION_COST: u64 = 10;
 
@@ -31,7 +33,7 @@ pub struct ConductLimits {
     pub messages_per_s: u64,
     /// Bytes a second over MQTT, likewise; all of them count.
     pub bytes_per_s: u64,
-    /// Requests a second, likewise, those for a package's bytes excepted.
+    /// Requests a second, likewise, those for a package's bytes excepted; and ten times as many for what it brings back.
     pub requests_per_s: u64,
     /// How long it is slowed before it is cut off.
     pub patience: Duration,
@@ -74,6 +76,8 @@ pub enum Way {
     Mqtt,
     /// Requests.
     Http,
+    /// Requests by which it brings back what its runs have made.
+    Outputs,
 }
 
 /// What to do with whoever has just sent something.
@@ -113,6 +117,7 @@ pub struct Watched {
 struct Record {
     mqtt: Allowance,
     http: Allowance,
+    outputs: Allowance,
     trouble: Option<Trouble>,
 }
 
@@ -196,6 +201,7 @@ impl Record {
         Self {
             mqtt: allowance(limits.messages_per_s, Some(limits.bytes_per_s)),
             http: allowance(limits.requests_per_s, None),
+            outputs: allowance(limits.requests_per_s.saturating_mul(OUTPUT_REQUESTS), None),
             trouble: None,
         }
     }
@@ -204,7 +210,12 @@ impl Record {
         match way {
             Way::Mqtt => &mut self.mqtt,
             Way::Http => &mut self.http,
+            Way::Outputs => &mut self.outputs,
         }
+    }
+
+    fn ways(&self) -> impl Iterator<Item = &Allowance> {
+        [&self.mqtt, &self.http, &self.outputs].into_iter()
     }
 
     /// Notes that it was slowed. Whether that is news.
@@ -288,7 +299,7 @@ impl Conduct {
                 record.trouble = None;
                 forgiven.push(robot.clone());
             }
-            let is_nothing = record.trouble.is_none() && record.mqtt.is_at_rest(now) && record.http.is_at_rest(now);
+            let is_nothing = record.trouble.is_none() && record.ways().all(|allowance| allowance.is_at_rest(now));
             drop(record);
             // Whoever holds it would go on with a record that nobody else sees.
             !(is_nothing && Arc::strong_count(shared) == 1)
@@ -362,7 +373,7 @@ impl Watched {
     fn flood(&self) -> Offence {
         match self.way {
             Way::Mqtt => Offence::Messages,
-            Way::Http => Offence::Requests,
+            Way::Http | Way::Outputs => Offence::Requests,
         }
     }
 }

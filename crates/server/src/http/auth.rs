@@ -22,6 +22,7 @@ use tokio::time::{Instant, timeout_at};
 use super::App;
 use super::conduct::hold_up;
 use super::error::{ApiError, ROBOT_REVOKED};
+use crate::conduct::Way;
 use crate::gatekeeper::ended_others;
 use crate::person::Person;
 use crate::store::{Admitted, StoreError, TokenHolder};
@@ -133,10 +134,11 @@ pub(super) async fn guard(
             if let Caller::Person(person) = &mut caller {
                 person.address = Some(peer.ip().to_canonical());
             }
-            if let (Access::OwnRobot, Caller::Robot(robot)) = (gate.access, &caller)
-                && let Err(error) = hold_up(&gate.app, robot, request.method()).await
+            if let Caller::Robot(robot) = &caller
+                && let Some(way) = way_of(gate.access, request.method())
+                && let Err(error) = hold_up(&gate.app, robot, way, request.method()).await
             {
-                return error.into_response();
+                return if is_oci { error.into_oci_response() } else { error.into_response() };
             }
             request.extensions_mut().insert(caller);
             request.extensions_mut().insert(token_number);
@@ -150,6 +152,15 @@ pub(super) async fn guard(
         let message = "the request took too long to arrive or to be answered";
         ApiError::new(StatusCode::REQUEST_TIMEOUT, "timeout", message).into_response()
     })
+}
+
+/// By which way a robot that asks for this comes; none if it pulls a package's bytes, which has limits of its own.
+fn way_of(access: Access, method: &Method) -> Option<Way> {
+    match access {
+        Access::OwnRobot => Some(Way::Http),
+        Access::PersonOrRobot if *method != Method::GET => Some(Way::Outputs),
+        _ => None,
+    }
 }
 
 /// The handler's answer. What changes something goes on to its end even if nobody waits for it any more: what is done after a

@@ -10,9 +10,9 @@ use super::error::ApiError;
 use crate::conduct::{Verdict, Way};
 
 /// Waits until it is the robot's turn; an error says when it is.
-pub(super) async fn hold_up(app: &App, robot: &RobotId, method: &Method) -> Result<(), ApiError> {
+pub(super) async fn hold_up(app: &App, robot: &RobotId, way: Way, method: &Method) -> Result<(), ApiError> {
     let now = Instant::now();
-    let watched = app.conduct.watch(robot, Way::Http, now);
+    let watched = app.conduct.watch(robot, way, now);
     // Whoever only asks is told what to do, as often as it is its turn.
     if *method != Method::GET
         && let Some(until) = watched.barred_until(now)

@@ -125,6 +125,26 @@ async fn who_reports_too_often_is_cut_off_and_still_told_what_to_do() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn who_pushes_too_often_is_held_up_and_may_still_report() {
+    let limits = ConductLimits { requests_per_s: 2, ..ConductLimits::default() };
+    let server = server(limits).await;
+    let mut atlas = server.enroll("atlas").await;
+    let path = format!("/v2/outputs/{}/mapping/blobs/uploads/{}", atlas.id, "0".repeat(16));
+    let push = || server.bare(Method::PATCH, &path).bearer_auth(&atlas.token).body("").send();
+    // A run's files go at once: ten seconds' worth of ten times as many as other requests.
+    for _ in 0..200 {
+        assert_eq!(push().await.expect("an answer").status(), 404);
+    }
+    let many = futures_util::future::join_all((0..100).map(|_| push())).await;
+    let refused = many.into_iter().map(|answer| answer.expect("an answer")).find(|answer| answer.status() == 429);
+    let refused = refused.expect("it may push as often as it likes");
+    assert!(refused.headers().contains_key("retry-after"));
+    assert!(refused.text().await.expect("text").contains("TOOMANYREQUESTS"));
+    let state = server.desired(&atlas).await;
+    assert_eq!(server.report(&mut atlas, &state, Phase::Running).await.status(), 200);
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn who_behaves_again_is_forgiven_by_itself() {
     let limits = ConductLimits {
         requests_per_s: 2,

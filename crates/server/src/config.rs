@@ -65,7 +65,8 @@ pub struct Config {
     pub max_http_connections: usize,
     /// The most MQTT connections at once; more are refused.
     pub max_mqtt_connections: usize,
-    /// The most connections of one address that have said nothing yet, at each listener; the oldest is closed for a further one.
+    /// The most connections of one address that have shown no good token yet, over MQTT sent no CONNECT; the oldest is closed for a
+    /// further one.
     pub max_silent_per_address: usize,
     /// The addresses of reverse proxies that are believed about where a request came from.
     pub trusted_proxies: Vec<IpAddr>,

@@ -414,6 +414,7 @@ fn http_limits(config: &Config) -> listener::Limits {
     listener::Limits {
         max_connections: config.max_http_connections,
         max_silent_per_address: config.max_silent_per_address,
+        proxies: config.trusted_proxies.clone().into(),
         handshake_timeout: HANDSHAKE_TIMEOUT,
     }
 }

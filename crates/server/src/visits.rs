@@ -20,6 +20,7 @@ pub struct Visits {
 #[derive(Debug, Clone, Default)]
 pub struct Line {
     cut: CancellationToken,
+    vouched: CancellationToken,
     bytes_out: Arc<AtomicU64>,
     /// The robot that came by it last.
     visit: Arc<Mutex<Option<Visit>>>,
@@ -97,6 +98,16 @@ impl Line {
     /// Cuts it, in the middle of whatever it carries.
     pub fn end(&self) {
         self.cut.cancel();
+    }
+
+    /// A good token was shown on it.
+    pub fn vouch(&self) {
+        self.vouched.cancel();
+    }
+
+    /// Resolves when one was.
+    pub async fn vouched(&self) {
+        self.vouched.cancelled().await;
     }
 
     /// Resolves when the connection has to end.

@@ -194,7 +194,7 @@ pub(super) const SETTINGS: &[Setting] = &[
     Setting {
         name: "max-silent-per-address",
         value_name: "N",
-        help: "Most connections of one address that have sent nothing yet [default: 2048]",
+        help: "Most connections of one address without a good token so far, over MQTT without CONNECT [default: 2048]",
         set: |config, text| count(text, 1_000_000).map(|n| config.max_silent_per_address = n as usize),
     },
     Setting {

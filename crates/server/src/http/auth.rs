@@ -293,6 +293,9 @@ async fn let_in(
         let Some(Admitted { holder, is_first_use }) = app.store.admit(&token, &proof, now_ms).await? else {
             return Ok(None);
         };
+        if let Some(line) = line.as_ref().filter(|_| !matches!(holder, TokenHolder::Pending { .. })) {
+            line.vouch();
+        }
         if let TokenHolder::Robot { robot, .. } = &holder
             && is_first_use
         {

@@ -3,9 +3,9 @@
 
 use std::convert::Infallible;
 use std::io;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::pin::{Pin, pin};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 use std::task::{Context, Poll, ready};
 use std::time::{Duration, Instant};
 
@@ -32,6 +32,8 @@ use crate::anteroom::{Anteroom, Place};
 use crate::tls::{ClientProof, Tls};
 use crate::visits::Line;
 
+/// How long a connection on which no good token was shown is left when its place is needed: enough to sign in, or to get a page.
+const GRACE: Duration = Duration::from_secs(3);
 /// How long a request's head may take, also the first one of a connection, and how long one is kept without a request.
 const HEAD_TIMEOUT: Duration = Duration::from_secs(20);
 /// How long a client may pause within a body it sends.
@@ -44,12 +46,15 @@ const MOST_HEAD_BYTES: usize = 64 * 1024;
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
 /// How many connections there may be.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub struct Limits {
-    /// At a time; when there are as many, those without a request end, and more wait in the listener's backlog.
+    /// At a time; when there are as many, those without a request end, those without a good token in any case, and more wait
+    /// in the listener's backlog.
     pub max_connections: usize,
-    /// Those of one address that have not sent a request yet; a further one takes the place of the oldest.
+    /// Those of one address on which no good token was shown yet; a further one takes the place of the oldest.
     pub max_silent_per_address: usize,
+    /// Whose connections are many clients': they count as silent until their first request, and end between requests only.
+    pub proxies: Arc<[IpAddr]>,
     /// How long a TLS handshake may take.
     pub handshake_timeout: Duration,
 }
@@ -60,6 +65,7 @@ struct Site {
     /// What they speak, if they are encrypted.
     tls: Option<Tls>,
     handshake_timeout: Duration,
+    proxies: Arc<[IpAddr]>,
     traffic: Arc<HttpTotals>,
     stop: CancellationToken,
     /// Ends what `stop` did not end in time.
@@ -91,8 +97,8 @@ pub async fn serve(
     let anteroom = Anteroom::new(limits.max_silent_per_address);
     let connections = TaskTracker::new();
     let abort = CancellationToken::new();
-    let handshake_timeout = limits.handshake_timeout;
-    let site = Arc::new(Site { router, tls, handshake_timeout, traffic, stop, abort: abort.clone() });
+    let Limits { handshake_timeout, proxies, .. } = limits;
+    let site = Arc::new(Site { router, tls, handshake_timeout, proxies, traffic, stop, abort: abort.clone() });
     loop {
         let (stream, peer, place) = tokio::select! {
             () = site.stop.cancelled() => break,
@@ -136,7 +142,7 @@ impl Site {
         let Some(tls) = &self.tls else { return };
         let shaken = tokio::select! {
             shaken = timeout(self.handshake_timeout, tls.accept(self.patient(stream, guest.line.clone()))) => shaken,
-            () = guest.silent.leave().cancelled() => return,
+            () = gives_way(&guest.silent, guest.crowded.clone()) => return,
             () = self.stop.cancelled() => return,
         };
         // Whoever speaks no TLS, or none that counts, is no event worth a line in the log.
@@ -151,21 +157,30 @@ impl Site {
         S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
     {
         let Guest { peer, silent, proof, crowded, line } = guest;
-        let (leave, spoken) = (silent.leave().clone(), CancellationToken::new());
+        let (spoken, is_proxy) = (CancellationToken::new(), self.proxies.contains(&peer.ip().to_canonical()));
         let (router, traffic) = (self.router.clone(), self.traffic.clone());
         let origin = Origin { peer, proof, line: line.clone() };
-        let mut connection = pin!(connection(stream, origin, silent, spoken.clone(), router, traffic));
+        let mut connection = pin!(connection(stream, origin, spoken.clone(), router, traffic));
+        let stranger = async {
+            tokio::select! {
+                () = line.vouched() => {}
+                () = spoken.cancelled(), if is_proxy => {}
+                () = gives_way(&silent, crowded.clone()) => return,
+            }
+            drop(silent);
+            std::future::pending().await
+        };
         let ended = async {
             tokio::select! {
                 _ = connection.as_mut() => return,
-                () = asked_to_end(&self.stop, spoken, crowded) => connection.as_mut().graceful_shutdown(),
+                () = asked_to_end(&self.stop, &spoken, crowded.clone()) => connection.as_mut().graceful_shutdown(),
             }
             // A client that breaks off or dawdles is no event worth a line in the log.
             let _ = connection.await;
         };
         tokio::select! {
             () = ended => {}
-            () = leave.cancelled() => {}
+            () = stranger => {}
             () = line.cut() => {}
             () = self.abort.cancelled() => {}
         }
@@ -200,17 +215,35 @@ impl Places {
 
 /// Resolves when a connection has to end as soon as it has no request: the server stops, or the places are needed and this
 /// one has had its turn.
-async fn asked_to_end(stop: &CancellationToken, spoken: CancellationToken, mut crowded: watch::Receiver<bool>) {
+async fn asked_to_end(stop: &CancellationToken, spoken: &CancellationToken, crowded: watch::Receiver<bool>) {
     let needed = async {
         spoken.cancelled().await;
-        if crowded.wait_for(|crowded| *crowded).await.is_err() {
-            // Nobody takes places any more.
-            std::future::pending().await
-        }
+        needed(crowded).await;
     };
     tokio::select! {
         () = stop.cancelled() => {}
         () = needed => {}
+    }
+}
+
+/// Resolves when a connection on which no good token was shown has to go, whatever it does: a neighbour needs its place, or
+/// anybody does. What it could do would otherwise take as long as whoever is behind it likes.
+async fn gives_way(silent: &Place, crowded: watch::Receiver<bool>) {
+    let needed = async {
+        needed(crowded).await;
+        tokio::time::sleep(GRACE).await;
+    };
+    tokio::select! {
+        () = silent.leave().cancelled() => {}
+        () = needed => {}
+    }
+}
+
+/// Resolves when the places are needed.
+async fn needed(mut crowded: watch::Receiver<bool>) {
+    if crowded.wait_for(|crowded| *crowded).await.is_err() {
+        // Nobody takes places any more.
+        std::future::pending().await
     }
 }
 
@@ -251,7 +284,6 @@ impl Origin {
 fn connection<S>(
     stream: S,
     origin: Origin,
-    silent: Place,
     spoken: CancellationToken,
     router: Router,
     traffic: Arc<HttpTotals>,
@@ -262,10 +294,8 @@ fn connection<S>(
 where
     S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
 {
-    let silent = Mutex::new(Some(silent));
     let service = hyper::service::service_fn(move |request: Request<Incoming>| {
         spoken.cancel();
-        drop(silent.lock().unwrap_or_else(PoisonError::into_inner).take());
         traffic.request();
         let mut request = request.map(|body| Body::new(PatientBody::new(body)));
         origin.mark(&mut request);

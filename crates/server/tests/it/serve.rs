@@ -14,7 +14,7 @@ use taskd::clock::Clock;
 use taskd::config::Config;
 use taskd::serve::{ServeError, Server};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
-use tokio::net::TcpStream;
+use tokio::net::{TcpSocket, TcpStream};
 
 use crate::harness::{TestServer, answer};
 use crate::mqtt_harness::{Connect, Raw, publish, topic};
@@ -109,6 +109,69 @@ async fn a_stop_under_load_loses_no_report_that_was_answered() {
         let phase = server.robot(&robot).await.tasks[0].phase;
         assert!(!was_stored || phase == Phase::Running, "{}: {phase}", robot.id);
     }
+}
+
+/// A socket that begins to send a login and goes on with it for ever.
+async fn trickling_login(address: &str) -> TcpStream {
+    let mut stream = TcpStream::connect(address).await.expect("connects");
+    let head =
+        b"POST /api/v1/login HTTP/1.1\r\nhost: x\r\ncontent-type: application/json\r\ncontent-length: 99\r\n\r\n{";
+    stream.write_all(head).await.expect("written");
+    stream
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn strangers_that_trickle_do_not_keep_out_who_has_a_token() {
+    let directory = tempfile::TempDir::new().expect("a directory");
+    let server = TestServer::start_in(directory, |config| config.max_http_connections = 8).await;
+    let address = server.server.addresses().http.clone();
+    let mut strangers = Vec::new();
+    for _ in 0..12 {
+        strangers.push(trickling_login(&address).await);
+    }
+    let elsewhere = TcpSocket::new_v4().expect("a socket");
+    elsewhere.bind(([127, 0, 0, 2], 0).into()).expect("bound");
+    let mut asks = elsewhere.connect(address.parse().expect("an address")).await.expect("connects");
+    let token = server.operator.reveal();
+    let request = format!("GET /api/v1/server HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {token}\r\n\r\n");
+    asks.write_all(request.as_bytes()).await.expect("written");
+    let mut first = [0; 12];
+    // Sooner than a body may pause.
+    let answer = tokio::time::timeout(Duration::from_secs(20), asks.read_exact(&mut first)).await;
+    answer.expect("in time").expect("an answer");
+    assert_eq!(&first, b"HTTP/1.1 200");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn who_has_shown_no_token_counts_against_its_address_whatever_it_sends() {
+    let directory = tempfile::TempDir::new().expect("a directory");
+    let server = TestServer::start_in(directory, |config| config.max_silent_per_address = 1).await;
+    let address = server.server.addresses().http.clone();
+    let token = server.operator.reveal();
+    let request = format!("GET /api/v1/server HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {token}\r\n\r\n");
+    let mut known = TcpStream::connect(&address).await.expect("connects");
+    known.write_all(request.as_bytes()).await.expect("written");
+    let mut oldest = trickling_login(&address).await;
+    let newcomers = async {
+        let (mut ticks, mut all) = (tokio::time::interval(Duration::from_millis(200)), Vec::new());
+        loop {
+            ticks.tick().await;
+            all.push(trickling_login(&address).await);
+        }
+    };
+    let mut rest = Vec::new();
+    let ended = tokio::time::timeout(Duration::from_secs(20), async {
+        tokio::select! {
+            ended = oldest.read_to_end(&mut rest) => ended,
+            () = newcomers => unreachable!("they go on coming"),
+        }
+    });
+    // A reset is an end as well.
+    let _ = ended.await.expect("the connection ends");
+    // The one that has shown its token is older, and stays.
+    known.write_all(request.replace("host", "connection: close\r\nhost").as_bytes()).await.expect("written");
+    known.read_to_end(&mut rest).await.expect("answers");
+    assert_eq!(String::from_utf8_lossy(&rest).matches("HTTP/1.1 200").count(), 2);
 }
 
 #[tokio::test(flavor = "multi_thread")]

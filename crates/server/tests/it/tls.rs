@@ -467,7 +467,8 @@ async fn listener(limits: Limits) -> (SocketAddr, tokio_util::sync::DropGuard, T
 #[tokio::test(flavor = "multi_thread")]
 async fn the_oldest_silent_connection_gives_way_during_its_handshake() {
     const HOUR: Duration = Duration::from_secs(3600);
-    let limits = Limits { max_connections: 1000, max_silent_per_address: 1, handshake_timeout: HOUR };
+    let limits =
+        Limits { max_connections: 1000, max_silent_per_address: 1, proxies: [].into(), handshake_timeout: HOUR };
     let (http, _stop, _directory) = listener(limits).await;
     let broker = crate::mqtt_harness::TestBroker::encrypted(|limits| {
         (limits.max_silent_per_address, limits.connect_timeout) = (1, HOUR);
@@ -498,8 +499,13 @@ async fn the_oldest_silent_connection_gives_way_during_its_handshake() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_silent_socket_and_a_slow_handshake_end_by_themselves() {
     let hasty = Duration::from_millis(200);
-    let (http, _stop, _directory) =
-        listener(Limits { max_connections: 1, max_silent_per_address: 10, handshake_timeout: hasty }).await;
+    let (http, _stop, _directory) = listener(Limits {
+        max_connections: 1,
+        max_silent_per_address: 10,
+        proxies: [].into(),
+        handshake_timeout: hasty,
+    })
+    .await;
     let broker = crate::mqtt_harness::TestBroker::encrypted(|limits| {
         (limits.connect_timeout, limits.max_connections) = (hasty, 1);
     })

@@ -40,6 +40,7 @@ pub mod permanent_address;
 pub mod plan;
 pub mod process;
 pub mod readiness;
+pub mod recent;
 pub mod rotation;
 pub mod run_dir;
 pub mod script;

@@ -1,7 +1,6 @@
 //! Questions that change something are believed only if the server signed them, for this robot and this start of its agent,
 //! and once: whoever passes messages on may repeat what was said, or say something itself. It never does what is asked.
 
-use std::collections::{HashSet, VecDeque};
 use std::sync::{Mutex, PoisonError};
 
 use task_proto::RobotId;
@@ -10,6 +9,7 @@ use task_proto::id::{InstanceId, RequestId};
 use task_proto::request::{ACTION_TYPE, Action, Ask, Refusal, Request};
 
 use crate::answers::refusal;
+use crate::recent::Recent;
 
 /// How many of those that were done are known; people ask them one by one.
 const KNOWN: usize = 10_000;
@@ -19,14 +19,7 @@ pub struct Orders {
     robot_id: RobotId,
     instance: InstanceId,
     server_key: PublicKey,
-    done: Mutex<Done>,
-}
-
-#[derive(Default)]
-struct Done {
-    known: HashSet<RequestId>,
-    /// The oldest first.
-    order: VecDeque<RequestId>,
+    done: Mutex<Recent<RequestId, KNOWN>>,
 }
 
 impl Orders {
@@ -50,25 +43,10 @@ impl Orders {
             return Err(unsigned("it was signed for another robot, start of its agent, or question"));
         }
         let mut done = self.done.lock().unwrap_or_else(PoisonError::into_inner);
-        if !done.is_new(action.id) {
+        if !done.see(action.id) {
             return Err(unsigned("it was asked before"));
         }
         Ok(action.ask)
-    }
-}
-
-impl Done {
-    fn is_new(&mut self, id: RequestId) -> bool {
-        let is_new = self.known.insert(id.clone());
-        if is_new {
-            self.order.push_back(id);
-        }
-        if self.order.len() > KNOWN
-            && let Some(oldest) = self.order.pop_front()
-        {
-            self.known.remove(&oldest);
-        }
-        is_new
     }
 }
 

@@ -1,7 +1,6 @@
 //! What a stored line says: its level, its node, its text. Nodes say most things twice, on `/rosout` and on their
 //! standard error; the second is known by the node's own time. It reads no file.
 
-use std::collections::{HashSet, VecDeque};
 use std::path::PathBuf;
 
 use task_proto::TaskName;
@@ -9,6 +8,7 @@ use task_proto::log::{LogLine, LogSource};
 
 use super::console;
 use super::record::Record;
+use crate::recent::Recent;
 
 /// Lines among which the second of two is looked for.
 const TWIN_WINDOW: usize = 4096;
@@ -43,10 +43,7 @@ struct Mark {
 
 /// The messages of nodes that were seen lately.
 #[derive(Debug, Default)]
-pub struct Twins {
-    known: HashSet<(Mark, LogSource)>,
-    order: VecDeque<(Mark, LogSource)>,
-}
+pub struct Twins(Recent<(Mark, LogSource), TWIN_WINDOW>);
 
 impl Entry {
     /// What `record` of `file` says; `None` if it says nothing. `at_ms` is for a record without a time.
@@ -99,18 +96,10 @@ impl Twins {
         let Some(mark) = &entry.mark else { return false };
         let others = [LogSource::Stdout, LogSource::Stderr, LogSource::Rosout].into_iter();
         let mut others = others.filter(|source| *source != entry.line.source);
-        if others.any(|source| self.known.contains(&(mark.clone(), source))) {
+        if others.any(|source| self.0.contains(&(mark.clone(), source))) {
             return true;
         }
-        let seen = (mark.clone(), entry.line.source);
-        if self.known.insert(seen.clone()) {
-            self.order.push_back(seen);
-        }
-        if self.order.len() > TWIN_WINDOW
-            && let Some(oldest) = self.order.pop_front()
-        {
-            self.known.remove(&oldest);
-        }
+        self.0.see((mark.clone(), entry.line.source));
         false
     }
 }
@@ -150,10 +139,5 @@ mod tests {
             assert!(!twins.knows(first) && !twins.knows(first), "two messages in one nanosecond");
             assert!(twins.knows(second) && !twins.knows(&other));
         }
-        let mut twins = Twins::default();
-        for number in 0..2 * TWIN_WINDOW {
-            assert!(!twins.knows(&entry(&format!("[INFO] [{number}.0] [talker]: tick")).unwrap()));
-        }
-        assert_eq!((twins.known.len(), twins.order.len()), (TWIN_WINDOW, TWIN_WINDOW));
     }
 }

@@ -1,0 +1,54 @@
+//! What was seen lately: a set that holds so many and forgets the oldest. It decides nothing.
+
+use std::collections::{HashSet, VecDeque};
+use std::hash::Hash;
+
+/// The last `MAX` different ones that were seen.
+#[derive(Debug)]
+pub struct Recent<T, const MAX: usize> {
+    known: HashSet<T>,
+    /// The oldest first.
+    order: VecDeque<T>,
+}
+
+impl<T, const MAX: usize> Default for Recent<T, MAX> {
+    fn default() -> Self {
+        Self { known: HashSet::new(), order: VecDeque::new() }
+    }
+}
+
+impl<T: Clone + Eq + Hash, const MAX: usize> Recent<T, MAX> {
+    /// Whether it was seen lately.
+    pub fn contains(&self, one: &T) -> bool {
+        self.known.contains(one)
+    }
+
+    /// It was seen. Whether that is new.
+    pub fn see(&mut self, one: T) -> bool {
+        let is_new = self.known.insert(one.clone());
+        if is_new {
+            self.order.push_back(one);
+        }
+        if self.order.len() > MAX
+            && let Some(oldest) = self.order.pop_front()
+        {
+            self.known.remove(&oldest);
+        }
+        is_new
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_oldest_is_forgotten_and_what_comes_again_is_not_new() {
+        let mut recent = Recent::<u32, 3>::default();
+        for number in 0..9 {
+            assert!(recent.see(number) && !recent.see(number) && recent.contains(&number));
+        }
+        assert!(!recent.contains(&5) && recent.contains(&6) && recent.contains(&8));
+        assert_eq!((recent.known.len(), recent.order.len()), (3, 3));
+    }
+}

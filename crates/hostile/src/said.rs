@@ -6,7 +6,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use task_proto::log::LogBatch;
 use task_proto::part::{Cut, MAX_PARTS, Part};
-use task_proto::report::{Phase, Report, Status};
+use task_proto::report::{Condition, Phase, Report, Status};
 use task_proto::request::{Reply, Request};
 use taskd::deployment::Standing;
 
@@ -14,16 +14,23 @@ use taskd::deployment::Standing;
 pub fn report(bytes: &[u8]) {
     same_again::<Status>(bytes);
     same_again::<LogBatch>(bytes);
-    let Some(report) = same_again::<Report>(bytes) else { return };
+    let Some(report) = same_again::<Report>(bytes).map(Report::tidied) else { return };
+    for Condition { code, text } in &report.conditions {
+        is_clean(code);
+        is_clean(text);
+    }
     for task in &report.tasks {
         for phase in Phase::ALL {
             let standing = Standing { run: task.run, phase, progress: None, failure: None, attempts: 0 };
             let Some(next) = standing.after(task) else { continue };
             assert!(!phase.is_final(), "{phase:?} was left");
-            let text = next.failure.map(|failure| failure.to_string()).unwrap_or_default();
-            assert!(!text.contains(|c: char| c.is_control() && c != '\n'), "{text:?} has a control character");
+            is_clean(&next.failure.map(|failure| failure.to_string()).unwrap_or_default());
         }
     }
+}
+
+fn is_clean(text: &str) {
+    assert!(!text.contains(|c: char| c.is_control() && c != '\n'), "{text:?} has a control character");
 }
 
 /// A question to a robot, or its answer.

@@ -39,8 +39,7 @@ impl Standing {
             run: self.run,
             phase: report.phase,
             progress: report.progress,
-            // Made anew, because a robot's text is not yet free of control characters.
-            failure: report.failure.clone().map(|failure| Failure::new(failure.code, failure.text)),
+            failure: report.failure.clone(),
             attempts: report.attempts,
         };
         (next != *self).then_some(next)
@@ -84,7 +83,6 @@ pub fn state(kind: TaskKind, cancelled: bool, paused: bool, counts: &[PhaseCount
 mod tests {
     use proptest::prelude::*;
     use task_proto::desired::{BlobRef, PackageRef, Wanted};
-    use task_proto::report::FailureCode;
     use task_proto::{DeploymentId, Digest};
 
     use super::*;
@@ -142,14 +140,6 @@ mod tests {
             let gone = !from.is_final() && removed.is_some_and(|removed| removed <= observed);
             prop_assert_eq!(next.map(|next| next.phase), gone.then_some(Phase::Stopped));
         }
-    }
-
-    #[test]
-    fn a_failure_from_a_robot_is_cleaned() {
-        let mut said = report(1, Phase::Failed);
-        said.failure = Some(Failure { code: FailureCode::BUILD_FAILED, text: "a\u{1b}[31mb".to_owned() });
-        let failure = standing(1, Phase::Building).after(&said).and_then(|next| next.failure).expect("failed");
-        assert_eq!(failure.text, "a [31mb");
     }
 
     #[test]

@@ -59,3 +59,22 @@ fn fact(text: &str) -> String {
 pub(super) fn clean(text: &str, max_chars: usize) -> String {
     text.chars().map(|c| if c.is_control() && c != '\n' { ' ' } else { c }).take(max_chars).collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Failure, FailureCode};
+    use super::*;
+
+    #[test]
+    fn a_failure_from_a_robot_is_cleaned() {
+        let mut report: Report =
+            serde_json::from_str(include_str!("../../tests/golden/report.json")).expect("a report");
+        let text = "a\u{1b}[31mb\n".repeat(MAX_FAILURE_CHARS);
+        let said = Failure { code: FailureCode::BUILD_FAILED, text };
+        (report.tasks[0].failure, report.tasks[0].degraded) = (Some(said.clone()), Some(said.clone()));
+        let kept = Failure::new(said.code, said.text);
+        assert!(kept.text.starts_with("a [31mb\n") && kept.text.chars().count() == MAX_FAILURE_CHARS);
+        let task = report.tidied().tasks.swap_remove(0);
+        assert_eq!((task.failure, task.degraded), (Some(kept.clone()), Some(kept)));
+    }
+}

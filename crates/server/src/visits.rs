@@ -1,5 +1,6 @@
 //! The connections by which robots came in over HTTP, so that those of a robot that may no more, or came by a token that
-//! has ended, end at once, in the middle of a download or of what it sends. It decides nothing.
+//! has ended, end at once, in the middle of a download or of what it sends. Of each it knows whether a good token was shown
+//! on it, and how much it took. It decides nothing.
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicU64, Ordering};

@@ -1,5 +1,6 @@
 //! Robots that pull blobs over HTTP: how many at once, how fast together, and who is next. A robot that has to wait does so
-//! for a moment; then it is told when to come back, and keeps its place. It knows no blobs and no answers.
+//! for a moment; then it is told when to come back, and keeps its place. One that takes next to nothing while others wait is
+//! cut off. It knows no blobs and no answers.
 
 mod body;
 mod pace;

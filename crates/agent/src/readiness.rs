@@ -88,6 +88,16 @@ struct Shortfall {
     certain: bool,
 }
 
+impl Shortfall {
+    /// A name that somebody else has, in words that stand alone.
+    fn as_taken(&self) -> String {
+        match &self.item {
+            Item::Alone(name) => format!("`{name}` is already on the graph: {}", self.seen),
+            _ => self.what.clone(),
+        }
+    }
+}
+
 /// How long a shortfall has lasted.
 #[derive(Debug, Clone)]
 struct Lasting {
@@ -138,8 +148,7 @@ impl Promise {
 
     /// Why the run can't be started: a living process has one of its names already.
     pub fn taken(&self, snapshot: &Snapshot, others: &BTreeMap<ParticipantId, String>) -> Option<Failure> {
-        let foreign = self.foreign(snapshot, others);
-        let texts: Vec<&str> = foreign.iter().map(|shortfall| shortfall.what.as_str()).collect();
+        let texts: Vec<String> = self.foreign(snapshot, others).iter().map(Shortfall::as_taken).collect();
         (!texts.is_empty()).then(|| Failure::new(FailureCode::NODE_NAME_TAKEN, texts.join("; ")))
     }
 
@@ -154,18 +163,18 @@ impl Promise {
     fn foreign(&self, snapshot: &Snapshot, others: &BTreeMap<ParticipantId, String>) -> Vec<Shortfall> {
         let nodes = self.nodes.iter().filter_map(|name| {
             let whose = snapshot.named(name).find_map(|node| others.get(&node.participant))?;
-            Some((name, format!("`{name}` is already on the graph: {whose} has a node of that name")))
+            Some((name, format!("{whose} has a node of that name")))
         });
         let services = self.services.iter().filter_map(|name| {
             let offered = |node: &Node| Some((node.name.clone(), others.get(&node.participant)?));
             let (node, whose) = snapshot.servers_of(name).find_map(offered)?;
-            Some((name, format!("`{name}` is already on the graph: `{node}` of {whose} offers that service")))
+            Some((name, format!("`{node}` of {whose} offers that service")))
         });
-        let taken = |(name, what): (&GraphName, String)| Shortfall {
+        let taken = |(name, seen): (&GraphName, String)| Shortfall {
             item: Item::Alone(name.clone()),
             code: FailureCode::NODE_NAME_TAKEN,
-            what,
-            seen: String::new(),
+            what: format!("`{name}` was not free"),
+            seen,
             certain: false,
         };
         nodes.chain(services).map(taken).collect()
@@ -343,9 +352,10 @@ impl Readiness {
             let item = shortfall.item.clone();
             let mut lasting = before.get(&item).cloned().unwrap_or(Lasting { since_ms: now_ms, said: None });
             let needed_ms = match item {
+                // Nothing becomes ready while anything is in doubt.
+                _ if !self.was_ready || shortfall.certain => 0,
                 Item::Alone(_) => FOREIGN_MS,
-                _ if self.was_ready && !shortfall.certain => GRACE_MS,
-                _ => 0,
+                _ => GRACE_MS,
             };
             if now_ms.saturating_sub(lasting.since_ms) >= needed_ms {
                 let said = lasting.said.take().filter(|_| self.was_ready).unwrap_or(shortfall);
@@ -355,9 +365,7 @@ impl Readiness {
             self.lasting.insert(item, lasting);
         }
         let stumbled = self.nodes.values().find_map(|node| node.refused().cloned());
-        let taken = counted.iter().find(|shortfall| matches!(shortfall.item, Item::Alone(_)));
-        let taken = taken.map(|shortfall| Failure::new(shortfall.code.clone(), &shortfall.what));
-        let refused = taken.or(stumbled);
+        let refused = self.taken(now_ms).or(stumbled);
         if matches!(self.health, Health::Refused(_)) {
             return;
         }
@@ -375,6 +383,13 @@ impl Readiness {
                 Health::Holds { since_ms }
             }
         };
+    }
+
+    /// A name that somebody else has had for long enough.
+    fn taken(&self, now_ms: u64) -> Option<Failure> {
+        let mut names = self.lasting.iter().filter(|(item, _)| matches!(item, Item::Alone(_)));
+        let (_, lasting) = names.find(|(_, lasting)| now_ms.saturating_sub(lasting.since_ms) >= FOREIGN_MS)?;
+        lasting.said.as_ref().map(|shortfall| Failure::new(shortfall.code.clone(), shortfall.as_taken()))
     }
 
     fn missing(&self, counted: &[Shortfall], now_ms: u64) -> Option<Health> {

@@ -156,8 +156,13 @@ fn a_name_that_a_living_stranger_has_is_taken() {
     assert_eq!(promise.taken(&stage.snapshot, &BTreeMap::new()), None);
 
     stage.add(OURS, "/mapper", &["/map"], &[]);
-    assert!(matches!(stage.after(0), Health::Holds { .. }));
-    assert!(refused(&stage.after(FOREIGN_MS)).starts_with("node_name_taken"));
+    assert_eq!(
+        missing(&stage.after(0)).not_within(8).text,
+        "`/mapper` was not free, `/map` was not free within 8 s; a neighbour has a node of that name; \
+         `/mapper` of a neighbour offers that service"
+    );
+    missing(&stage.after(FOREIGN_MS - 1));
+    assert!(refused(&stage.after(1)).starts_with("node_name_taken"));
     // It stays refused, also once the stranger has left.
     stage.remove(OTHER);
     refused(&stage.after(5000));

@@ -3,7 +3,8 @@
 use task_proto::api::RobotView;
 use task_proto::report::{Failure, Isolation, Phase};
 
-use crate::harness::{Fleet, Robot, Server, TASK_USER, eventually, open_directory, processes_with, write_package};
+use crate::harness::{Fleet, Robot, Server, TASK_USER, eventually, open_directory, write_package};
+use crate::leftovers::processes_with;
 
 async fn failure_of(server: &Server, task: &str, phase: Phase) -> Failure {
     let view = server.wait_phase("robot-1", task, phase).await;

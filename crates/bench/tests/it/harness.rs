@@ -2,17 +2,14 @@
 //! It asks them only through their public faces: commands, the HTTP API, files an operator may read.
 #![expect(clippy::disallowed_methods, reason = "a test harness starts processes")]
 
-use std::collections::BTreeSet;
 use std::ffi::OsStr;
 use std::fs::File;
 use std::net::SocketAddr;
-use std::os::fd::AsFd as _;
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
-use nix::poll::{PollFd, PollFlags};
 use nix::sys::signal::Signal;
 use rand::{RngExt as _, SeedableRng as _};
 use serde_json::Value;
@@ -22,8 +19,13 @@ use task_proto::{CaPin, RobotId};
 use task_transport::Trust;
 use tempfile::TempDir;
 
+use crate::leftovers;
+
 /// How long anything that should happen may take on a busy machine.
 pub const PATIENCE: Duration = Duration::from_secs(90);
+
+/// Lines that are shown of a log when a test fails.
+const MAX_SHOWN: usize = 100;
 
 /// Whom the robots' tasks run as where the tests run as root, as agents on real robots do: nobody who owns anything.
 pub const TASK_USER: &str = "65534";
@@ -48,15 +50,20 @@ pub async fn eventually<T>(what: &str, ask: impl AsyncFnMut() -> Option<T>) -> T
 }
 
 /// The same, for what takes longer than most.
-pub async fn eventually_within<T>(patience: Duration, what: &str, mut ask: impl AsyncFnMut() -> Option<T>) -> T {
+pub async fn eventually_within<T>(patience: Duration, what: &str, ask: impl AsyncFnMut() -> Option<T>) -> T {
+    within(patience, ask).await.unwrap_or_else(|| panic!("after {patience:?} still waiting for {what}"))
+}
+
+/// Asks again until there is an answer or patience ends.
+pub async fn within<T>(patience: Duration, mut ask: impl AsyncFnMut() -> Option<T>) -> Option<T> {
     let start = Instant::now();
     let mut tick = tokio::time::interval(Duration::from_millis(50));
     loop {
         tick.tick().await;
-        if let Some(answer) = ask().await {
+        let answer = ask().await;
+        if answer.is_some() || start.elapsed() >= patience {
             return answer;
         }
-        assert!(start.elapsed() < patience, "after {patience:?} still waiting for {what}");
     }
 }
 
@@ -302,6 +309,12 @@ impl Server {
     }
 }
 
+impl Drop for Server {
+    fn drop(&mut self) {
+        show_log_of_failed(&self.data.with_extension("server.log"));
+    }
+}
+
 /// A `task-agent` with its own data directory and MAC.
 pub struct Robot {
     process: Option<Process>,
@@ -401,10 +414,9 @@ impl Robot {
 impl Drop for Robot {
     /// Tasks outlive the agent on purpose; they must not outlive the test.
     fn drop(&mut self) {
+        show_log_of_failed(&self.data.with_extension("agent.log"));
         self.process = None;
-        let groups = cgroups_of(&self.data);
-        end_processes_below(&self.data);
-        groups.iter().for_each(|group| remove_cgroup(group));
+        leftovers::end(&self.data);
     }
 }
 
@@ -416,69 +428,6 @@ async fn enroll(data: &Path, number: u8, environment: &[(String, String)], optio
     let output =
         tokio::task::spawn_blocking(move || enroll.output().expect("task-agent runs")).await.expect("no panic");
     assert!(output.status.success(), "enroll: {}", String::from_utf8_lossy(&output.stderr));
-}
-
-/// The control groups of a robot's runs, and of what else it has started: those that none but its killed agent removes.
-fn cgroups_of(data: &Path) -> BTreeSet<PathBuf> {
-    let entries = |dir: PathBuf| std::fs::read_dir(dir).into_iter().flatten().flatten().map(|entry| entry.path());
-    let runs = entries(data.join("tasks")).flat_map(|task| entries(task.join("run")));
-    let written = runs.filter_map(|run| {
-        let spec: Value = serde_json::from_slice(&std::fs::read(run.join("spec.json")).ok()?).ok()?;
-        Some(PathBuf::from(spec["cgroup"].as_str()?))
-    });
-    let mounts = std::fs::read_to_string("/proc/mounts").expect("mounts");
-    let mount = mounts.lines().find_map(|line| line.contains(" cgroup2 ").then(|| line.split(' ').nth(1)).flatten());
-    let carry = processes_with(data.to_str().expect("utf-8 path").as_bytes());
-    let joined = carry.into_iter().filter_map(|pid| {
-        let groups = std::fs::read_to_string(format!("/proc/{pid}/cgroup")).ok()?;
-        let own = groups.lines().find_map(|line| line.strip_prefix("0::/"))?;
-        own.contains("taskd/run-").then_some(Path::new(mount?).join(own))
-    });
-    written.chain(joined).collect()
-}
-
-/// Ends what is left in the group and removes it, and what it lay in if no other test has groups there.
-fn remove_cgroup(group: &Path) {
-    let start = Instant::now();
-    while group.exists() && std::fs::remove_dir(group).is_err() && start.elapsed() < PATIENCE {
-        let inside = std::fs::read_to_string(group.join("cgroup.procs")).unwrap_or_default();
-        for pid in inside.lines().filter_map(|line| line.parse().ok()) {
-            let _ = nix::sys::signal::kill(nix::unistd::Pid::from_raw(pid), nix::sys::signal::Signal::SIGKILL);
-        }
-        // The kernel takes a moment to let a killed process go, and says when.
-        if let Ok(events) = File::open(group.join("cgroup.events")) {
-            let _ = nix::poll::poll(&mut [PollFd::new(events.as_fd(), PollFlags::POLLPRI)], 50_u8);
-        }
-    }
-    let base = group.parent().expect("lies in one");
-    let _ = std::fs::remove_dir(base.join("shims")).and_then(|()| std::fs::remove_dir(base));
-}
-
-/// Kills every process of ours whose environment or command line names `dir`.
-fn end_processes_below(dir: &Path) {
-    let needle = dir.to_str().expect("utf-8 path").as_bytes().to_owned();
-    // Killing a shim frees its children; a few rounds find those too.
-    for _ in 0..3 {
-        for pid in processes_with(&needle) {
-            let _ = nix::sys::signal::kill(nix::unistd::Pid::from_raw(pid), nix::sys::signal::Signal::SIGKILL);
-        }
-    }
-}
-
-/// Pids whose environment or command line contains `needle`, our own process left out.
-pub fn processes_with(needle: &[u8]) -> Vec<i32> {
-    let own = i32::try_from(std::process::id()).expect("pid");
-    std::fs::read_dir("/proc")
-        .expect("/proc")
-        .filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok())
-        .filter(|&pid| pid != own)
-        .filter(|pid| {
-            ["environ", "cmdline"].iter().any(|file| {
-                std::fs::read(format!("/proc/{pid}/{file}"))
-                    .is_ok_and(|bytes| bytes.windows(needle.len()).any(|window| window == needle))
-            })
-        })
-        .collect()
 }
 
 /// A server and robots named `robot-1`, `robot-2`, …, each in a directory below one that goes with the test.
@@ -537,6 +486,17 @@ fn ros_is_for_all() -> bool {
 pub fn open_directory(path: &Path) {
     std::fs::create_dir(path).expect("directory");
     std::fs::set_permissions(path, std::fs::Permissions::from_mode(0o1777)).expect("open to all");
+}
+
+/// Where a test has failed, what a program said last is all there is to learn from: its directory goes with the test.
+#[expect(clippy::print_stderr, reason = "the test runner shows what a failed test printed")]
+fn show_log_of_failed(path: &Path) {
+    if std::thread::panicking() {
+        let log = std::fs::read_to_string(path).unwrap_or_default();
+        let lines: Vec<&str> = log.lines().collect();
+        let last = &lines[lines.len().saturating_sub(MAX_SHOWN)..];
+        eprintln!("---- the end of {}\n{}", path.display(), last.join("\n"));
+    }
 }
 
 fn log_file(path: &Path) -> File {

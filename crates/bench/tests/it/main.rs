@@ -11,6 +11,7 @@ mod doctor;
 mod flood;
 mod harness;
 mod hostile;
+mod leftovers;
 mod load;
 mod logs;
 mod orders;

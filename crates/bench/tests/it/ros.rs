@@ -13,7 +13,8 @@ use task_proto::api::RobotTask;
 use task_proto::report::{Failure, Phase};
 use tempfile::TempDir;
 
-use crate::harness::{Process, Robot, Server, eventually, eventually_within, processes_with, required};
+use crate::harness::{PATIENCE, Process, Robot, Server, eventually, eventually_within, required, within};
+use crate::leftovers::processes_with;
 use crate::talker::trigger;
 
 /// Where the package lies whose node does as it is told.
@@ -118,11 +119,13 @@ impl Stage {
     }
 
     pub async fn is<T>(&self, name: &str, phase: Phase, which: impl Fn(RobotTask) -> Option<T>) -> T {
-        eventually(&format!("{name} to be {phase} as expected"), async || {
-            let task = self.task(name).await;
-            which(task.filter(|task| task.phase == phase)?)
+        let mut seen = None;
+        let answer = within(PATIENCE, async || {
+            seen = self.task(name).await;
+            which(seen.clone().filter(|task| task.phase == phase)?)
         })
-        .await
+        .await;
+        answer.unwrap_or_else(|| panic!("{name} was to be {phase}, and is {seen:#?}\n{}", self.log(name)))
     }
 
     /// The process of the task's node, which is the one that has these words in its command line.
@@ -245,6 +248,11 @@ async fn what_never_gets_ready_fails_and_says_what_is_missing() {
         .env("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         .stdout(Stdio::null());
     let _stranger = Process::spawn(&mut stranger);
+    eventually("the robot to see the stranger", async || {
+        let nodes = stage.server.try_operate(["node", "list", "robot-1", "-o", "json"]).await;
+        String::from_utf8_lossy(&nodes.stdout).contains("\"/taken\"").then_some(())
+    })
+    .await;
     stage.push("taken", "--node taken --lifecycle", &ready("lifecycle = ['/taken']")).await;
 
     let failures = [

@@ -6,7 +6,8 @@ use std::path::Path;
 
 use task_proto::report::{FailureCode, Phase};
 
-use crate::harness::{Fleet, Robot, Server, eventually, processes_with, required};
+use crate::harness::{Fleet, Robot, Server, eventually, required};
+use crate::leftovers::processes_with;
 
 /// A ROS 1 master's address that nobody uses, and how its nodes find it.
 struct Master {

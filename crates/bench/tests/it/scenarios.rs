@@ -6,7 +6,8 @@ use std::process::Output;
 
 use serde_json::Value;
 
-use crate::harness::{processes_with, program};
+use crate::harness::program;
+use crate::leftovers::processes_with;
 
 async fn taskbench(dir: &Path, arguments: &[&str]) -> Output {
     let (data, out) = (dir.join("data"), dir.join("out"));

@@ -5,7 +5,8 @@ use std::path::Path;
 
 use task_proto::report::Phase;
 
-use crate::harness::{Robot, Server, eventually, processes_with, required};
+use crate::harness::{Robot, Server, eventually, required};
+use crate::leftovers::processes_with;
 
 /// Calls the Trigger service `name` from a real rclpy node and gives the answer's text.
 pub async fn trigger(venv: &Path, domain: &str, name: &str) -> String {

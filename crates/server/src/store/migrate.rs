@@ -4,7 +4,7 @@
 use std::borrow::Cow;
 
 use sqlx::migrate::{MigrateError, Migration, MigrationType, Migrator};
-use sqlx::{AnyPool, SqlSafeStr};
+use sqlx::{AnyConnection, SqlSafeStr};
 
 /// Version, name and text of every migration.
 const MIGRATIONS: &[(i64, &str, &str)] = &[
@@ -31,9 +31,9 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[
 ];
 
 /// Applies what has not been applied yet.
-pub(super) async fn run(pool: &AnyPool) -> Result<(), MigrateError> {
+pub(super) async fn run(connection: &mut AnyConnection) -> Result<(), MigrateError> {
     let migrations = MIGRATIONS.iter().map(|&(version, name, sql)| {
         Migration::new(version, Cow::Borrowed(name), MigrationType::Simple, sql.into_sql_str(), false)
     });
-    Migrator::with_migrations(migrations.collect()).run(pool).await
+    Migrator::with_migrations(migrations.collect()).run(connection).await
 }

@@ -7,6 +7,7 @@ mod access;
 mod adoption;
 mod assignments;
 mod audit;
+mod connections;
 mod deliveries;
 mod deployments;
 mod earlier;
@@ -35,13 +36,13 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
-use sqlx::any::{Any, AnyPoolOptions};
 use sqlx::migrate::MigrateError;
-use sqlx::{AnyConnection, AnyPool, Connection as _, Transaction};
+use sqlx::{AnyConnection, Connection as _};
 
 use access::{Access, Ending};
 pub use assignments::{Released, TaskOrder};
 pub use audit::{Act, Deed};
+use connections::{Connections, Lent, Statement, Terms};
 pub use deliveries::{Decided, DeliveryOrder, RobotFacts};
 pub use deployments::{DeploymentPage, NewDeployment};
 pub use earlier::{EarlierPackage, Unsuccessful};
@@ -75,8 +76,8 @@ const PATIENCE: Duration = Duration::from_secs(30);
 /// The database. Clones share its connections.
 #[derive(Debug, Clone)]
 pub struct Store {
-    reads: AnyPool,
-    writes: AnyPool,
+    reads: Connections,
+    writes: Connections,
     access: Access,
     first_uses: FirstUses,
     is_postgres: bool,
@@ -144,7 +145,7 @@ impl StoreError {
 
 /// A write in progress: the only one, for it holds the write lock. Dropped without [`Write::commit`], it never was.
 pub struct Write {
-    transaction: Transaction<'static, Any>,
+    lent: Lent,
     turn: u64,
     ending: Ending,
     /// Who was found to have their rights still.
@@ -159,9 +160,9 @@ impl Write {
 
     /// Makes it so. Goes on to its end even if the caller does not wait for it.
     pub async fn commit(self) -> Result<(), StoreError> {
-        let Self { transaction, ending, .. } = self;
+        let Self { lent, ending, .. } = self;
         let committing = tokio::spawn(async move {
-            let committed = transaction.commit().await;
+            let committed = lent.commit().await;
             drop(ending);
             committed
         });
@@ -177,8 +178,8 @@ impl Write {
     }
 
     /// Where the store's own statements run.
-    fn connection(&mut self) -> &mut AnyConnection {
-        &mut self.transaction
+    fn connection(&mut self) -> Statement<'_> {
+        self.lent.connection()
     }
 }
 
@@ -201,15 +202,16 @@ impl Store {
     pub async fn open(url: &str) -> Result<Self, StoreError> {
         sqlx::any::install_default_drivers();
         let open_error = |source| StoreError::Open { url: without_password(url), source };
-        is_there(url).await.map_err(open_error)?;
-        // One writer: its transactions queue for this connection instead of failing each other.
-        let writes = pool_options(url, 1, WRITER_CACHE).connect(url).await.map_err(open_error)?;
-        migrate::run(&writes).await.map_err(|source| match source {
+        let mut first = first_connection(url).await.map_err(open_error)?;
+        migrate::run(&mut first).await.map_err(|source| match source {
             MigrateError::VersionMissing(version) => StoreError::Newer { url: without_password(url), version },
             source => StoreError::Migrate { url: without_password(url), source },
         })?;
-        let reads = pool_options(url, READERS, READER_CACHE).connect(url).await.map_err(open_error)?;
-        let is_postgres = url.starts_with("postgres");
+        first.close().await.map_err(open_error)?;
+        // One writer: its transactions queue for this connection instead of failing each other.
+        let writes = Connections::open(terms(url, 1, WRITER_CACHE)).await.map_err(open_error)?;
+        let reads = Connections::open(terms(url, READERS, READER_CACHE)).await.map_err(open_error)?;
+        let is_postgres = is_postgres(url);
         Ok(Self { reads, writes, access: Access::default(), first_uses: FirstUses::default(), is_postgres })
     }
 
@@ -221,8 +223,7 @@ impl Store {
 
     /// Whether the database answers.
     pub async fn ping(&self) -> Result<(), StoreError> {
-        sqlx::query("SELECT 1").execute(&self.reads).await?;
-        Ok(())
+        Ok(self.reads.lend().await.map(drop)?)
     }
 
     /// Which database it is, and how large.
@@ -246,48 +247,50 @@ impl Store {
 
     /// Begins a write that changes nobody's rights, like what robots report, or that is never committed.
     pub async fn begin_keeping_rights(&self) -> Result<Write, StoreError> {
-        let mut transaction = self.writes.begin().await?;
+        let mut lent = self.writes.lend().await?;
+        lent.begin().await?;
         let turn: i64 = sqlx::query_scalar("UPDATE write_lock SET turn = turn + 1 WHERE id = 1 RETURNING turn")
-            .fetch_one(&mut *transaction)
+            .fetch_one(lent.connection())
             .await?;
         let ending = self.access.until_ended();
-        Ok(Write { transaction, turn: rows::number(turn), ending, vouched_for: None })
+        Ok(Write { lent, turn: rows::number(turn), ending, vouched_for: None })
     }
 }
 
-/// Asks once without a pool, which would try until its patience is over and then say only that.
-async fn is_there(url: &str) -> Result<(), sqlx::Error> {
+/// A connection of its own for what takes as long as it takes. It is asked for once, so that what is wrong is said at once.
+async fn first_connection(url: &str) -> Result<AnyConnection, sqlx::Error> {
     let mut connection = AnyConnection::connect(url).await?;
     // SQLite reads its file no sooner.
-    let first = if url.starts_with("sqlite:") { "PRAGMA schema_version" } else { "SELECT 1" };
+    let first = if is_postgres(url) { POSTGRES_SESSION } else { SQLITE_SESSION };
     sqlx::raw_sql(first).execute(&mut connection).await?;
-    connection.close().await
+    Ok(connection)
 }
 
+fn is_postgres(url: &str) -> bool {
+    url.starts_with("postgres")
+}
+
+/// What every SQLite connection begins with. FULL: a commit survives a power cut.
+const SQLITE_SESSION: &str = "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; PRAGMA foreign_keys = ON;
+     PRAGMA busy_timeout = 30000;";
 /// What Postgres does by itself with a session of a server that is gone without a word, for it may hold the write lock, which
 /// the next one waits for. By default it keeps such a session for hours.
 const POSTGRES_SESSION: &str = "SET idle_in_transaction_session_timeout = '60s'; SET lock_timeout = '30s';
-     SET tcp_keepalives_idle = 30; SET tcp_keepalives_interval = 10; SET tcp_keepalives_count = 3";
+     SET tcp_keepalives_idle = 30; SET tcp_keepalives_interval = 10; SET tcp_keepalives_count = 3;";
+/// And with a statement before the server gives up waiting for its answer.
+const POSTGRES_STATEMENT: &str = "SET statement_timeout = '50s';";
 
-fn pool_options(url: &str, connections: u32, cache: &'static str) -> AnyPoolOptions {
-    let is_sqlite = url.starts_with("sqlite:");
-    AnyPoolOptions::new().max_connections(connections).acquire_timeout(PATIENCE).after_connect(move |connection, _| {
-        Box::pin(async move {
-            if is_sqlite {
-                // The pool can't carry SQLite's own options through `Any`. FULL: a commit survives a power cut.
-                sqlx::raw_sql(
-                    "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; PRAGMA foreign_keys = ON;
-                     PRAGMA busy_timeout = 30000;",
-                )
-                .execute(&mut *connection)
-                .await?;
-                sqlx::raw_sql(cache).execute(connection).await?;
-            } else {
-                sqlx::raw_sql(POSTGRES_SESSION).execute(connection).await?;
-            }
-            Ok(())
-        })
-    })
+/// The terms of a store's connections.
+fn terms(url: &str, count: u32, cache: &str) -> Terms {
+    let url = url.to_owned();
+    if is_postgres(&url) {
+        let session = [POSTGRES_SESSION, POSTGRES_STATEMENT].concat();
+        let (answer, greeting) = (Duration::from_secs(60), Duration::from_secs(5));
+        return Terms { url, session, count, answer, greeting, wait: PATIENCE };
+    }
+    // A file does not fall silent: it is slow.
+    let session = [SQLITE_SESSION, cache].concat();
+    Terms { url, session, count, answer: Duration::MAX, greeting: Duration::MAX, wait: PATIENCE }
 }
 
 /// A URL as it may be shown: `user:password@` and the query, which may hold a password too, cut out.
@@ -330,7 +333,7 @@ mod tests {
         let store = Store::open(&url).await.expect("opens");
         let newer = "INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time)
                      VALUES (9999, 'later', TRUE, x'00', 0)";
-        sqlx::query(newer).execute(&store.writes).await.expect("written");
+        sqlx::query(newer).execute(&store.reads).await.expect("written");
         store.close().await;
         let newer = refused("newer").await;
         assert!(newer.contains("a newer taskd (its tables are at 9999)"), "{newer}");

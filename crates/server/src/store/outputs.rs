@@ -37,6 +37,7 @@ impl Store {
         task: Option<&TaskName>,
         scope: &Scope,
     ) -> Result<Vec<OutputView>, StoreError> {
+        let mut lent = self.reads.lend().await?;
         let mut found = sqlx::query(
             "SELECT o.manifest, o.output, o.pushed_at_ms, r.name, o.robot_id, r.labels FROM outputs o JOIN robots r ON r.id = o.robot_id
              WHERE ($1 = '' OR o.robot_id = $1) AND ($2 = '' OR o.task = $2)
@@ -46,7 +47,7 @@ impl Store {
         .bind(task.map_or("", TaskName::as_str))
         // How many of a scope's are among the newest is not known before they are looked at.
         .bind(if scope.is_everything() { MAX_LISTED as i64 } else { i64::MAX })
-        .fetch(&self.reads);
+        .fetch(lent.connection());
         let (mut views, mut bytes) = (Vec::new(), 0);
         while let Some(row) = found.try_next().await? {
             let robot_name = rows::id("robots.name", row.try_get("name")?)?;

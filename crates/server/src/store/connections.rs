@@ -1,0 +1,360 @@
+//! Connections to the database, and how long one may be silent. One whose other end was lost, or that stalls on its way, would
+//! keep whoever waits for it, and with the writer everybody, for as long as the kernel hopes; here it is given up, and whoever
+//! comes next gets another.
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+use std::{fmt, io};
+
+use futures_util::future::BoxFuture;
+use futures_util::stream::{self, BoxStream};
+use futures_util::{StreamExt as _, TryStreamExt as _};
+use sqlx::any::{Any, AnyQueryResult, AnyRow, AnyStatement, AnyTypeInfo};
+use sqlx::{AnyConnection, AssertSqlSafe, Connection as _, Either, Error, Execute, Executor, SqlStr};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::time::timeout;
+
+/// What the connections of one set have in common.
+pub(super) struct Terms {
+    /// The database's URL.
+    pub(super) url: String,
+    /// Statements that prepare a new connection.
+    pub(super) session: String,
+    /// How many there may be.
+    pub(super) count: u32,
+    /// How long each part of a statement's answer may take.
+    pub(super) answer: Duration,
+    /// How long an idle connection may take to show that it is alive.
+    pub(super) greeting: Duration,
+    /// How long a new connection, or another's to become free, is waited for.
+    pub(super) wait: Duration,
+}
+
+/// A set of connections to one database, each lent to one user at a time. Clones share them.
+#[derive(Clone)]
+pub(super) struct Connections {
+    terms: Arc<Terms>,
+    places: Arc<Semaphore>,
+    idle: Arc<Mutex<Vec<AnyConnection>>>,
+}
+
+/// A connection while it is lent. What it was in the middle of when it is dropped is not done: a transaction is rolled back
+/// before anybody else gets the connection.
+pub(super) struct Lent {
+    /// `None` once it was given back.
+    held: Option<Held>,
+    answer: Duration,
+    in_transaction: bool,
+}
+
+struct Held {
+    connection: AnyConnection,
+    /// It has not failed.
+    is_sound: bool,
+    idle: Arc<Mutex<Vec<AnyConnection>>>,
+    _place: OwnedSemaphorePermit,
+}
+
+impl fmt::Debug for Connections {
+    /// The URL may hold a password.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Connections").finish_non_exhaustive()
+    }
+}
+
+impl Connections {
+    /// The first is made now.
+    pub(super) async fn open(terms: Terms) -> Result<Self, Error> {
+        let places = Arc::new(Semaphore::new(terms.count as usize));
+        let connections = Self { terms: Arc::new(terms), places, idle: Arc::default() };
+        connections.lend().await?;
+        Ok(connections)
+    }
+
+    /// Lends a connection that has just answered.
+    pub(super) async fn lend(&self) -> Result<Lent, Error> {
+        let Terms { answer, greeting, wait, .. } = *self.terms;
+        let place = timeout(wait, self.places.clone().acquire_owned()).await.map_err(|_| Error::PoolTimedOut)?;
+        let place = place.map_err(|_| Error::PoolClosed)?;
+        let connection = loop {
+            let Some(mut known) = lock(&self.idle).pop() else { break bounded(wait, self.connect()).await? };
+            match bounded(greeting, known.ping()).await {
+                Ok(()) => break known,
+                Err(error) => tracing::warn!(%error, "a connection to the database is given up"),
+            }
+        };
+        let held = Held { connection, is_sound: true, idle: self.idle.clone(), _place: place };
+        Ok(Lent { held: Some(held), answer, in_transaction: false })
+    }
+
+    async fn connect(&self) -> Result<AnyConnection, Error> {
+        let mut connection = AnyConnection::connect(&self.terms.url).await?;
+        sqlx::raw_sql(AssertSqlSafe(self.terms.session.clone())).execute(&mut connection).await?;
+        Ok(connection)
+    }
+
+    /// Ends all connections, once those that are lent have come back. None is lent any more.
+    pub(super) async fn close(&self) {
+        let all = self.places.acquire_many(self.terms.count).await;
+        self.places.close();
+        drop(all);
+        let idle = std::mem::take(&mut *lock(&self.idle));
+        for connection in idle {
+            if let Err(error) = bounded(self.terms.answer, connection.close()).await {
+                tracing::debug!(%error, "a connection to the database did not end well");
+            }
+        }
+    }
+}
+
+impl Lent {
+    /// Where the next statement runs.
+    pub(super) fn connection(&mut self) -> Statement<'_> {
+        let held = self.held.as_mut().expect("it is given back when it is dropped");
+        Statement { connection: &mut held.connection, is_sound: &mut held.is_sound, answer: self.answer }
+    }
+
+    pub(super) async fn begin(&mut self) -> Result<(), Error> {
+        self.in_transaction = true;
+        sqlx::raw_sql("BEGIN").execute(self.connection()).await.map(drop)
+    }
+
+    pub(super) async fn commit(mut self) -> Result<(), Error> {
+        sqlx::raw_sql("COMMIT").execute(self.connection()).await?;
+        self.in_transaction = false;
+        Ok(())
+    }
+}
+
+impl Drop for Lent {
+    fn drop(&mut self) {
+        let Some(mut held) = self.held.take() else { return };
+        if !self.in_transaction {
+            return held.give_back();
+        }
+        let answer = self.answer;
+        tokio::spawn(async move {
+            if held.is_sound && bounded(answer, sqlx::raw_sql("ROLLBACK").execute(&mut held.connection)).await.is_ok() {
+                held.give_back();
+            }
+        });
+    }
+}
+
+impl Held {
+    /// Another may have it. One that has failed ends here, and its place is free.
+    fn give_back(self) {
+        if self.is_sound {
+            lock(&self.idle).push(self.connection);
+        }
+    }
+}
+
+/// What runs one statement, and notices when the connection fails.
+#[derive(Debug)]
+pub(super) struct Statement<'c> {
+    connection: &'c mut AnyConnection,
+    is_sound: &'c mut bool,
+    answer: Duration,
+}
+
+impl<'c> Executor<'c> for Statement<'c> {
+    type Database = Any;
+
+    fn fetch_many<'e, 'q: 'e, E>(self, query: E) -> BoxStream<'e, Result<Either<AnyQueryResult, AnyRow>, Error>>
+    where
+        'c: 'e,
+        E: 'q + Execute<'q, Any>,
+    {
+        let Self { connection, is_sound, answer } = self;
+        let rest = Some((connection.fetch_many(query), is_sound));
+        let answers = stream::unfold(rest, move |rest| async move {
+            let (mut rows, is_sound) = rest?;
+            match bounded(answer, rows.try_next()).await {
+                Ok(row) => row.map(|row| (Ok(row), Some((rows, is_sound)))),
+                Err(error) => {
+                    *is_sound &= is_refusal(&error);
+                    Some((Err(error), None))
+                }
+            }
+        });
+        answers.boxed()
+    }
+
+    fn fetch_optional<'e, 'q: 'e, E>(self, query: E) -> BoxFuture<'e, Result<Option<AnyRow>, Error>>
+    where
+        'c: 'e,
+        E: 'q + Execute<'q, Any>,
+    {
+        Box::pin(async move {
+            let fetched = bounded(self.answer, self.connection.fetch_optional(query)).await;
+            *self.is_sound &= fetched.as_ref().err().is_none_or(is_refusal);
+            fetched
+        })
+    }
+
+    fn prepare_with<'e>(self, sql: SqlStr, parameters: &'e [AnyTypeInfo]) -> BoxFuture<'e, Result<AnyStatement, Error>>
+    where
+        'c: 'e,
+    {
+        self.connection.prepare_with(sql, parameters)
+    }
+}
+
+/// Statements that each run on whichever connection is free, which is lent until all their rows are there.
+impl<'c> Executor<'c> for &'c Connections {
+    type Database = Any;
+
+    fn fetch_many<'e, 'q: 'e, E>(self, query: E) -> BoxStream<'e, Result<Either<AnyQueryResult, AnyRow>, Error>>
+    where
+        'c: 'e,
+        E: 'q + Execute<'q, Any>,
+    {
+        let rows = async move { self.lend().await?.connection().fetch_many(query).try_collect::<Vec<_>>().await };
+        stream::once(rows).map_ok(|rows| stream::iter(rows).map(Ok)).try_flatten().boxed()
+    }
+
+    fn fetch_optional<'e, 'q: 'e, E>(self, query: E) -> BoxFuture<'e, Result<Option<AnyRow>, Error>>
+    where
+        'c: 'e,
+        E: 'q + Execute<'q, Any>,
+    {
+        Box::pin(async move { self.lend().await?.connection().fetch_optional(query).await })
+    }
+
+    fn prepare_with<'e>(self, sql: SqlStr, parameters: &'e [AnyTypeInfo]) -> BoxFuture<'e, Result<AnyStatement, Error>>
+    where
+        'c: 'e,
+    {
+        Box::pin(async move { self.lend().await?.connection().prepare_with(sql, parameters).await })
+    }
+}
+
+/// Whether the connection did its part: the database refused a statement.
+fn is_refusal(error: &Error) -> bool {
+    matches!(error, Error::Database(_))
+}
+
+/// What the database answers, if it does in time.
+async fn bounded<T>(time: Duration, answer: impl Future<Output = Result<T, Error>>) -> Result<T, Error> {
+    let silent = |_| Error::Io(io::Error::new(io::ErrorKind::TimedOut, "the database does not answer"));
+    timeout(time, answer).await.map_err(silent)?
+}
+
+fn lock(idle: &Mutex<Vec<AnyConnection>>) -> MutexGuard<'_, Vec<AnyConnection>> {
+    // A list of connections is sound whatever a panic left.
+    idle.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+#[cfg(test)]
+mod tests {
+    use tokio::io::copy_bidirectional;
+    use tokio::net::{TcpListener, TcpStream};
+    use tokio::sync::watch;
+
+    use super::*;
+
+    /// Something between us and a real Postgres. What is told to stall passes nothing on any more, and ends nothing either.
+    struct Between {
+        url: String,
+        stalled: watch::Sender<()>,
+    }
+
+    impl Between {
+        async fn start() -> Self {
+            let server = std::env::var("TASKD_TEST_POSTGRES").expect("run the tests with ./scripts/test");
+            let (scheme, host) = server.rsplit_once('@').expect("postgres://user@host:port");
+            let (host, listener) = (host.to_owned(), TcpListener::bind("127.0.0.1:0").await.expect("a port"));
+            let url = format!("{scheme}@{}/postgres", listener.local_addr().expect("bound"));
+            let (stalled, known) = watch::channel(());
+            tokio::spawn(async move {
+                while let Ok((mut near, _)) = listener.accept().await {
+                    let (mut stalled, host) = (known.clone(), host.clone());
+                    stalled.mark_unchanged();
+                    tokio::spawn(async move {
+                        let mut far = TcpStream::connect(host).await.expect("the test server answers");
+                        tokio::select! {
+                            _ = copy_bidirectional(&mut near, &mut far) => return,
+                            _ = stalled.changed() => {}
+                        }
+                        // Both stay open until the test is over.
+                        while stalled.changed().await.is_ok() {}
+                    });
+                }
+            });
+            Self { url, stalled }
+        }
+
+        async fn one_connection(&self) -> Connections {
+            sqlx::any::install_default_drivers();
+            let (few, session) = (Duration::from_secs(2), "SET idle_in_transaction_session_timeout = '60s'".to_owned());
+            let wait = Duration::from_secs(60);
+            let terms = Terms { url: self.url.clone(), session, count: 1, answer: few, greeting: few, wait };
+            Connections::open(terms).await.expect("opens")
+        }
+
+        /// All connections that are there now.
+        fn stall(&self) {
+            self.stalled.send_replace(());
+        }
+    }
+
+    async fn answers(connections: &Connections) -> Result<i32, Error> {
+        sqlx::query_scalar("SELECT 1").fetch_one(connections).await
+    }
+
+    #[tokio::test]
+    async fn a_connection_that_falls_silent_is_given_up() {
+        let between = Between::start().await;
+        let connections = between.one_connection().await;
+
+        let mut lent = connections.lend().await.expect("lent");
+        lent.begin().await.expect("begun");
+        between.stall();
+        let silent = sqlx::query("SELECT 1").execute(lent.connection()).await.expect_err("silent");
+        assert_eq!(silent.to_string(), "error communicating with database: the database does not answer");
+        drop(lent);
+        assert_eq!(answers(&connections).await.expect("another answers"), 1);
+
+        // Whoever asked is gone before it was noticed.
+        let mut lent = connections.lend().await.expect("lent");
+        lent.begin().await.expect("begun");
+        between.stall();
+        drop(lent);
+        assert_eq!(answers(&connections).await.expect("another answers"), 1);
+
+        // One that was idle.
+        between.stall();
+        assert_eq!(answers(&connections).await.expect("another answers"), 1);
+    }
+
+    #[tokio::test]
+    async fn a_transaction_that_is_dropped_is_rolled_back_and_its_connection_used_again() {
+        let between = Between::start().await;
+        let connections = between.one_connection().await;
+        let session = async || {
+            let pid = sqlx::query_scalar::<_, i32>("SELECT pg_backend_pid()").fetch_one(&connections).await;
+            pid.expect("answers")
+        };
+        let before = session().await;
+        let mut lent = connections.lend().await.expect("lent");
+        lent.begin().await.expect("begun");
+        sqlx::query("CREATE TEMPORARY TABLE made (id INT)").execute(lent.connection()).await.expect("made");
+        let refused = sqlx::query("SELECT 1 / 0").execute(lent.connection()).await.expect_err("refused");
+        assert!(is_refusal(&refused), "{refused}");
+        drop(lent);
+        let made = sqlx::query("SELECT * FROM made").execute(&connections).await.expect_err("rolled back");
+        assert!(is_refusal(&made), "{made}");
+        assert_eq!(session().await, before);
+
+        let mut lent = connections.lend().await.expect("lent");
+        lent.begin().await.expect("begun");
+        sqlx::query("CREATE TEMPORARY TABLE made (id INT)").execute(lent.connection()).await.expect("made");
+        lent.commit().await.expect("committed");
+        sqlx::query("SELECT * FROM made").execute(&connections).await.expect("is there");
+        assert_eq!(session().await, before);
+
+        connections.close().await;
+        assert!(matches!(answers(&connections).await, Err(Error::PoolClosed)));
+    }
+}

@@ -1,6 +1,9 @@
 //! The command line of `taskd` as a whole: what `main` parses, what shells complete and what the man pages are made of.
 
-use clap::{CommandFactory as _, Parser, Subcommand};
+use std::ffi::OsString;
+
+use clap::parser::ValueSource;
+use clap::{CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 
 use crate::commands;
 use crate::config::ServeFlags;
@@ -32,6 +35,15 @@ pub enum Command {
 }
 
 impl CommandLine {
+    /// What was typed, and what the environment adds.
+    pub fn read(words: impl IntoIterator<Item = impl Into<OsString> + Clone>) -> Result<Self, clap::Error> {
+        let matches = Self::command().try_get_matches_from(words)?;
+        let mut read = Self::from_arg_matches(&matches)?;
+        let is_typed = |option: &str| matches.value_source(option) == Some(ValueSource::CommandLine);
+        read.connection.prefer_what_is_typed(is_typed);
+        Ok(read)
+    }
+
     /// The same as clap's own description of it.
     pub fn describe() -> clap::Command {
         Self::command()

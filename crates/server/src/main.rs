@@ -5,7 +5,6 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::Context as _;
-use clap::Parser as _;
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use task_proto::line::OneLineEach;
 use taskd::clock::Clock;
@@ -30,7 +29,8 @@ const OTHER_FILES: usize = 500;
 
 fn main() -> ExitCode {
     commands::complete(CommandLine::describe);
-    let CommandLine { connection, command } = CommandLine::parse();
+    let CommandLine { connection, command } =
+        CommandLine::read(std::env::args_os()).unwrap_or_else(|error| error.exit());
     // Sockets are looked at after so many tasks: those that hand out blobs take long, and would keep everybody waiting.
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().event_interval(TASKS_PER_LOOK).build();
     let runtime = match runtime {

@@ -158,14 +158,14 @@ impl Client {
         Ok(Self { token: Some(token), ..client })
     }
 
-    /// The same with this token.
-    pub(crate) fn with_token(connection: &Connection, token: &str) -> Result<Self, CommandError> {
+    /// The same server, asked with the token that is kept for it.
+    pub(crate) fn with_token(self, token: &str) -> Result<Self, ClientError> {
         let token =
             token.parse().map_err(|source| ClientError::Token { origin: "the kept token".to_owned(), source })?;
-        Ok(Self { token: Some(token), ..Self::anonymous(connection)? })
+        Ok(Self { token: Some(token), ..self })
     }
 
-    /// The same without a token, to ask for one.
+    /// Finds the server alone, to ask for a token.
     pub(crate) fn anonymous(connection: &Connection) -> Result<Self, CommandError> {
         let (base, known_pin) = find_server(connection, data_directory(connection).as_deref())?;
         let url = reqwest::Url::parse(&base).ok();

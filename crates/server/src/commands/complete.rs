@@ -195,14 +195,16 @@ fn connection(words: impl Iterator<Item = String>) -> Connection {
     let or_variable = |name: &str, variable: &str| {
         option(name).or_else(|| std::env::var(variable).ok()).filter(|value| !value.is_empty())
     };
-    Connection {
+    let mut connection = Connection {
         server: or_variable("--server", "TASKD_SERVER"),
         pin: or_variable("--pin", "TASKD_PIN").and_then(|pin| pin.parse().ok()),
         token: or_variable("--token", "TASKD_TOKEN"),
         token_file: option("--token-file").map(Into::into),
         data: or_variable("--data", "TASKD_DATA"),
         output: Format::Json,
-    }
+    };
+    connection.prefer_what_is_typed(|name| option(&format!("--{name}")).is_some());
+    connection
 }
 
 #[cfg(test)]

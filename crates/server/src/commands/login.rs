@@ -51,21 +51,21 @@ pub(super) async fn log_in(connection: &Connection, order: LoginOrder) -> Result
 }
 
 pub(super) async fn log_out(connection: &Connection) -> Result<Outcome, CommandError> {
-    let base = Client::anonymous(connection)?.base().to_owned();
-    let path = path().filter(|path| path.exists());
-    let Some(path) = path else { return Err(CommandError::Usage(format!("you are not signed in at {base}"))) };
+    let client = Client::anonymous(connection)?;
+    let base = client.base().to_owned();
+    let unknown = || CommandError::Usage(format!("you are not signed in at {base}"));
+    let path = path().ok_or_else(unknown)?;
+    let token = Kept::read(&path)?.servers.remove(&base).ok_or_else(unknown)?;
+    // It may have ended by itself, which comes to the same. One that the server may still take is not forgotten.
+    match client.with_token(&token)?.delete("/session").await {
+        Err(error) if error.outcome() != Outcome::NotAllowed => return Err(error.into()),
+        _ => {}
+    }
     let mut kept = Kept::read(&path)?;
-    let Some(token) = kept.servers.remove(&base) else {
-        return Err(CommandError::Usage(format!("you are not signed in at {base}")));
-    };
+    kept.servers.remove(&base);
     kept.last.take_if(|last| *last == base);
     kept.write(&path)?;
-    let client = Client::with_token(connection, &token)?;
-    // It may have ended by itself, which comes to the same.
-    match client.delete("/session").await {
-        Err(error) if error.outcome() != Outcome::NotAllowed => return Err(error.into()),
-        _ => say(&format!("signed out at {base}")),
-    }
+    say(&format!("signed out at {base}"));
     Ok(Outcome::Succeeded)
 }
 

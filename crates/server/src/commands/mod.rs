@@ -331,6 +331,15 @@ pub(crate) struct Session {
 }
 
 impl Connection {
+    /// Who types a directory means its server, not the one that is in the environment; what goes with that one is not for
+    /// this one.
+    pub(crate) fn prefer_what_is_typed(&mut self, is_typed: impl Fn(&str) -> bool) {
+        if is_typed("data") && !is_typed("server") && self.server.take().is_some() {
+            self.token.take_if(|_| !is_typed("token"));
+            self.pin.take_if(|_| !is_typed("pin"));
+        }
+    }
+
     fn open(&self) -> Result<Session, CommandError> {
         Ok(Session { client: Client::connect(self)?, output: Output::new(self.output) })
     }

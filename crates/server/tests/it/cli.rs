@@ -87,11 +87,21 @@ impl Bench {
 
     /// Stops the server and starts it again where it was.
     async fn restart(&mut self) {
+        let stopped = self.stop().await;
+        self.go_on(stopped).await;
+    }
+
+    /// Stops the server; gives what it goes on with.
+    pub async fn stop(&mut self) -> Config {
         let mut config = Config::with_data(self.data());
         config.http = self.server().addresses().http.parse().unwrap();
         config.mqtt = self.server().addresses().mqtt.parse().unwrap();
         self.server.take().unwrap().stop().await;
-        self.server = Some(Server::start(config, Clock::system()).await.unwrap());
+        config
+    }
+
+    pub async fn go_on(&mut self, stopped: Config) {
+        self.server = Some(Server::start(stopped, Clock::system()).await.unwrap());
     }
 
     pub fn server(&self) -> &Server {

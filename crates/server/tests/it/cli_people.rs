@@ -89,7 +89,16 @@ async fn a_user_is_added_signs_in_and_out() {
     away.told(&["wrong", "another long one"], &passwd).await.expect(2, "old: it is wrong");
     away.told(&[PASSWORD, "another long one"], &passwd).await.expect(0, "signed out everywhere else");
     away.taskd(&["whoami"]).await.expect(0, "");
-    away.taskd(&["logout"]).await.expect(0, "signed out at http://");
+    let kept_token = |kept: &std::path::Path| {
+        let kept: Value = serde_json::from_slice(&std::fs::read(kept).unwrap()).unwrap();
+        kept["servers"].as_object().unwrap().values().next().unwrap().as_str().unwrap().to_owned()
+    };
+    let token = kept_token(&kept);
+    // The server that was signed in to last is meant where none is named.
+    let mut anywhere = away.command(&["logout"]);
+    anywhere.env_remove("TASKD_SERVER");
+    run(anywhere).await.expect(0, "signed out at http://");
+    away.taskd(&["--token", &token, "whoami"]).await.expect(4, "expired or revoked");
     away.taskd(&["whoami"]).await.expect(2, "no token");
     away.taskd(&["logout"]).await.expect(2, "you are not signed in");
 
@@ -98,6 +107,39 @@ async fn a_user_is_added_signs_in_and_out() {
     bench.taskd(&["user", "remove", "alice", "--yes"]).await.expect(0, "removed alice");
     away.told(&["another long one"], &["login", "alice", "--password-stdin"]).await.expect(4, "is wrong");
     bench.server.unwrap().stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn nobody_is_signed_out_where_the_server_was_not_told() {
+    let mut bench = Bench::start().await;
+    add_user(&bench, "alice", &["--role", "viewer"]).await.expect(0, "");
+    let sign_in = ["login", "alice", "--password-stdin"];
+    Away { bench: &bench }.told(&[PASSWORD], &sign_in).await.expect(0, "");
+    let log_out = Away { bench: &bench }.command(&["logout"]);
+    let stopped = bench.stop().await;
+    run(log_out).await.expect(1, "can't reach the server");
+    bench.go_on(stopped).await;
+    Away { bench: &bench }.taskd(&["logout"]).await.expect(0, "signed out at http://");
+    bench.server.unwrap().stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_directory_that_is_typed_is_meant_whatever_is_in_the_environment() {
+    let (meant, other) = (Bench::start().await, Bench::start().await);
+    let token = std::fs::read_to_string(other.data().join("operator.token")).unwrap();
+    let data = meant.data();
+    let ask = |arguments: &[&str]| {
+        let mut command = command(&[arguments, &["server", "info", "-o", "json"]].concat());
+        command.env("TASKD_SERVER", format!("http://{}", other.server().addresses().http));
+        command.env("TASKD_TOKEN", token.trim());
+        run(command)
+    };
+    let mqtt = |bench: &Bench| Value::from(bench.server().addresses().mqtt.as_str());
+    let typed = ask(&["--data", data.to_str().unwrap()]).await.expect(0, "").json();
+    let server = ask(&[]).await.expect(0, "").json();
+    assert_eq!((&typed["mqtt"], &server["mqtt"]), (&mqtt(&meant), &mqtt(&other)));
+    meant.server.unwrap().stop().await;
+    other.server.unwrap().stop().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]

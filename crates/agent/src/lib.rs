@@ -41,6 +41,7 @@ pub mod plan;
 pub mod process;
 pub mod readiness;
 pub mod recent;
+mod registry_words;
 pub mod rotation;
 pub mod run_dir;
 pub mod script;

@@ -80,6 +80,14 @@ pub enum OutputError {
     /// No connection, or it broke.
     #[error("the server can't be reached")]
     Unreachable(#[source] reqwest::Error),
+    /// Something answered that is no registry: a captive portal, a proxy.
+    #[error("something else answers in the server's place: {status} {text}")]
+    NotTheServer {
+        /// The HTTP status.
+        status: u16,
+        /// What it said.
+        text: String,
+    },
     /// The server is overloaded, restarting or broken.
     #[error("the server answers {status} {text}")]
     Busy {
@@ -116,7 +124,7 @@ impl OutputError {
             Self::Read { .. } | Self::User(_) => Some(Duration::from_secs(30)),
             Self::Busy { retry_after, .. } => Some(retry_after.unwrap_or_default()),
             // A robot that is enrolled anew, or replaces its token, is known again.
-            Self::Refused { status: 401, .. } => Some(Duration::from_secs(30)),
+            Self::NotTheServer { .. } | Self::Refused { status: 401, .. } => Some(Duration::from_secs(30)),
             Self::Pattern { .. } | Self::TooMuch(_) | Self::Refused { .. } => None,
         }
     }

@@ -15,9 +15,10 @@ use tokio::sync::mpsc;
 use tokio::time::Instant;
 
 use super::FetchError;
+use crate::registry_words::RegistryWords;
 
 /// The digest of the blob in an answer (OCI distribution-spec).
-const CONTENT_DIGEST: HeaderName = HeaderName::from_static("docker-content-digest");
+pub(crate) const CONTENT_DIGEST: HeaderName = HeaderName::from_static("docker-content-digest");
 /// What must come within each stall timeout.
 const MIN_PROGRESS_BYTES: u64 = 16 * 1024;
 /// Overrides whatever limit the client has for whole requests: a large package on a bad link takes its time, and the
@@ -57,8 +58,14 @@ impl Download {
         }
         let asked_at = Instant::now();
         let answer = tokio::time::timeout(stall_timeout, request.send()).await;
-        let response = answer.map_err(|_| FetchError::Stalled(stall_timeout))?.map_err(FetchError::Unreachable)?;
-        let skip = judge(&response, repository, blob, offset)?;
+        let mut response = answer.map_err(|_| FetchError::Stalled(stall_timeout))?.map_err(FetchError::Unreachable)?;
+        let skip = match judge(&response, repository, blob, offset) {
+            Err(FetchError::Unavailable { .. }) if !has_registrys_words(&mut response, stall_timeout).await => {
+                let status = response.status().as_u16();
+                return Err(FetchError::NotTheServer(format!("status {status} without a registry's error")));
+            }
+            judged => judged?,
+        };
         Ok(Self {
             response,
             size: blob.size,
@@ -167,6 +174,11 @@ fn judge(
         return Err(other_bytes(blob, reason));
     }
     Ok(offset - start)
+}
+
+/// Whether a refusal is the server's own. A proxy in front of one that restarts refuses as well, and passes.
+async fn has_registrys_words(response: &mut reqwest::Response, patience: Duration) -> bool {
+    tokio::time::timeout(patience, RegistryWords::read(response)).await.is_ok_and(|words| words.are_a_registrys())
 }
 
 fn other_bytes(blob: BlobRef, reason: String) -> FetchError {

@@ -1,7 +1,6 @@
 //! Pushes an output through the OCI distribution API: the config and the manifest, to hear whether it would be kept, then
 //! blobs in chunks that go on where they broke off, then the manifest once more.
 
-use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::io::{Read as _, Seek as _, SeekFrom};
 use std::path::Path;
@@ -19,7 +18,8 @@ use tokio::sync::{Semaphore, watch};
 
 use super::{OutputError, OutputOrder};
 use crate::credential::Credential;
-use crate::fetch::MAX_RETRY_AFTER;
+use crate::fetch::{CONTENT_DIGEST, MAX_RETRY_AFTER};
+use crate::registry_words::RegistryWords;
 use crate::task_user::{self, TaskUser};
 use crate::{durable, foreign_file};
 
@@ -27,12 +27,12 @@ use crate::{durable, foreign_file};
 const CHUNK_BYTES: u64 = 1024 * 1024;
 /// The registry's word for a manifest whose files are not all there.
 const FILES_MISSING: &str = "MANIFEST_BLOB_UNKNOWN";
+/// And for bytes that are not those of the digest.
+const OTHER_BYTES: &str = "DIGEST_INVALID";
 /// How long one request may take.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(180);
 /// How often an upload that the server has forgotten is begun again in one go.
 const MAX_BEGINNINGS: u32 = 3;
-/// The most of an error's body that is read.
-const MAX_ERROR_BYTES: usize = 4096;
 
 /// The server's registry, as this robot may use it.
 #[derive(Clone)]
@@ -59,6 +59,30 @@ impl Registry {
         url.set_path(&format!("{}{path}", self.base.path().trim_end_matches('/')));
         url.set_query(query);
         self.client.request(method, url).bearer_auth(self.token.current()).timeout(REQUEST_TIMEOUT)
+    }
+
+    /// Sends what makes the registry take these bytes as a whole, and has its word that it did.
+    async fn store(&self, what: &str, digest: Digest, request: RequestBuilder) -> Result<(), OutputError> {
+        let response = self.send(what, request).await?;
+        if is_of(&response, digest) { Ok(()) } else { Err(not_the_server(&response)) }
+    }
+
+    /// Sends what begins or goes on with an upload; gives its answer and where it goes on.
+    async fn upload(&self, what: &str, request: RequestBuilder) -> Result<(Response, String), OutputError> {
+        let response = self.send(what, request).await?;
+        location(&response).map(|location| (response, location))
+    }
+
+    /// Whether the registry has this blob.
+    async fn has(&self, repository: &str, digest: Digest) -> Result<bool, OutputError> {
+        let head = self.request(Method::HEAD, &format!("{repository}/blobs/{digest}"));
+        let response = head.send().await.map_err(OutputError::Unreachable)?;
+        match response.status() {
+            StatusCode::NOT_FOUND => Ok(false),
+            status if !status.is_success() => Err(refusal("a file", response).await),
+            _ if is_of(&response, digest) => Ok(true),
+            _ => Err(not_the_server(&response)),
+        }
     }
 
     async fn send(&self, what: &str, request: RequestBuilder) -> Result<Response, OutputError> {
@@ -96,12 +120,13 @@ pub(super) async fn push(
         serde_json::to_vec(&output.manifest(config_ref)).map_err(|error| note_error(&order.notes, error.into()))?;
     let list = async || {
         let put = registry.request(Method::PUT, &format!("/v2/{repository}/manifests/{tag}"));
-        registry.send("the output", put.header(CONTENT_TYPE, MANIFEST_TYPE).body(manifest.clone())).await
+        let put = put.header(CONTENT_TYPE, MANIFEST_TYPE).body(manifest.clone());
+        registry.store("the output", Digest::of(&manifest), put).await
     };
     // What the server would not list need not travel.
     match list().await {
         Err(OutputError::Refused { code, .. }) if code == FILES_MISSING => {}
-        listed => return listed.map(drop),
+        listed => return listed,
     }
     for file in &output.files {
         push.file(&order.directory.join(file.path.as_str()), file.blob).await?;
@@ -113,7 +138,7 @@ pub(super) async fn push(
         Err(OutputError::Refused { status, code, text, .. }) if code == FILES_MISSING => {
             Err(OutputError::Busy { status, text, retry_after: None })
         }
-        listed => listed.map(drop),
+        listed => listed,
     }
 }
 
@@ -130,23 +155,26 @@ struct Push<'a> {
 
 impl Push<'_> {
     async fn file(&mut self, path: &Path, blob: BlobRef) -> Result<(), OutputError> {
-        let head = self.registry.request(Method::HEAD, &format!("{}/blobs/{}", self.base, blob.digest));
-        match self.registry.send("a file", head).await {
-            Ok(_) => return Ok(()),
-            Err(OutputError::Refused { status: 404, .. }) => {}
-            Err(error) => return Err(error),
-        }
-        if blob.size <= CHUNK_BYTES {
-            let bytes = read_part(self.user, path, 0, blob.size).await?;
-            return self.small(blob.digest, bytes).await;
+        if self.registry.has(&self.base, blob.digest).await? {
+            return Ok(());
         }
         let mut beginnings = 0;
         loop {
-            match self.large(path, blob).await {
+            let sent = match blob.size <= CHUNK_BYTES {
+                true => self.small(blob.digest, read_part(self.user, path, 0, blob.size).await?).await,
+                false => self.large(path, blob).await,
+            };
+            match sent {
                 // The server has collected the upload, or took a chunk whose answer was lost.
                 Err(OutputError::Refused { status: 404 | 416, .. }) if beginnings < MAX_BEGINNINGS => {
                     beginnings += 1;
                     self.note(blob.digest, None)?;
+                }
+                // A task that runs again writes where it wrote before.
+                Err(OutputError::Refused { code, .. }) if code == OTHER_BYTES => {
+                    self.note(blob.digest, None)?;
+                    let source = std::io::Error::other("it was changed while it was sent");
+                    return Err(OutputError::Read { path: path.to_owned(), source });
                 }
                 done => return done,
             }
@@ -157,21 +185,19 @@ impl Push<'_> {
     async fn small(&self, digest: Digest, bytes: Vec<u8>) -> Result<(), OutputError> {
         let post = self.registry.request(Method::POST, &format!("{}/blobs/uploads/?digest={digest}", self.base));
         let post = post.header(CONTENT_TYPE, "application/octet-stream").body(bytes);
-        self.registry.send("a file", post).await.map(drop)
+        self.registry.store("a file", digest, post).await
     }
 
     async fn large(&mut self, path: &Path, blob: BlobRef) -> Result<(), OutputError> {
         let (mut location, mut offset) = match self.notes.get(&blob.digest).cloned() {
             Some(location) => {
-                let status =
-                    self.registry.send("an upload's state", self.registry.request(Method::GET, &location)).await?;
-                let offset = uploaded(&status).min(blob.size);
-                (location, offset)
+                let get = self.registry.request(Method::GET, &location);
+                let (status, location) = self.registry.upload("an upload's state", get).await?;
+                (location, uploaded(&status).min(blob.size))
             }
             None => {
                 let post = self.registry.request(Method::POST, &format!("{}/blobs/uploads/", self.base));
-                let begun = self.registry.send("an upload", post).await?;
-                let location = location(&begun)?;
+                let (_, location) = self.registry.upload("an upload", post).await?;
                 self.note(blob.digest, Some(location.clone()))?;
                 (location, 0)
             }
@@ -181,13 +207,12 @@ impl Push<'_> {
             let last = offset + bytes.len() as u64 - 1;
             let patch = self.registry.request(Method::PATCH, &location);
             let patch = patch.header(CONTENT_RANGE, format!("{offset}-{last}")).body(bytes);
-            let taken = self.registry.send("a part of a file", patch).await?;
-            location = self::location(&taken)?;
+            (_, location) = self.registry.upload("a part of a file", patch).await?;
             offset = last + 1;
             self.progress.send_modify(|progress| progress.done = self.done + offset);
         }
         let put = self.registry.request(Method::PUT, &format!("{location}?digest={}", blob.digest));
-        self.registry.send("a file", put).await?;
+        self.registry.store("a file", blob.digest, put).await?;
         self.note(blob.digest, None)
     }
 
@@ -237,16 +262,20 @@ fn uploaded(status: &Response) -> u64 {
     last.filter(|last| *last > 0).map_or(0, |last| last.saturating_add(1))
 }
 
-/// Where an upload goes on, as a path of this server.
+/// Where an upload goes on, as a path of this server, which says so in every answer about one.
 fn location(response: &Response) -> Result<String, OutputError> {
     let location = response.headers().get(LOCATION).and_then(|value| value.to_str().ok());
     let path = location.filter(|location| location.starts_with("/v2/") && !location.contains('?'));
-    path.map(str::to_owned).ok_or_else(|| OutputError::Refused {
-        what: "an upload".to_owned(),
-        status: response.status().as_u16(),
-        code: String::new(),
-        text: "its answer does not say where to go on".to_owned(),
-    })
+    path.map(str::to_owned).ok_or_else(|| not_the_server(response))
+}
+
+/// Whether the answer is about these bytes, as a registry's is that has them.
+fn is_of(response: &Response, digest: Digest) -> bool {
+    response.headers().get(CONTENT_DIGEST).is_some_and(|value| value.as_bytes() == digest.to_string().as_bytes())
+}
+
+fn not_the_server(response: &Response) -> OutputError {
+    OutputError::NotTheServer { status: response.status().as_u16(), text: "without a registry's headers".to_owned() }
 }
 
 async fn refusal(what: &str, mut response: Response) -> OutputError {
@@ -260,29 +289,17 @@ async fn refusal(what: &str, mut response: Response) -> OutputError {
                 | StatusCode::CONFLICT
         );
     let seconds = response.headers().get(RETRY_AFTER).and_then(|value| value.to_str().ok()?.parse().ok());
-    let mut body = Vec::new();
-    while let Ok(Some(chunk)) = response.chunk().await {
-        body.extend_from_slice(&chunk);
-        if body.len() > MAX_ERROR_BYTES {
-            break;
-        }
-    }
-    body.truncate(MAX_ERROR_BYTES);
-    let (code, text) = said(&body);
-    let status = status.as_u16();
+    let words = RegistryWords::read(&mut response).await;
+    let (status, is_own) = (status.as_u16(), words.are_a_registrys());
+    let RegistryWords { code, text } = words;
     if is_passing {
         let retry_after = seconds.map(|seconds| Duration::from_secs(seconds).min(MAX_RETRY_AFTER));
         return OutputError::Busy { status, text, retry_after };
     }
-    OutputError::Refused { what: what.to_owned(), status, code, text }
-}
-
-/// The code and the words of a registry's error body; all of what is none.
-fn said(body: &[u8]) -> (String, String) {
-    let parsed: serde_json::Value = serde_json::from_slice(body).unwrap_or_default();
-    let [code, message] = ["code", "message"].map(|key| parsed["errors"][0][key].as_str());
-    let text = message.map_or_else(|| String::from_utf8_lossy(body), Cow::Borrowed).replace(char::is_control, " ");
-    (code.unwrap_or_default().to_owned(), text)
+    match is_own {
+        true => OutputError::Refused { what: what.to_owned(), status, code, text },
+        false => OutputError::NotTheServer { status, text },
+    }
 }
 
 #[cfg(test)]
@@ -294,15 +311,5 @@ mod tests {
         let busy = http::Response::builder().status(503).header(RETRY_AFTER, u64::MAX.to_string()).body("");
         let refused = refusal("a file", busy.expect("an answer").into()).await;
         assert_eq!(refused.retry_after(), Some(MAX_RETRY_AFTER), "{refused}");
-    }
-
-    #[test]
-    fn a_refusal_is_told_in_the_servers_words() {
-        let error = br#"{"errors":[{"code":"SIZE_INVALID","message":"the output\nhas 9 bytes","detail":{}}]}"#;
-        assert_eq!(said(error), ("SIZE_INVALID".to_owned(), "the output has 9 bytes".to_owned()));
-        for other in ["<h1>Forbidden</h1>", r#"{"errors":[]}"#, r#"{"error":{"code":"x"}}"#, "[]"] {
-            assert_eq!(said(other.as_bytes()), (String::new(), other.to_owned()));
-        }
-        assert_eq!(said(b"\xff\x1b[2J").1, "\u{fffd} [2J");
     }
 }

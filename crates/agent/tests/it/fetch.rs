@@ -41,6 +41,8 @@ pub enum Answer {
     Drip,
     /// The whole blob, whatever range was asked for.
     IgnoreRange,
+    /// This status, in a registry's words.
+    Refused(u16),
     /// This status and these headers, with an empty body.
     Status(u16, Vec<(&'static str, &'static str)>),
     /// A page, as a captive portal shows it.
@@ -207,6 +209,10 @@ async fn answer(
                 Some((Ok::<_, std::io::Error>(drop), (bytes, at + 1, every)))
             });
             exact(response).body(Body::from_stream(drops))
+        }
+        Answer::Refused(status) => {
+            let words = r#"{"errors":[{"code":"BLOB_UNKNOWN","message":"the blob is not here"}]}"#;
+            Response::builder().status(status).body(Body::from(words))
         }
         Answer::Status(status, headers) => {
             let response = Response::builder().status(status);
@@ -378,9 +384,11 @@ async fn wrong_bytes_are_never_used_nor_kept() {
 #[tokio::test]
 async fn what_is_not_the_server_counts_as_not_reached() {
     let login = vec![("location", "/login")];
-    for answer in
-        [Answer::Html(200), Answer::Html(404), Answer::Html(302), Answer::Anonymous, Answer::Status(204, login)]
-    {
+    let mut answers =
+        vec![Answer::Html(200), Answer::Html(404), Answer::Html(302), Answer::Anonymous, Answer::Status(204, login)];
+    // A proxy whose server restarts.
+    answers.extend([403, 404, 410, 451].map(|status| Answer::Status(status, vec![("content-type", "text/plain")])));
+    for answer in answers {
         let site = Site::new(&tar()).await;
         site.put_part(&site.content[..1000]);
         site.answers([answer.clone()]);
@@ -400,9 +408,6 @@ async fn statuses_say_whether_to_come_back() {
         (500, Some("Fri, 31 Dec 1999 23:59:59 GMT"), FailureCode::SERVER_UNREACHABLE, true, None),
         (502, None, FailureCode::SERVER_UNREACHABLE, true, None),
         (401, None, FailureCode::UNAUTHORIZED, true, None),
-        (403, None, FailureCode::PACKAGE_UNAVAILABLE, false, None),
-        (404, None, FailureCode::PACKAGE_UNAVAILABLE, false, None),
-        (410, None, FailureCode::PACKAGE_UNAVAILABLE, false, None),
     ] {
         let site = Site::new(&tar()).await;
         site.answers([Answer::Status(status, retry_after.map(|value| ("retry-after", value)).into_iter().collect())]);
@@ -412,6 +417,12 @@ async fn statuses_say_whether_to_come_back() {
             (Some(code), retryable, wait),
             "{status}"
         );
+    }
+    for status in [403, 404, 410] {
+        let site = Site::new(&tar()).await;
+        site.answers([Answer::Refused(status)]);
+        let error = site.pull().await.unwrap_err();
+        assert_eq!((error.code(), error.is_retryable()), (Some(FailureCode::PACKAGE_UNAVAILABLE), false), "{status}");
     }
 }
 

@@ -13,6 +13,7 @@ mod graph;
 mod harness;
 mod launch;
 mod logs;
+mod outputs;
 mod parts;
 mod peer;
 mod ros;

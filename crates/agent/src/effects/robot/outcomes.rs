@@ -51,7 +51,9 @@ pub(super) fn build_failure(error: BuildError, root: &Path) -> StepFailure {
 
 pub(super) fn outputs_code(error: &OutputError) -> FailureCode {
     match error {
-        OutputError::Unreachable(_) | OutputError::Busy { .. } => FailureCode::SERVER_UNREACHABLE,
+        OutputError::Unreachable(_) | OutputError::NotTheServer { .. } | OutputError::Busy { .. } => {
+            FailureCode::SERVER_UNREACHABLE
+        }
         OutputError::Read { .. } | OutputError::User(_) | OutputError::Note { .. } => FailureCode::IO_ERROR,
         OutputError::Cancelled => FailureCode::INTERRUPTED,
         OutputError::Pattern { .. } | OutputError::TooMuch(_) | OutputError::Refused { .. } => {

@@ -1,0 +1,113 @@
+//! Bringing files back, to what is no registry and from under a task that goes on writing. The way to a real one is in the
+//! tests of the whole.
+
+use std::path::PathBuf;
+
+use axum::Router;
+use axum::body::{Body, to_bytes};
+use axum::extract::Request;
+use axum::response::Response;
+use http::Method;
+use task_agent::outputs::{OutputError, OutputOrder, Registry, bring_back};
+use task_proto::Digest;
+use task_proto::report::Progress;
+use tempfile::TempDir;
+use tokio::net::TcpListener;
+use tokio::sync::watch;
+use tokio_util::sync::CancellationToken;
+
+/// A run that has left `map.pgm`.
+struct Left {
+    dir: TempDir,
+    order: OutputOrder,
+}
+
+impl Left {
+    fn new() -> Self {
+        let dir = tempfile::tempdir().unwrap();
+        let order = OutputOrder {
+            robot_id: "r0123456789abcdef".parse().unwrap(),
+            task: "mapper".parse().unwrap(),
+            version: "1.0.0".parse().unwrap(),
+            deployment: "d0123456789abcdef".parse().unwrap(),
+            run: 1,
+            directory: dir.path().join("run"),
+            user: None,
+            patterns: vec!["map.pgm".to_owned()],
+            notes: dir.path().join("uploads.json"),
+            max_bytes: 1 << 20,
+        };
+        std::fs::create_dir(&order.directory).unwrap();
+        let left = Self { dir, order };
+        std::fs::write(left.map(), "the whole map").unwrap();
+        left
+    }
+
+    fn map(&self) -> PathBuf {
+        self.dir.path().join("run/map.pgm")
+    }
+
+    async fn bring_to(&self, router: Router) -> Result<usize, OutputError> {
+        let _ = rustls::crypto::ring::default_provider().install_default();
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let base = format!("http://{}", listener.local_addr().unwrap()).parse().unwrap();
+        tokio::spawn(async move { axum::serve(listener, router).await });
+        let client = reqwest::Client::builder().no_proxy().redirect(reqwest::redirect::Policy::none());
+        let registry = Registry::new(client.build().unwrap(), base, "token".to_owned());
+        let progress = watch::Sender::new(Progress { done: 0, total: 0 });
+        bring_back(&registry, &self.order, &progress, &CancellationToken::new()).await
+    }
+}
+
+fn answer(status: u16, headers: &[(&str, String)], body: impl Into<Body>) -> Response {
+    let response = Response::builder().status(status);
+    let response = headers.iter().fold(response, |response, (name, value)| response.header(*name, value));
+    response.body(body.into()).unwrap()
+}
+
+fn refusal(status: u16, code: &str) -> Response {
+    answer(status, &[], format!(r#"{{"errors":[{{"code":"{code}","message":"no"}}]}}"#))
+}
+
+#[tokio::test]
+async fn what_is_not_the_server_takes_no_files_and_loses_none() {
+    let left = Left::new();
+    for status in [200, 201, 202, 302, 403, 404, 405] {
+        for kind in ["text/html", "text/plain"] {
+            let portal = move || async move {
+                let headers = [("content-type", kind.to_owned()), ("location", "/login".to_owned())];
+                answer(status, &headers, "please sign in")
+            };
+            let error = left.bring_to(Router::new().fallback(portal)).await.unwrap_err();
+            assert!(matches!(error, OutputError::NotTheServer { .. }), "{status} {kind}: {error:?}");
+            assert!(error.retry_after().is_some(), "{error}");
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_file_that_changes_while_it_is_sent_is_brought_back_later() {
+    let left = Left::new();
+    let map = left.map();
+    // A registry that has nothing; between a look at what it has and the sending, the task writes once more.
+    let registry = move |request: Request| {
+        let map = map.clone();
+        async move {
+            let (method, path) = (request.method().clone(), request.uri().to_string());
+            let body = to_bytes(request.into_body(), 1 << 20).await.unwrap();
+            let created = || answer(201, &[("docker-content-digest", Digest::of(&body).to_string())], "");
+            match method {
+                Method::HEAD => {
+                    std::fs::write(map, "another map..").unwrap();
+                    answer(404, &[], "")
+                }
+                Method::POST if path.ends_with(&format!("?digest={}", Digest::of(&body))) => created(),
+                Method::POST => refusal(400, "DIGEST_INVALID"),
+                _ => refusal(404, "MANIFEST_BLOB_UNKNOWN"),
+            }
+        }
+    };
+    let error = left.bring_to(Router::new().fallback(registry)).await.unwrap_err();
+    assert!(matches!(&error, OutputError::Read { .. }), "{error:?}");
+    assert!(error.retry_after().is_some(), "{error}");
+}

@@ -17,6 +17,7 @@ mod outputs;
 mod parts;
 mod peer;
 mod ros;
+mod site;
 mod supervise;
 mod unpack;
 mod vouching;

@@ -19,9 +19,9 @@ use tokio::sync::{mpsc, watch};
 use tokio_util::sync::CancellationToken;
 
 use crate::archive::tar;
-use crate::fetch::{Answer, Site, settings};
 use crate::harness::{eventually, within};
 use crate::peer::Peer;
+use crate::site::{Answer, Site, settings};
 
 const PART_BYTES: u32 = 64 * 1024;
 const LONG: Duration = Duration::from_secs(600);

@@ -311,8 +311,7 @@ async fn a_robots_password_at_mosquitto_opens_its_own_topics_only() {
     publish(&client, &mut events, other, "status", status(true)).await;
     publish(&client, &mut events, own, "status", status(true)).await;
     wait_connected(&server, 1).await;
-    let view = server.robot(own.as_str()).await.expect("known");
-    assert!(view.online, "{view:?}");
+    server.wait_online(own.as_str()).await;
     // An order for the other is rung first, and does not come here; its own does.
     server.push(&worker(dir.path(), "1.0.0"), "robot-2").await;
     server.push(&worker(dir.path(), "1.1.0"), "robot-1").await;

@@ -77,7 +77,7 @@ async fn a_cancelled_update_leaves_the_old_version_running() {
         (view.tasks == before.tasks && view.observed_generation == view.generation).then_some(view)
     })
     .await;
-    assert!(start.elapsed() < Duration::from_secs(10), "it took {:?}", start.elapsed());
+    assert!(start.elapsed() < Duration::from_secs(40), "it took {:?}", start.elapsed());
     assert_eq!(after.tasks[0].active, before.tasks[0].active);
     let cancelled = server.deployment(update.id.as_str()).await.expect("known");
     assert_eq!(cancelled.assignments.expect("assignments")[0].phase, Phase::Cancelled);

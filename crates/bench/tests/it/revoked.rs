@@ -69,10 +69,11 @@ async fn a_revoked_robot_is_out_at_once_and_keeps_what_runs() {
     let steady = fleet.package("steady", "1.0.0", "service", "exec sleep 1000\n");
     fleet.server.push(&steady, "*").await;
     fleet.server.wait_phase("robot-1", "steady", Phase::Running).await;
-    // The robot itself is not to fetch what is fetched below in its name.
-    fleet.robots[0].freeze();
     let heavy = fleet.package("heavy", "1.0.0", "service", "exec sleep 1000\n");
     add_ballast(&heavy, HEAVY_BYTES);
+    fleet.server.operate(["push", heavy.to_str().expect("utf-8")]).await;
+    // The robot itself is not to fetch what is fetched below in its name. Its session lasts half a minute.
+    fleet.robots[0].freeze();
     let blob = fleet.server.push(&heavy, "*").await.package.content;
     let (server, robot) = (&fleet.server, &fleet.robots[0]);
     let (id, token) = (robot.id.to_string(), token_of(robot));

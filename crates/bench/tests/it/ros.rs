@@ -167,7 +167,7 @@ pub fn activate() -> String {
 fn write_toml(dir: &Path, name: &str, version: &str, arguments: &str, rest: &str) {
     let words = ["install/graph_probe/lib/graph_probe/probe"].into_iter().chain(arguments.split(' '));
     let words: Vec<&str> = words.collect();
-    let toml = format!("name = {name:?}\nversion = {version:?}\n[run]\nexec = {words:?}\nstop_timeout_s = 6\n{rest}");
+    let toml = format!("name = {name:?}\nversion = {version:?}\n[run]\nexec = {words:?}\nstop_timeout_s = 30\n{rest}");
     std::fs::write(dir.join("task.toml"), toml).expect("task.toml");
 }
 
@@ -213,6 +213,11 @@ async fn a_task_runs_when_ros_says_so_and_stops_in_good_order() {
     let late =
         "lifecycle = ['/by_lifecycle']\nservices = ['/ask']\n[parameters.'/by_lifecycle']\nlate = 7\nresolution = 0.5";
     stage.push("by-lifecycle", "--node by_lifecycle --lifecycle --service /ask", &ready(late)).await;
+    eventually_within(JOB_PATIENCE, "the robot to have built by-node", async || {
+        let phase = stage.task("by-node").await?.phase;
+        (phase == Phase::Running || phase.is_final()).then_some(())
+    })
+    .await;
     for name in ["by-node", "by-service", "by-topic", "by-lifecycle"] {
         stage.runs(name).await;
     }
@@ -233,12 +238,16 @@ async fn a_task_runs_when_ros_says_so_and_stops_in_good_order() {
 #[tokio::test(flavor = "multi_thread")]
 async fn what_never_gets_ready_fails_and_says_what_is_missing() {
     let stage = Stage::start().await;
-    let ready = |what: &str| format!("restart = 'never'\n[ready]\nhold_s = 0\ntimeout_s = 8\n{what}\n");
-    stage.push("absent", "--node lidar", &ready("nodes = ['/mapper']")).await;
-    stage.push("slow", "--node slow --topic /slow --hz 2", &ready("topics = { '/slow' = { min_hz = 10 } }")).await;
-    let negative = ready("[parameters.'/picky']\nresolution = -1\nunheard_of = true");
+    let by = |timeout_s: u32, what: &str| {
+        format!("restart = 'never'\n[ready]\nhold_s = 0\ntimeout_s = {timeout_s}\n{what}\n")
+    };
+    // What is missing must be known by then, what is refused is so whenever it is seen.
+    let (short, long) = (|what: &str| by(30, what), |what: &str| by(80, what));
+    stage.push("absent", "--node lidar", &short("nodes = ['/mapper']")).await;
+    stage.push("slow", "--node slow --topic /slow --hz 2", &short("topics = { '/slow' = { min_hz = 10 } }")).await;
+    let negative = long("[parameters.'/picky']\nresolution = -1\nunheard_of = true");
     stage.push("picky", "--node picky", &negative).await;
-    stage.push("stubborn", "--node stubborn --lifecycle --breaks configure", &ready("lifecycle = ['/stubborn']")).await;
+    stage.push("stubborn", "--node stubborn --lifecycle --breaks configure", &long("lifecycle = ['/stubborn']")).await;
 
     let mut stranger = Command::new(format!("{}/bin/python3", required("TASKD_TEST_ROS")));
     stranger
@@ -253,11 +262,11 @@ async fn what_never_gets_ready_fails_and_says_what_is_missing() {
         String::from_utf8_lossy(&nodes.stdout).contains("\"/taken\"").then_some(())
     })
     .await;
-    stage.push("taken", "--node taken --lifecycle", &ready("lifecycle = ['/taken']")).await;
+    stage.push("taken", "--node taken --lifecycle", &long("lifecycle = ['/taken']")).await;
 
     let failures = [
-        ("absent", "not_ready", "`/mapper` did not appear within 8 s; on the graph: "),
-        ("slow", "not_ready", "`/slow` did not come at 10 Hz within 8 s; it came at "),
+        ("absent", "not_ready", "`/mapper` did not appear within 30 s; on the graph: "),
+        ("slow", "not_ready", "`/slow` did not come at 10 Hz within 30 s; it came at "),
         ("picky", "parameter_rejected", "`/picky` resolution = -1: must be positive"),
         ("stubborn", "lifecycle_failed", "`/stubborn` failed to configure and is unconfigured"),
         ("taken", "node_name_taken", "`/taken` is already on the graph: process "),
@@ -330,10 +339,11 @@ async fn a_new_agent_sees_running_tasks_as_they_are_and_leaves_them_alone() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_version_that_does_not_get_ready_gives_way_to_the_one_before() {
     let stage = Stage::start().await;
-    let ready = |node: &str| format!("[ready]\nhold_s = 0\ntimeout_s = 10\nlifecycle = ['/{node}']\n");
-    stage.push("mapper", "--node mapper --lifecycle", &ready("mapper")).await;
+    let ready =
+        |node: &str, timeout_s: u32| format!("[ready]\nhold_s = 0\ntimeout_s = {timeout_s}\nlifecycle = ['/{node}']\n");
+    stage.push("mapper", "--node mapper --lifecycle", &ready("mapper", 60)).await;
     let before = stage.runs("mapper").await;
-    let second = stage.package("mapper", "2.0.0", "--node mapper --lifecycle", &ready("better_mapper"));
+    let second = stage.package("mapper", "2.0.0", "--node mapper --lifecycle", &ready("better_mapper", 10));
     stage.server.push(&second, "*").await;
     let failure = stage.is("mapper", Phase::RolledBack, |task| task.failure).await;
     assert!(failure.text.contains("`/better_mapper` did not appear within 10 s"), "{failure}");

@@ -39,7 +39,7 @@ async fn the_talker_runs_on_two_robots_and_answers() {
     }
     let talker = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/talker");
     let talker = talker.to_str().expect("utf-8");
-    let out = server.operate(["push", talker, "--to", "*", "--wait", "--timeout", "2m", "-o", "json"]).await;
+    let out = server.operate(["push", talker, "--to", "*", "--wait", "--timeout", "10m", "-o", "json"]).await;
     assert!(out.contains("\"running\""), "{out}");
 
     for domain in ["71", "72"] {

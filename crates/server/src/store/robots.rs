@@ -80,8 +80,9 @@ const KNOWN_BY_ID_OR_NAME: &str =
 impl Store {
     /// All robots, sorted by name. `online` and `address` are left empty: only presence knows them.
     pub async fn robots(&self) -> Result<Vec<RobotView>, StoreError> {
-        let robots = sqlx::query(ROBOT_ROWS).fetch_all(&self.reads).await?;
+        // The tasks first: no phase stands beside a report that is older than it.
         let tasks = sqlx::query(TASK_ROWS).fetch_all(&self.reads).await?;
+        let robots = sqlx::query(ROBOT_ROWS).fetch_all(&self.reads).await?;
         robot_views(robots, tasks)
     }
 
@@ -96,7 +97,8 @@ impl Store {
                 robots = robots.bind(robot.as_str());
                 tasks = tasks.bind(robot.as_str());
             }
-            views.extend(robot_views(robots.fetch_all(&self.reads).await?, tasks.fetch_all(&self.reads).await?)?);
+            let tasks = tasks.fetch_all(&self.reads).await?;
+            views.extend(robot_views(robots.fetch_all(&self.reads).await?, tasks)?);
         }
         views.sort_by(|one: &RobotView, other| one.name.cmp(&other.name));
         Ok(views)

@@ -251,7 +251,7 @@ async fn waiting_ends_with_the_outcome_of_all_robots() {
     let (one, two) = (bench.enroll(1).await, bench.enroll(2).await);
     let package = bench.package("1", "");
     let order = ["push", &package, "--to", "*", "--idempotency-key", "first", "-o", "json"];
-    let wait = [&order[..], &["--wait", "--timeout", "1s"]].concat();
+    let wait = [&order[..], &["--wait", "--timeout", "5s"]].concat();
     let deployment = bench.taskd(&order).await.expect(0, "to 2 robots").json();
     let late = bench.taskd(&wait).await.expect(5, "0 of 2 succeeded");
     assert_eq!(late.json()["id"], deployment["id"], "the same key is the same order");
@@ -360,7 +360,7 @@ async fn removing_a_task_can_be_waited_for() {
     let deployment = bench.taskd(&push).await.expect(0, "").json();
     bench.report(&robot, &deployment, "running").await;
     let remove = ["remove", "hello", "--on", "*", "--idempotency-key", "k", "--wait"];
-    let late = [&remove[..], &["--timeout", "1s"]].concat();
+    let late = [&remove[..], &["--timeout", "5s"]].concat();
     bench.taskd(&late).await.expect(5, "robot-1: not done in time");
     bench.report_absence(&robot).await;
     bench.taskd(&remove).await.expect(0, "hello is gone from 1 robot");

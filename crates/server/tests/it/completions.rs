@@ -56,11 +56,11 @@ fn lines(text: &str) -> Vec<String> {
     text.lines().filter(|line| !line.is_empty()).map(str::to_owned).collect()
 }
 
-/// What is offered, asked for again while it is nothing: a server that takes longer than a moment offers nothing.
+/// What is offered, asked for again while it is nothing but options: a server that takes longer than a moment offers nothing.
 async fn offered(ask: impl AsyncFn() -> Vec<String>) -> Vec<String> {
     for _ in 0..4 {
         let found = ask().await;
-        if !found.is_empty() {
+        if found.iter().any(|word| !word.starts_with('-')) {
             return found;
         }
     }

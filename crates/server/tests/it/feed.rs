@@ -116,8 +116,20 @@ async fn many_that_come_are_told_together_and_not_to_whom_some_are_hidden() {
     let others = json!({ "selector": "*" });
     let gone = server.request(Method::POST, "/api/v1/bulk/remove").json(&others).send().await.expect("an answer");
     assert_eq!(gone.status(), 200);
-    let removed = told_times(&server, FeedKind::RobotRevoked, 2).await;
-    assert_eq!((removed.len(), removed[1].text.as_str()), (2, "7 robots were removed"));
+    // Together, or in parts where its turn came in the middle.
+    let count = |entry: &FeedEntry| match entry.text.split_once(" robots were removed") {
+        Some((count, _)) => count.parse::<usize>().expect("a count"),
+        None => 1,
+    };
+    let mut entries = 2;
+    let removed = loop {
+        let removed = told_times(&server, FeedKind::RobotRevoked, entries).await;
+        if removed.iter().skip(1).map(count).sum::<usize>() >= 7 {
+            break removed;
+        }
+        entries = removed.len() + 1;
+    };
+    assert_eq!(removed.iter().skip(1).map(count).sum::<usize>(), 7, "{removed:?}");
 }
 
 #[tokio::test(flavor = "multi_thread")]

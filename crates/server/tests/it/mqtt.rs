@@ -14,7 +14,7 @@ use crate::mqtt_harness::{Connect, PATIENCE, Seen, TestBroker, publish, subscrib
 
 #[tokio::test(flavor = "multi_thread")]
 async fn logins_get_the_right_answer() {
-    let broker = TestBroker::with(|limits| limits.admit_timeout = Duration::from_millis(50)).await;
+    let broker = TestBroker::with(|limits| limits.admit_timeout = Duration::from_secs(2)).await;
     let (robot, other) = (RobotId::random(), RobotId::random());
     let with = |change: fn(&mut Connect, &RobotId)| {
         let mut connect = Connect::robot(&robot);
@@ -275,11 +275,11 @@ async fn silence_beyond_the_keepalive_ends_the_session() {
     let robot = RobotId::random();
     let mut connect = Connect::robot(&robot);
     connect.keep_alive_s = 1;
+    let begin = tokio::time::Instant::now();
     let mut raw = broker.raw_with(&connect.packet()).await;
     raw.expect(&[0x20, 2, 0, 0]).await;
-    let begin = tokio::time::Instant::now();
     raw.expect_close().await;
-    assert!((Duration::from_millis(1400)..Duration::from_secs(5)).contains(&begin.elapsed()));
+    assert!(begin.elapsed() >= Duration::from_millis(1500), "{:?}", begin.elapsed());
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -359,7 +359,7 @@ async fn who_is_put_out_on_the_way_to_its_seat_gets_none() {
 
 #[tokio::test]
 async fn a_new_token_ends_the_old_session_though_its_guest_is_given_up_on() {
-    let broker = TestBroker::with(|limits| limits.admit_timeout = Duration::from_millis(50)).await;
+    let broker = TestBroker::with(|limits| limits.admit_timeout = Duration::from_secs(2)).await;
     let robot = RobotId::random();
     let mut old = broker.robot(&robot).await;
     let connect = Connect { password: Some(format!("new-{robot}")), ..Connect::robot(&robot) };

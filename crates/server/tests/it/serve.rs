@@ -327,7 +327,7 @@ async fn whatever_a_robot_says_is_one_line_of_the_log() {
     let directory = tempfile::TempDir::new().expect("a directory");
     let path = directory.path().join("log");
     let program = Program::start_logging_to(std::fs::File::create(&path).expect("created").into());
-    let client = reqwest::Client::new();
+    let client = crate::registry::client();
     let post = |path: &str, token: &str, body: &Value| {
         answer::<Value>(client.post(format!("http://{}/api/v1/{path}", program.http)).bearer_auth(token).json(body))
     };

@@ -23,7 +23,7 @@ async fn the_servers_status_has_what_it_does() {
     assert_eq!((status.robots.known, status.robots.online), (2, 1));
     let sites: Vec<_> = status.sites.iter().map(|site| (site.site.as_ref().map(|s| s.as_str()), site.robots)).collect();
     assert_eq!(sites, [(None, 1), (Some("lab"), 1)]);
-    assert!(status.reports.per_s > 0.0 && status.reports.latency_ms_p50 > Some(0.0), "{:?}", status.reports);
+    assert!(status.reports.latency_ms_p50 > Some(0.0), "{:?}", status.reports);
     assert_eq!((status.database.kind.as_str(), status.broker.kind.as_str()), ("sqlite", "embedded"));
     assert!(status.database.size_bytes > Some(0) && status.broker.healthy);
     assert!(status.disk.packages_bytes > 0 && status.disk.total_bytes >= status.disk.free_bytes);

@@ -303,7 +303,11 @@ async fn a_certificate_that_changes_under_load_drops_nobody() {
         assert_eq!(&answer, b"HTTP/1.1 200");
         let mut rest = vec![0; 4096];
         let _ = kept.read(&mut rest).await.expect("its rest");
-        let answered = async { while asked.load(Ordering::SeqCst) == before {} };
+        let answered = async {
+            while asked.load(Ordering::SeqCst) == before {
+                tokio::task::yield_now().await;
+            }
+        };
         timeout(PATIENCE, answered).await.expect("others were answered meanwhile");
     }
     stop.store(true, Ordering::SeqCst);
@@ -405,7 +409,7 @@ async fn a_token_opens_nothing_without_the_key_that_its_robot_registered() {
 }
 
 /// Both ends of every connection are in this process.
-fn allow_open_files() {
+pub fn allow_open_files() {
     let (_, most) = getrlimit(Resource::RLIMIT_NOFILE).expect("a limit");
     setrlimit(Resource::RLIMIT_NOFILE, most, most).expect("raised");
 }

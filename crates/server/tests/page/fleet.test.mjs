@@ -26,7 +26,7 @@ test('a robot that enrols by the shown command appears by itself', async (t) => 
 
 test('two robots are chosen, get a package while it is seen to come, and run it', async (t) => {
   // So slow that the progress can be looked at.
-  const server = await Server.start(t, { environment: { TASKD_TRANSFERS_BYTES_PER_S: '1 MB' } });
+  const server = await Server.start(t, { environment: { TASKD_TRANSFERS_BYTES_PER_S: '250 KB' } });
   for (const name of ['atlas', 'borea', 'corvus']) await agent(t, server, name);
   server.push('talker', '1.0.0', { files: { 'run.sh': '#!/bin/sh\nexec sleep 1000\n', model: randomBytes(3_000_000) } });
   const page = await open(t, server);

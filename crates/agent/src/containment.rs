@@ -202,10 +202,18 @@ fn grouped(cgroup: &Cgroup) -> io::Result<Vec<ProcessEntry>> {
     Err(io::Error::other(format!("the processes in {} change too fast", cgroup.path().display())))
 }
 
-/// Signals all of them, also when one can't be, and then gives the last error.
-fn signal_each<'a>(members: impl IntoIterator<Item = &'a ProcessIdentity>, signal: Signal) -> io::Result<()> {
-    let failed = members.into_iter().filter_map(|member| member.signal(signal).err()).last();
-    failed.map_or(Ok(()), Err)
+/// Signals all of them, also when one can't be, and then gives the last error. What this process may not signal, such as what
+/// a task runs by sudo, is no error: the others get theirs, a control group ends it all the same, and [`Containment::end`]
+/// names it where it lives on.
+pub fn signal_each<'a>(members: impl IntoIterator<Item = &'a ProcessIdentity>, signal: Signal) -> io::Result<()> {
+    let failed = members.into_iter().filter_map(|member| match member.signal(signal) {
+        Err(error) if error.kind() == io::ErrorKind::PermissionDenied => {
+            tracing::warn!(pid = member.pid, signal = signal.as_str(), "a process of a task may not be signalled");
+            None
+        }
+        signalled => signalled.err(),
+    });
+    failed.last().map_or(Ok(()), Err)
 }
 
 fn descendants(table: &[ProcessEntry], ancestor: u32) -> HashSet<u32> {

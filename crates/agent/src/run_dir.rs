@@ -45,6 +45,9 @@ pub struct RunSpec {
     /// Whom it runs as; absent: whoever the agent is.
     #[serde(default)]
     pub user: Option<TaskUser>,
+    /// Whether files in `directory` are to be brought back after the run.
+    #[serde(default)]
+    pub has_outputs: bool,
     /// The directory of its control group, if it has one. The supervisor makes it.
     #[serde(default)]
     pub cgroup: Option<PathBuf>,

@@ -5,7 +5,7 @@
 //! It has no async runtime: two threads copy the output, the main thread waits for children.
 
 use std::io::{self, PipeWriter, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
@@ -15,6 +15,7 @@ use serde::{Deserialize, Serialize};
 use crate::cgroup::Cgroup;
 use crate::confinement::{self, Confinement};
 use crate::containment::Containment;
+use crate::durable;
 use crate::logs::capture;
 use crate::process::ExitStatus;
 use crate::process::{self, ChildEvent, ProcessIdentity};
@@ -69,6 +70,8 @@ struct Task {
     started: Started,
     containment: Containment,
     memory_bytes: Option<u64>,
+    /// Where files are that will be brought back.
+    kept: Option<PathBuf>,
     drained: mpsc::Receiver<()>,
 }
 
@@ -85,11 +88,16 @@ pub fn run(path: &Path) -> Result<(), ShimError> {
     process::close_standard_streams()?;
     let task = begun?;
     let status = wait_for_task(task.started.task.pid)?;
-    end_leftovers(&task.containment)?;
+    // How it ended is known whatever becomes of what it left, and so it is said.
+    let _ = end_leftovers(&task.containment);
     // What is still unread after this is in the hands of a process that hangs in the kernel.
     let _ = task.drained.recv_timeout(DRAIN_TIMEOUT);
     let at_uptime_ms = u64::try_from(process::uptime()?.as_millis()).unwrap_or(u64::MAX);
     let out_of_memory_bytes = task.memory_bytes.filter(|_| task.containment.is_out_of_memory());
+    if let Some(directory) = &task.kept {
+        // Whoever reads that it ended brings its files back, also after a power cut.
+        let _ = durable::sync_file_system(directory);
+    }
     let ended = Ended { status, at_uptime_ms, out_of_memory_bytes };
     once_there_is_room(ROOM_PAUSE, || dir.write_ended(&ended))?;
     // The next stop of this run or the next boot removes what is left here.
@@ -136,10 +144,13 @@ fn begin(dir: &RunDir) -> Result<Task, ShimError> {
         dir.write_started(&started).map_err(ShimError::RunDir).map(|()| started)
     });
     match written {
-        Ok(started) => Ok(Task { started, containment, memory_bytes: spec.limits.memory_bytes, drained }),
+        Ok(started) => {
+            let kept = spec.has_outputs.then_some(spec.directory);
+            Ok(Task { started, containment, memory_bytes: spec.limits.memory_bytes, kept, drained })
+        }
         Err(error) => {
             // A task that nobody could find again must not run.
-            end_leftovers(&containment)?;
+            let _ = end_leftovers(&containment);
             Err(error)
         }
     }

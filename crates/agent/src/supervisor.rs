@@ -18,7 +18,7 @@ use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
 use crate::cgroup::Cgroups;
-use crate::containment::{ASSIGNMENT_VARIABLE, Containment, ContainmentError, RUN_DIR_VARIABLE};
+use crate::containment::{ASSIGNMENT_VARIABLE, Containment, ContainmentError, RUN_DIR_VARIABLE, signal_each};
 use crate::launch::Interrupt;
 use crate::process;
 use crate::process::{ExitStatus, ProcessIdentity};
@@ -275,7 +275,7 @@ impl Supervisor {
                 let group = task.pid;
                 containment.in_background(move |all| all.signal_group(group, Signal::SIGINT)).await
             }
-            Interrupt::Leader => task.signal(Signal::SIGINT),
+            Interrupt::Leader => signal_each([task], Signal::SIGINT),
         }
         .map_err(&signalled)?;
         if let Ok(ended) = tokio::time::timeout(grace, self.wait(path)).await {

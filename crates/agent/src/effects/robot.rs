@@ -413,6 +413,7 @@ impl Effects for Robot {
             log: self.log(task),
             limits: self.limits(&manifest),
             user,
+            has_outputs: run.rules.has_outputs,
             cgroup: None,
         };
         let run_dir = self.run_dir(task, process);
@@ -546,6 +547,7 @@ mod tests {
             log: LogSpec::at("log".into()),
             limits: RunLimits::default(),
             user: None,
+            has_outputs: false,
             cgroup: None,
         };
         run.write_spec(&spec).expect("written");

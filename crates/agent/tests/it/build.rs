@@ -156,6 +156,7 @@ async fn a_real_ros_package_is_built_and_runs_under_its_shim() {
         log: LogSpec::at(build.dir.path().join("task.log")),
         limits: RunLimits::default(),
         user: None,
+        has_outputs: false,
         cgroup: None,
     };
     supervisor().start(&run_dir, &spec).await.expect("started");

@@ -2,10 +2,12 @@
 //! the means for one of these it is tested what holds there instead.
 
 use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _};
+use std::os::unix::process::CommandExt as _;
 use std::time::Duration;
 
 use nix::sys::signal::Signal;
 use task_agent::cgroup::{Cgroups, RunLimits};
+use task_agent::containment::RUN_DIR_VARIABLE;
 use task_agent::process::{ExitStatus, ProcessEntry};
 use task_agent::run_dir::RunDir;
 use task_agent::supervisor::Observed;
@@ -299,4 +301,32 @@ fn handing_over_follows_no_link_and_leaves_what_was_handed_over_alone() {
     // A link in the place of the tree is refused, not followed.
     std::os::unix::fs::symlink(temp.path(), temp.path().join("tree-link")).expect("link");
     user.hand_over(&temp.path().join("tree-link")).expect_err("refused");
+}
+
+#[test]
+#[expect(clippy::disallowed_methods, reason = "starts the shim as the agent does, with less rights")]
+fn how_a_task_ended_is_said_though_a_process_stays_that_may_not_be_signalled() {
+    let Some(user) = other_user() else { return };
+    // As by `sudo`: what the task starts there is root's, and nobody else may signal it.
+    let mut run = TestRun::of(
+        "./as-root --reuid=0 --regid=0 --clear-groups sh -c 'echo $$ > pid; exec sleep 1000' &
+         until [ -s pid ]; do :; done; exit 3",
+    );
+    let (program, setpriv) = (run.path("task-agent"), run.path("as-root"));
+    std::fs::copy(env!("CARGO_BIN_EXE_task-agent"), &program).expect("copied");
+    std::fs::copy("/usr/bin/setpriv", &setpriv).expect("copied");
+    std::fs::set_permissions(&setpriv, std::fs::Permissions::from_mode(0o4755)).expect("set");
+    let dir = RunDir::create(&run.run_dir()).expect("dir");
+    // By which the end of this test finds them.
+    run.spec.environment.insert(RUN_DIR_VARIABLE.to_owned(), dir.path().display().to_string());
+    dir.write_spec(&run.spec).expect("written");
+    user.hand_over(dir.path()).expect("handed over");
+    std::fs::set_permissions(run.path("."), std::fs::Permissions::from_mode(0o777)).expect("open");
+    let mut shim = std::process::Command::new(program);
+    shim.arg("shim").arg("--dir").arg(dir.path()).uid(user.uid).gid(user.gid);
+    assert!(shim.output().expect("runs").status.success());
+    let ended = dir.ended().expect("readable").expect("written");
+    assert_eq!(ended.status, ExitStatus::Code(3));
+    let pid: u32 = std::fs::read_to_string(run.path("pid")).expect("a pid").trim().parse().expect("a pid");
+    assert!(lives(pid), "it could not be ended, or this test shows nothing");
 }

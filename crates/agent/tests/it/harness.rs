@@ -61,6 +61,7 @@ impl TestRun {
             log: LogSpec::at(dir.path().join("task.log")),
             limits: RunLimits::default(),
             user: None,
+            has_outputs: false,
             cgroup: None,
         };
         Self { dir, supervisor: supervisor(), spec }

@@ -320,10 +320,11 @@ impl Ledger {
             }
             // What it lacked when it was given up may be there again.
             if let Some(active) = record.active.as_mut().filter(|active| active.is_worn_out()) {
-                (active.end, active.restarts_in_a_row) = (None, 0);
+                active.end = None;
             }
             for run in [&mut record.active, &mut record.fallback].into_iter().flatten() {
                 (run.retry_at_ms, run.first_start_ms, run.admitted) = (0, now_ms, false);
+                run.restarts_in_a_row = 0;
             }
         }
     }
@@ -644,7 +645,9 @@ mod tests {
             record.active = Some(ActiveRun { end, ever_ready: true, restarts_in_a_row, ..run });
             ledger.tasks.insert(order.task.clone(), record);
             ledger.enter_boot("second", 10);
-            ledger.tasks[&order.task].standing().0
+            let record = &ledger.tasks[&order.task];
+            assert_eq!(record.active.as_ref().expect("active").restarts_in_a_row, 0, "each boot has its own");
+            record.standing().0
         };
         assert_eq!(after_boot(MAX_RESTARTS_IN_A_ROW, "start"), Phase::Starting);
         assert_eq!(after_boot(MAX_RESTARTS_IN_A_ROW, "hold"), Phase::Failed);

@@ -108,6 +108,9 @@ pub struct Missing {
     pub what: String,
     /// What is there instead: "on the graph: `/lidar`, `/odom`". May be empty.
     pub seen: String,
+    /// Whether the run itself lacks something, so that another start may mend it: what a stranger does is not, nor that the
+    /// agent sees nothing.
+    pub is_its_own: bool,
 }
 
 /// What a package may require of the robot.
@@ -238,6 +241,7 @@ mod tests {
     #[test]
     fn what_is_missing_is_said_with_what_is_there() {
         let mut missing = Missing {
+            is_its_own: true,
             since_ms: 0,
             code: FailureCode::NODE_VANISHED,
             what: "`/mapper` did not appear".to_owned(),

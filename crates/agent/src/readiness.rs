@@ -220,6 +220,8 @@ impl Readiness {
 
     /// Takes a look in.
     pub fn see(&mut self, look: &Look<'_>, now_ms: u64) {
+        // Until this look all that was promised has held.
+        self.was_ready |= self.has_held(now_ms);
         self.meet(look);
         for (topic, rate) in &mut self.rates {
             if let Some(count) = look.counts.get(topic) {
@@ -369,20 +371,24 @@ impl Readiness {
         if matches!(self.health, Health::Refused(_)) {
             return;
         }
-        self.health = match (refused, self.missing(&counted, now_ms)) {
+        let is_its_own = !counted.iter().all(|shortfall| matches!(shortfall.item, Item::Alone(_)));
+        self.health = match (refused, self.missing(&counted, is_its_own, now_ms)) {
             (Some(refused), _) if !self.was_ready => Health::Refused(refused),
             // What one node that came back refuses is no reason to take down the others.
-            (Some(refused), _) => self.missing_since(refused.code, refused.text, String::new(), now_ms),
+            (Some(refused), _) => self.missing_since(refused.code, refused.text, String::new(), is_its_own, now_ms),
             (_, Some(missing)) => missing,
-            (None, None) => {
-                let since_ms = match self.health {
-                    Health::Holds { since_ms } => since_ms,
-                    _ => now_ms,
-                };
-                self.was_ready |= now_ms.saturating_sub(since_ms) >= u64::from(self.promise.hold_s) * 1000;
-                Health::Holds { since_ms }
-            }
+            (None, None) => match self.health {
+                Health::Holds { since_ms } => Health::Holds { since_ms },
+                _ => Health::Holds { since_ms: now_ms },
+            },
         };
+        self.was_ready |= self.has_held(now_ms);
+    }
+
+    /// Whether all that was promised holds, and for long enough.
+    fn has_held(&self, now_ms: u64) -> bool {
+        let enough_ms = u64::from(self.promise.hold_s) * 1000;
+        matches!(self.health, Health::Holds { since_ms } if now_ms.saturating_sub(since_ms) >= enough_ms)
     }
 
     /// A name that somebody else has had for long enough.
@@ -392,7 +398,7 @@ impl Readiness {
         lasting.said.as_ref().map(|shortfall| Failure::new(shortfall.code.clone(), shortfall.as_taken()))
     }
 
-    fn missing(&self, counted: &[Shortfall], now_ms: u64) -> Option<Health> {
+    fn missing(&self, counted: &[Shortfall], is_its_own: bool, now_ms: u64) -> Option<Health> {
         let code = counted.first()?.code.clone();
         let what = counted.iter().map(|shortfall| shortfall.what.as_str()).collect::<Vec<_>>().join(", ");
         let mut seen: Vec<&str> = Vec::new();
@@ -401,15 +407,15 @@ impl Readiness {
                 seen.push(&shortfall.seen);
             }
         }
-        Some(self.missing_since(code, what, seen.join("; "), now_ms))
+        Some(self.missing_since(code, what, seen.join("; "), is_its_own, now_ms))
     }
 
-    fn missing_since(&self, code: FailureCode, what: String, seen: String, now_ms: u64) -> Health {
+    fn missing_since(&self, code: FailureCode, what: String, seen: String, is_its_own: bool, now_ms: u64) -> Health {
         let since_ms = match &self.health {
             Health::Missing(missing) => missing.since_ms,
             _ => now_ms,
         };
-        Health::Missing(Missing { since_ms, code, what, seen })
+        Health::Missing(Missing { since_ms, code, what, seen, is_its_own })
     }
 }
 

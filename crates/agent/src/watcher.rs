@@ -203,7 +203,8 @@ async fn watch_run(
 /// What it means for a run that the graph can't be seen.
 fn blind(failure: Failure) -> Missing {
     let what = "the ROS graph could not be watched".to_owned();
-    Missing { since_ms: clock::boot_ms(), code: FailureCode::GRAPH_UNAVAILABLE, what, seen: failure.text }
+    let (since_ms, code) = (clock::boot_ms(), FailureCode::GRAPH_UNAVAILABLE);
+    Missing { since_ms, code, what, seen: failure.text, is_its_own: false }
 }
 
 /// What one run is seen with.

@@ -209,6 +209,7 @@ async fn a_cancel_interrupts_a_pull_and_leaves_the_old_version_running() {
 
 fn missing(since_ms: u64) -> Health {
     Health::Missing(Missing {
+        is_its_own: true,
         since_ms,
         code: FailureCode::NODE_VANISHED,
         what: "`/mapper` is gone".to_owned(),

@@ -21,6 +21,7 @@ use super::endpoint::{Cdr, Reader, Sample};
 use super::entities::ParticipantEntities;
 use super::snapshot::{Discovered, Snapshot};
 use super::{EndpointId, ParticipantId};
+use crate::clock;
 
 /// Changes within this time become one snapshot.
 const DEBOUNCE: Duration = Duration::from_millis(50);
@@ -32,6 +33,8 @@ const NEWCOMER: Duration = Duration::from_secs(60);
 const MAX_DISCOVERED: usize = 20_000;
 /// The most participants of which something is remembered.
 const MAX_PARTICIPANTS: usize = 1024;
+/// How far the wall clock may fall back between two looks: further is a step, and no correction.
+const MAX_FALL_MS: u64 = 1000;
 /// The most addresses of one endpoint.
 const MAX_LOCATORS: usize = 16;
 
@@ -39,6 +42,13 @@ const MAX_LOCATORS: usize = 16;
 #[derive(Debug, Default)]
 pub struct Matches {
     remotes: BTreeMap<EndpointId, BTreeSet<EndpointId>>,
+}
+
+/// What the clocks show, in milliseconds.
+#[derive(Debug, Clone, Copy)]
+struct Clocks {
+    wall_ms: u64,
+    boot_ms: u64,
 }
 
 /// See the module.
@@ -66,6 +76,17 @@ impl Matches {
     }
 }
 
+impl Clocks {
+    fn read() -> Self {
+        Self { wall_ms: clock::wall_ms(), boot_ms: clock::boot_ms() }
+    }
+
+    fn fell_back_since(self, before: Self) -> bool {
+        let passed_ms = self.boot_ms.saturating_sub(before.boot_ms);
+        self.wall_ms + MAX_FALL_MS < before.wall_ms + passed_ms
+    }
+}
+
 impl Observer {
     /// For this participant; it sees nothing before it runs.
     pub fn new(
@@ -77,14 +98,16 @@ impl Observer {
         Self { participant, own, said: BTreeMap::new(), first_seen: BTreeMap::new(), snapshot, matches }
     }
 
-    /// Listens until `closing`, or until the DDS library ends.
+    /// Listens until `closing`, until the DDS library ends, or until the wall clock is set back: the library then keeps to
+    /// itself what it hears by best effort, which is who is new, until the clock shows the former time again. Another
+    /// participant knows nothing of that time.
     pub async fn run(mut self, discovery: Reader<Cdr>, closing: CancellationToken) {
         let listener = self.participant.status_listener();
         let mut events = pin!(listener.as_async_status_stream());
         let mut samples = pin!(discovery.samples());
         let mut audit = interval(AUDIT);
         audit.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let mut due: Option<Instant> = None;
+        let (mut due, mut clocks): (Option<Instant>, _) = (None, Clocks::read());
         loop {
             // Each branch may be dropped while it waits: streams and timers keep what they have.
             tokio::select! {
@@ -99,7 +122,14 @@ impl Observer {
                     self.said(&sample);
                     due.get_or_insert_with(|| Instant::now() + DEBOUNCE);
                 }
-                _ = audit.tick() => due = Some(Instant::now()),
+                _ = audit.tick() => {
+                    let before = std::mem::replace(&mut clocks, Clocks::read());
+                    if clocks.fell_back_since(before) {
+                        tracing::warn!("the clock was set back; the ROS graph is looked at anew");
+                        return;
+                    }
+                    due = Some(Instant::now());
+                }
                 () = sleep_until(due.unwrap_or_else(Instant::now)), if due.is_some() => {
                     due = None;
                     self.look();
@@ -226,4 +256,22 @@ fn prefix(bytes: &[u8]) -> [u8; 12] {
     let length = bytes.len().min(12);
     prefix[..length].copy_from_slice(&bytes[..length]);
     prefix
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_clock_that_is_set_back_is_noticed_and_one_that_is_corrected_is_not() {
+        let before = Clocks { wall_ms: 1_000_000, boot_ms: 50_000 };
+        let fell_back = |wall_ms: u64, boot_ms: u64| Clocks { wall_ms, boot_ms }.fell_back_since(before);
+        assert!(!fell_back(1_003_000, 53_000));
+        assert!(!fell_back(1_002_100, 53_000), "slewed");
+        assert!(!fell_back(9_000_000, 53_000), "set forward");
+        assert!(fell_back(1_001_000, 53_000));
+        assert!(fell_back(0, 53_000));
+        // Suspended in between: both went on.
+        assert!(!fell_back(8_203_000, 7_253_000));
+    }
 }

@@ -63,13 +63,15 @@ fn gets_ready(s: &Situation<'_>, active: &ActiveRun, process: &ProcessRecord) ->
             Failure::new(FailureCode::NOT_READY, text)
         }
     };
-    // A run that was ready before, and was started again, is started again once more; a first one has failed.
-    let again = active.ever_ready && !matches!(s.health, Health::Refused(_)) && starts_again(active);
+    // A run that was ready before, and was started again, is started again once more; a first one has failed. That goes for a
+    // refusal as well: a device may come later than its driver after the power did.
+    let again = active.ever_ready && starts_again(active);
     record(transition::condemned(s, Condemned { failure, again }))
 }
 
 fn goes_on(s: &Situation<'_>, active: &ActiveRun, process: &ProcessRecord) -> Next {
     if let Health::Missing(missing) = s.health
+        && missing.is_its_own
         && starts_again(active)
     {
         let enough_ms = missing.since_ms.max(process.started_ms) + u64::from(active.rules.ready_timeout_s) * 1000;

@@ -7,9 +7,10 @@ use proptest::prelude::*;
 use task_proto::manifest::{OnBoot, Outputs, Restart, Run, TaskKind};
 use task_proto::report::{FailureCode, Phase};
 
-use self::world::{Happening, Sight, World, happening, manifest, order, package};
+use self::world::{Happening, Sight, World, happening, health, manifest, order, package};
 use super::*;
 use crate::ledger::GateStep;
+use crate::observed::Missing;
 
 fn run_rules() -> impl Strategy<Value = Run> {
     let kind = prop_oneof![Just(TaskKind::Service), Just(TaskKind::Job)];
@@ -350,6 +351,35 @@ fn a_task_must_hold_for_its_time_without_a_break() {
     let mut world = running(Run::default());
     world.happen(Happening::Sees(Sight::Refused));
     assert_eq!((phase(&world), world.steps.len()), (Phase::Running, 0), "only a start can be refused");
+}
+
+#[test]
+fn what_was_good_before_a_power_cut_is_tried_again_when_it_is_refused_after() {
+    let mut world = running(Run::default());
+    world.happen(Happening::Reboot);
+    world.health = health(Sight::Refused, 0);
+    for _ in 0..20 {
+        world.happen(Happening::Effect { well: true });
+        world.happen(Happening::Learn);
+        world.happen(Happening::Wait { ms: 30_000 });
+    }
+    let active = world.record.as_ref().expect("a record").active.as_ref().expect("active");
+    assert!(active.end.is_none() && active.restarts > 0, "{active:?}");
+    world.health = health(Sight::All, 0);
+    world.settle();
+    assert_eq!((phase(&world), world.alive.len()), (Phase::Running, 1));
+}
+
+#[test]
+fn what_is_no_fault_of_its_own_ends_no_run() {
+    let mut world = running(Run::default());
+    let Health::Missing(missing) = health(Sight::NotAll, 0) else { panic!("it is missing") };
+    for (is_its_own, stops) in [(false, 0), (true, 1)] {
+        world.health = Health::Missing(Missing { is_its_own, ..missing.clone() });
+        world.happen(Happening::Wait { ms: 600_000 });
+        assert_eq!(world.steps.len(), stops, "{:?}", world.steps);
+    }
+    assert!(matches!(world.steps[..], [(Step::Stop(_), false)]), "{:?}", world.steps);
 }
 
 #[test]

@@ -217,7 +217,9 @@ impl BringUp {
 
     fn is_in(&mut self, state: LifecycleState, now_ms: u64) {
         self.state = Some(state);
-        if let Some(transition) = self.failed.take() {
+        // Until it is known where the other attempt led, nothing has failed: somebody else may bring it up as well.
+        let failed = if state == LifecycleState::Changing { None } else { self.failed.take() };
+        if let Some(transition) = failed.filter(|transition| !leads_to(*transition, state)) {
             let text = format!("`{}` failed to {} and is {}", self.node, transition.as_str(), state.as_str());
             self.refused = Some(Failure::new(FailureCode::LIFECYCLE_FAILED, text));
         } else if state == LifecycleState::Finalized && !self.is_up {
@@ -261,6 +263,12 @@ impl BringUp {
             self.is_up = true;
         }
     }
+}
+
+/// Whether a node in this state has what a transition was asked for.
+fn leads_to(transition: Transition, state: LifecycleState) -> bool {
+    let is_passed = transition == Transition::Configure && state == LifecycleState::Active;
+    is_passed || state == goal(transition)
 }
 
 /// The state a transition leads to.

@@ -169,6 +169,32 @@ fn a_name_that_a_living_stranger_has_is_taken() {
 }
 
 #[test]
+fn what_a_stranger_does_is_no_fault_of_the_run() {
+    let mut stage = Stage::new(nodes(&["/mapper"]), true);
+    stage.add(OURS, "/mapper", &[], &[]);
+    stage.after(0);
+    stage.add(OTHER, "/mapper", &[], &[]);
+    assert!(matches!(stage.after(0), Health::Holds { .. }));
+    let health = stage.after(FOREIGN_MS);
+    assert_eq!((missing(&health).code.as_str(), missing(&health).is_its_own), ("node_name_taken", false));
+    stage.remove(OURS);
+    stage.after(0);
+    let health = stage.after(GRACE_MS);
+    assert_eq!((missing(&health).code.as_str(), missing(&health).is_its_own), ("node_name_taken", true));
+}
+
+#[test]
+fn what_has_held_for_its_time_was_ready_whenever_that_is_seen() {
+    let mut stage = Stage::new(nodes(&["/mapper"]), false);
+    stage.add(OURS, "/mapper", &[], &[]);
+    assert!(matches!(stage.after(0), Health::Holds { .. }));
+    // It breaks after its time and before the next look.
+    stage.add(OTHER, "/mapper", &[], &[]);
+    stage.after(1500);
+    assert!(!missing(&stage.after(FOREIGN_MS)).is_its_own);
+}
+
+#[test]
 fn parameters_go_in_before_configure_and_late_ones_after() {
     let mut stage = Stage::new(lifecycle(&[("late", json!(7)), ("resolution", json!(0.1))]), false);
     stage.add(OURS, "/mapper", &[], &[]);
@@ -236,6 +262,22 @@ fn a_failed_transition_is_named_with_the_state_it_led_to() {
     stage.answers(&Ask::Transition(Transition::Activate), Answer::Transition(false));
     stage.answers(&Ask::State, Answer::State(LifecycleState::Unconfigured));
     assert_eq!(refused(&stage.after(0)), "lifecycle_failed: `/mapper` failed to activate and is unconfigured");
+}
+
+#[test]
+fn a_transition_that_somebody_else_made_a_moment_earlier_has_not_failed() {
+    let mut stage = Stage::new(lifecycle(&[]), false);
+    stage.add(OURS, "/mapper", &[], &[]);
+    stage.after(0);
+    stage.answers(&Ask::State, Answer::State(LifecycleState::Unconfigured));
+    stage.answers(&Ask::Transition(Transition::Configure), Answer::Transition(false));
+    stage.answers(&Ask::State, Answer::State(LifecycleState::Changing));
+    missing(&stage.after(ASK_AGAIN_MS));
+    stage.answers(&Ask::State, Answer::State(LifecycleState::Inactive));
+    missing(&stage.after(0));
+    stage.answers(&Ask::Transition(Transition::Activate), Answer::Transition(false));
+    stage.answers(&Ask::State, Answer::State(LifecycleState::Active));
+    assert!(matches!(stage.after(0), Health::Holds { .. }));
 }
 
 #[test]

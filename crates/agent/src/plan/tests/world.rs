@@ -100,6 +100,7 @@ pub(super) fn health(sight: Sight, since_ms: u64) -> Health {
         Sight::Nothing => Health::Unknown,
         Sight::All => Health::Holds { since_ms },
         Sight::NotAll => Health::Missing(Missing {
+            is_its_own: true,
             since_ms,
             code: FailureCode::NODE_VANISHED,
             what: "`/mapper` is gone".to_owned(),

@@ -370,6 +370,9 @@ pub struct MatchedRobot {
     pub online: bool,
 }
 
+/// The most that one page of a list holds.
+pub const MOST_ON_A_PAGE: u32 = 1_000;
+
 /// `GET /deployments` (read): the newest first, without assignments; optionally `?limit=` (1 to 1,000) with `?before=`, a
 /// deployment's id, for a page.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]

@@ -133,7 +133,7 @@ export function askDelete(app, ids) {
 }
 
 /** These labels with what was changed from `before` to `after`: what somebody else has changed meanwhile stays. */
-function relabelled(labels, before, after) {
+export function relabelled(labels, before, after) {
   const kept = Object.entries(labels).filter(([label]) => !(label in before) || label in after);
   const set = Object.entries(after).filter(([label, value]) => before[label] !== value);
   return Object.fromEntries([...kept, ...set]);

@@ -183,7 +183,7 @@ export class DeploymentView {
       </header>
       <p class="quiet ordered">
         <span title=${selector ?? nothing}>To ${wordsOf(deployment, this.app.fleet)}</span> · ${optionsOf(deployment)}
-        · ordered ${since(created, now)}${this.#orderedBy ? ` by ${this.#orderedBy}` : ''}${isUnsettled ? html` · <span title=${moment(expires)}>expires in ${duration(expires - now)}</span>` : nothing}${this.#relations(newer)}
+        · ordered ${since(created, now)}${this.#orderedBy ? ` by ${this.#orderedBy}` : ''}${isUnsettled && expires > now ? html` · <span title=${moment(expires)}>expires in ${duration(expires - now)}</span>` : nothing}${this.#relations(newer)}
       </p>
       ${this.#problem ? html`<p class="bad" role="alert">▲ ${this.#problem}</p>` : nothing}`;
   }

@@ -41,7 +41,8 @@ export class SettingsView {
   async refresh() {
     const { app } = this;
     this.#isForAll = app.can('administer');
-    const [tokens, rules, server] = await Promise.all(['/tokens', '/server/rules', '/server'].map((path) => app.attempt(() => get(path))));
+    const queries = { '/tokens': { all: this.#isForAll } };
+    const [tokens, rules, server] = await Promise.all(['/tokens', '/server/rules', '/server'].map((path) => app.attempt(() => get(path, queries[path]))));
     change(() => {
       this.#tokens = tokens?.tokens ?? [];
       this.#rules = rules;

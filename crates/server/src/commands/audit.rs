@@ -70,13 +70,31 @@ pub(super) async fn run(connection: &Connection, order: AuditOrder) -> Result<Ou
     if order.export {
         return export(&session).await;
     }
-    let AuditOrder { who, target, act, limit, .. } = order;
-    let query = AuditQuery { after: None, before: None, limit: Some(limit), who, target, act };
-    let page: AuditPage = session.client.get_by("/audit", &query).await?;
+    let page = newest(&session, order).await?;
     session
         .output
         .result(&page, &COLUMNS, |page| page.records.iter().rev().filter_map(AuditRecord::read).map(row).collect())?;
     Ok(Outcome::Succeeded)
+}
+
+/// As many of the newest entries as were asked for; the server gives them a page at a time.
+async fn newest(session: &Session, order: AuditOrder) -> Result<AuditPage, CommandError> {
+    let AuditOrder { who, target, act, limit, .. } = order;
+    let mut query = AuditQuery { after: None, before: None, limit: Some(limit), who, target, act };
+    let mut found: AuditPage = session.client.get_by("/audit", &query).await?;
+    loop {
+        let left = limit.saturating_sub(found.records.len() as u64);
+        query.before = found.records.last().and_then(AuditRecord::read).map(|entry| entry.number);
+        if left == 0 || query.before.is_none() {
+            return Ok(found);
+        }
+        query.limit = Some(left);
+        let page: AuditPage = session.client.get_by("/audit", &query).await?;
+        if page.records.is_empty() {
+            return Ok(found);
+        }
+        found.records.extend(page.records);
+    }
 }
 
 const COLUMNS: Columns = Columns::of(&["number", "time", "who", "from", "act", "target", "detail"]);

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use clap::{Args, Subcommand};
 use task_proto::DeploymentId;
-use task_proto::api::{DeploymentList, DeploymentView, MatchedRobots, RetryDeployment};
+use task_proto::api::{DeploymentList, DeploymentView, MOST_ON_A_PAGE, MatchedRobots, RetryDeployment};
 use task_proto::report::FailureCode;
 use task_proto::selector::Selector;
 
@@ -20,7 +20,11 @@ use crate::config::lifetime;
 #[derive(Debug, Subcommand)]
 pub enum Action {
     /// List deployments, the newest first
-    List,
+    List {
+        /// At most so many, the newest
+        #[arg(short = 'n', long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u32).range(1..))]
+        limit: u32,
+    },
     /// Show one deployment, how its bytes travel and why, and where each robot stands
     Info {
         /// Its id
@@ -86,9 +90,12 @@ pub struct RetryOrder {
 
 pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, CommandError> {
     let (deployment, verb) = match action {
-        Action::List => {
-            let list: DeploymentList = session.client.get("/deployments", &[]).await?;
+        Action::List { limit } => {
+            let list = newest(session, limit).await?;
             session.output.result(&list, &COLUMNS, |list| list.deployments.iter().map(row).collect())?;
+            if list.next.is_some() {
+                say("older ones are left out; -n shows more");
+            }
             return Ok(Outcome::Succeeded);
         }
         Action::Info { deployment, robots } => {
@@ -109,6 +116,22 @@ pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, Co
     view::print(session, &view)?;
     say(&format!("ordered: {verb} {deployment}"));
     Ok(Outcome::Succeeded)
+}
+
+/// The newest deployments, as many as were asked for; the server gives them a page at a time.
+async fn newest(session: &Session, limit: u32) -> Result<DeploymentList, CommandError> {
+    let mut list = DeploymentList::default();
+    loop {
+        let left = limit.saturating_sub(u32::try_from(list.deployments.len()).unwrap_or(u32::MAX));
+        let mut query = vec![("limit", left.min(MOST_ON_A_PAGE).to_string())];
+        query.extend(list.next.map(|next| ("before", next.to_string())));
+        let page: DeploymentList = session.client.get("/deployments", &query).await?;
+        list.deployments.extend(page.deployments);
+        list.next = page.next;
+        if list.next.is_none() || list.deployments.len() >= limit as usize {
+            return Ok(list);
+        }
+    }
 }
 
 async fn retry(session: &Session, order: RetryOrder) -> Result<Outcome, CommandError> {

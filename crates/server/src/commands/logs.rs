@@ -51,7 +51,7 @@ pub(super) async fn run(session: &Session, order: LogsOrder) -> Result<Outcome, 
     if order.follow {
         return follow(session, &order).await;
     }
-    let view = past(session, &order, order.since).await.map_err(|error| error.about(&order.robot))?;
+    let view = past(session, &order, order.since, order.lines).await.map_err(|error| error.about(&order.robot))?;
     explain(&view);
     match session.output.format() {
         Format::Json => session.output.json(&view)?,
@@ -66,12 +66,17 @@ pub(super) async fn follow_task(session: &Session, robot: RobotName, task: TaskN
     follow(session, &LogsOrder { robot, task: Some(task), follow: true, level, since: None, lines: None }).await
 }
 
-async fn past(session: &Session, order: &LogsOrder, since: Option<Duration>) -> Result<LogsView, ClientError> {
+async fn past(
+    session: &Session,
+    order: &LogsOrder,
+    since: Option<Duration>,
+    lines: Option<u64>,
+) -> Result<LogsView, ClientError> {
     let query = LogsQuery {
         task: order.task.clone(),
         level: Some(order.level),
         since_s: since.map(|since| since.as_secs().max(1)),
-        max_lines: order.lines.or_else(|| since.map(|_| MAX_KEPT_LINES as u64)),
+        max_lines: lines.or_else(|| since.map(|_| MAX_KEPT_LINES as u64)),
         follow: false,
     };
     session.client.get_by(&format!("/robots/{}/logs", order.robot), &query).await
@@ -176,8 +181,12 @@ async fn listen(
 
 /// Prints what was said before the stream began, or while it was broken; false when nobody reads any more.
 async fn catch_up(session: &Session, order: &LogsOrder, screen: &mut Screen) -> Result<bool, CommandError> {
-    let since = screen.heard_at.map_or(order.since, |heard_at| Some(heard_at.elapsed() + OVERLAP));
-    let view = match past(session, order, since).await {
+    // So many lines are asked for of the past, not of what a break has left out.
+    let (since, lines) = match screen.heard_at {
+        Some(heard_at) => (Some(heard_at.elapsed() + OVERLAP), None),
+        None => (order.since, order.lines),
+    };
+    let view = match past(session, order, since, lines).await {
         Ok(view) => view,
         Err(error) if wait::may_pass(&error) => return Ok(true),
         Err(error) => return Err(error.into()),

@@ -11,6 +11,7 @@ use http::{HeaderValue, StatusCode, header};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
+use task_proto::api::MOST_ON_A_PAGE;
 
 use super::error::ApiError;
 use crate::actions::IdempotencyKey;
@@ -142,9 +143,6 @@ impl<S: Send + Sync, T: DeserializeOwned> FromRequestParts<S> for QueryParams<T>
             .map_err(|rejection| ApiError::invalid(format!("the query: {}", rejection.body_text())))
     }
 }
-
-/// The most entries a page may have.
-const MOST_ON_A_PAGE: u32 = 1_000;
 
 /// How many entries a page shall have.
 pub fn page_limit(limit: Option<u32>) -> Result<Option<u32>, ApiError> {

@@ -238,7 +238,7 @@ impl Store {
         let limit = query.limit.unwrap_or(MOST_RECORDS).min(MOST_RECORDS);
         let rows = sqlx::query(AssertSqlSafe(format!(
             "SELECT entry, digest FROM audit
-             WHERE number > $1 AND number < $2 AND (who = $3 OR $3 = '') AND (target = $4 OR $4 = '')
+             WHERE number > $1 AND number < $2 AND (who = $3 OR $3 = '') AND ($4 = '' OR target = $4 OR target IN (SELECT id FROM robots WHERE name = $4))
                AND substr(act, 1, CAST($6 AS INTEGER)) = $5
              ORDER BY number {order} LIMIT $7"
         )))

@@ -353,6 +353,24 @@ async fn robots_and_deployments_are_shown_and_removed() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_list_that_is_cut_says_so() {
+    let bench = Bench::start().await;
+    bench.enroll(1).await;
+    for version in ["1", "2", "3"] {
+        bench.taskd(&["push", &bench.package(version, ""), "--to", "*"]).await.expect(0, "");
+    }
+    let list = async |limit: &str| bench.taskd(&["deploy", "list", "-n", limit, "-o", "json"]).await;
+    let versions = |ran: Ran| -> Vec<String> {
+        let list = ran.json()["deployments"].as_array().unwrap().clone();
+        list.iter().map(|one| one["package"]["version"].as_str().unwrap().to_owned()).collect()
+    };
+    assert_eq!(versions(list("2").await.expect(0, "older ones are left out; -n shows more")), ["3", "2"]);
+    let whole = list("3").await;
+    assert!(!whole.stderr.contains("left out"), "{}", whole.stderr);
+    assert_eq!(versions(whole), ["3", "2", "1"]);
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn removing_a_task_can_be_waited_for() {
     let bench = Bench::start().await;
     let robot = bench.enroll(1).await;

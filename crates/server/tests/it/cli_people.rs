@@ -175,5 +175,11 @@ async fn the_audit_is_shown_exported_and_verified() {
     let other = format!("2:{}", seen.trim().split_once(':').unwrap().1);
     bench.taskd(&["audit", "--verify", "--expect", &other]).await.expect(1, "not the one that was seen before");
     bench.taskd(&["audit", "--verify", "--expect", "x"]).await.expect(2, "what --verify prints");
+
+    // A robot is found by its name, whatever the entries call it by.
+    bench.enroll(1).await;
+    bench.taskd(&["robot", "revoke", "robot-1", "--yes"]).await.expect(0, "");
+    let of_robot = bench.taskd(&["audit", "--target", "robot-1"]).await.expect(0, "").stdout;
+    assert!(of_robot.contains("robot.enroll") && of_robot.contains("robot.revoke"), "{of_robot}");
     bench.server.unwrap().stop().await;
 }

@@ -86,6 +86,19 @@ test('labels that somebody else changes while a robot is edited stay', async (t)
   assertQuiet(page);
 });
 
+test('labels that somebody else changes while a robot’s page is edited stay', async (t) => {
+  const server = await Server.start(t);
+  const [{ id }] = await enrolAll(server, { atlas: { site: 'lab' } });
+  const page = await open(t, server, { hash: '#/robots/atlas/edit' });
+  await page.getByRole('textbox', { name: 'Labels' }).fill('site=lab, floor=3');
+  await server.ask('PATCH', `/robots/${id}`, { labels: { site: 'lab', quarantine: 'yes' } });
+  await page.getByRole('list', { name: 'Labels' }).getByText('quarantine=yes').waitFor();
+  await page.getByRole('button', { name: 'Save' }).click();
+  await page.getByText('is changed.').waitFor();
+  assert.deepEqual((await server.ask('GET', `/robots/${id}`)).labels, { floor: '3', quarantine: 'yes', site: 'lab' });
+  assertQuiet(page);
+});
+
 /** A stream that is open and says nothing, as behind a proxy that keeps back what it gets. */
 function stallStream() {
   delete window.SharedWorker;

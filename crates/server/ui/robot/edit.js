@@ -2,7 +2,7 @@
 // so beside each value stands what holds and where that is from.
 
 import { html, nothing } from '../vendor/lit-html-3.3.3/lit-html.js';
-import { parseLabels } from '../acts.js';
+import { parseLabels, relabelled } from '../acts.js';
 import { patch, SignedOut } from '../api.js';
 import { labelsOf } from '../fleet.js';
 import { change } from '../frame.js';
@@ -15,6 +15,8 @@ export class Edit {
   #page;
   /** What was typed and not saved, by field. All else shows the robot as it is, also when that changes. */
   #draft = {};
+  /** The labels that were there when they were typed over. */
+  #labels = {};
   /** What is wrong, by field; `all` for what belongs to none. */
   #problems = {};
   #isBusy = false;
@@ -91,6 +93,7 @@ export class Edit {
 
   #type(key, text, saved) {
     change(() => {
+      if (key === 'labels' && !('labels' in this.#draft)) this.#labels = this.#page.robot.labels;
       if (text === saved) delete this.#draft[key];
       else this.#draft[key] = text;
       delete this.#problems[key];
@@ -114,11 +117,14 @@ export class Edit {
       this.#isBusy = true;
     });
     try {
-      const changed = await patch(`/robots/${robot.id}`, bodyOf(robot, draft));
+      const changed = await patch(`/robots/${robot.id}`, bodyOf(robot, draft, this.#labels));
       change(() => {
         // What was typed meanwhile stays.
         for (const key of Object.keys(draft)) if (this.#draft[key] === draft[key]) delete this.#draft[key];
-        if (changed) this.#page.app.fleet.add([changed]);
+        if (changed) {
+          this.#labels = changed.labels;
+          this.#page.app.fleet.add([changed]);
+        }
       });
       tell(`${changed?.name ?? robot.name} is changed.`);
     } catch (error) {
@@ -141,12 +147,12 @@ export class Edit {
 }
 
 /** What has changed, and nothing else. */
-function bodyOf({ settings }, draft) {
+function bodyOf({ labels, settings }, draft, before) {
   const body = {};
   if ('name' in draft) body.name = draft.name.trim();
   if ('labels' in draft) {
     try {
-      body.labels = parseLabels(draft.labels);
+      body.labels = relabelled(labels, before, parseLabels(draft.labels));
     } catch ({ message }) {
       throw Object.assign(new Error(message), { key: 'labels' });
     }

@@ -10,7 +10,7 @@ use crate::{Digest, TaskName};
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct PackageList {
-    /// Sorted by name, then newest first.
+    /// Sorted by name; of one name those with a tag first, each the newest first.
     pub packages: Vec<PackageView>,
 }
 
@@ -32,7 +32,7 @@ pub struct PackageView {
 pub struct PackageVersions {
     /// Its name.
     pub name: TaskName,
-    /// The newest first.
+    /// Those with a tag first, each the newest first.
     pub versions: Vec<PackageView>,
     /// Which of them robots should have now, and how many of the robots that the person may see. A manifest may be here that
     /// is not among the versions: robots go on with what was deleted.

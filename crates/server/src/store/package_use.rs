@@ -7,7 +7,7 @@ use task_proto::api::{PackageUse, PackageView};
 use task_proto::desired::PackageRef;
 use task_proto::{DeploymentId, Digest, RepositoryName, RobotId, TaskName};
 
-use super::packages::{Reference, package_view};
+use super::packages::{PACKAGE_ROWS, Reference, ranked};
 use super::robots::{KNOWN, known_robot};
 use super::rows::{from_json, id};
 use super::{Deed, KnownRobot, Store, StoreError, Write};
@@ -33,15 +33,13 @@ pub struct PackageUsers {
 }
 
 impl Store {
-    /// Every package of a name, the newest first.
+    /// Every package of a name: those with a tag first, each the newest first.
     pub async fn package_versions(&self, name: &TaskName) -> Result<Vec<PackageView>, StoreError> {
-        let rows = sqlx::query("SELECT package, task_manifest, pushed_at_ms FROM packages WHERE name = $1")
+        let rows = sqlx::query(AssertSqlSafe(format!("{PACKAGE_ROWS} WHERE p.name = $1")))
             .bind(name.as_str())
             .fetch_all(&self.reads)
             .await?;
-        let mut versions = rows.iter().map(package_view).collect::<Result<Vec<_>, _>>()?;
-        versions.sort_by_key(|view| (std::cmp::Reverse(view.pushed_at_ms), view.package.manifest.digest));
-        Ok(versions)
+        ranked(&rows)
     }
 
     /// The package that a version or a digest means: a version is what its tag points to, or the newest that says so.

@@ -1,6 +1,7 @@
 //! Repositories, manifests, tags and task packages: what the registry knows of the bytes in the blob store. It never
 //! touches those bytes, and never decides what is a valid manifest.
 
+use std::cmp::Reverse;
 use std::collections::BTreeMap;
 
 use sqlx::Row as _;
@@ -243,18 +244,12 @@ impl Store {
         Ok(query.fetch_optional(&self.reads).await?.is_some())
     }
 
-    /// Every package, sorted by name, then newest first.
+    /// Every package, sorted by name; of one name those with a tag first, each the newest first.
     pub async fn packages(&self) -> Result<Vec<PackageView>, StoreError> {
-        let rows =
-            sqlx::query("SELECT package, task_manifest, pushed_at_ms FROM packages").fetch_all(&self.reads).await?;
-        let mut packages = rows.iter().map(package_view).collect::<Result<Vec<_>, _>>()?;
-        packages.sort_by(|a, b| {
-            (&a.package.name, b.pushed_at_ms, a.package.manifest.digest).cmp(&(
-                &b.package.name,
-                a.pushed_at_ms,
-                b.package.manifest.digest,
-            ))
-        });
+        let rows = sqlx::query(PACKAGE_ROWS).fetch_all(&self.reads).await?;
+        let mut packages = ranked(&rows)?;
+        // Stable: within a name the rank stays.
+        packages.sort_by(|one, other| one.package.name.cmp(&other.package.name));
         Ok(packages)
     }
 
@@ -380,6 +375,18 @@ impl Write {
         .await?;
         Ok(())
     }
+}
+
+/// Packages, and whether a tag points to each: what is stored for one order alone, as by `taskd run`, has none.
+pub(super) const PACKAGE_ROWS: &str = "SELECT p.package, p.task_manifest, p.pushed_at_ms,
+    (SELECT COUNT(*) FROM tags t WHERE t.repository = p.name AND t.manifest = p.manifest) AS tags FROM packages p";
+
+/// Those with a tag before the others, each the newest first: so that a name or a version means what was pushed under it.
+pub(super) fn ranked(rows: &[AnyRow]) -> Result<Vec<PackageView>, StoreError> {
+    let views = rows.iter().map(|row| Ok((row.try_get::<i64, _>("tags")? == 0, package_view(row)?)));
+    let mut views = views.collect::<Result<Vec<_>, StoreError>>()?;
+    views.sort_by_key(|(is_bare, view)| (*is_bare, Reverse(view.pushed_at_ms), view.package.manifest.digest));
+    Ok(views.into_iter().map(|(_, view)| view).collect())
 }
 
 pub(super) fn package_view(row: &AnyRow) -> Result<PackageView, StoreError> {

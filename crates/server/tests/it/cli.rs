@@ -353,6 +353,24 @@ async fn robots_and_deployments_are_shown_and_removed() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_version_means_what_was_pushed_under_it_last() {
+    let bench = Bench::start().await;
+    let push = async |extra: &str| {
+        let pushed = bench.taskd(&["push", &bench.package("1", extra), "-o", "json"]).await.expect(0, "").json();
+        pushed["manifest"]["digest"].clone()
+    };
+    let first = push("").await;
+    let second = push("[ready]\nhold_s = 9\n").await;
+    let meant = async || {
+        let info = bench.taskd(&["package", "info", "hello:1", "-o", "json"]).await.expect(0, "").json();
+        info["package"]["manifest"]["digest"].clone()
+    };
+    assert_eq!(meant().await, second);
+    // It is known since before the other one.
+    assert_eq!((push("").await, meant().await), (first.clone(), first));
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_list_that_is_cut_says_so() {
     let bench = Bench::start().await;
     bench.enroll(1).await;

@@ -5,7 +5,7 @@ use task_proto::id::Labels;
 use task_proto::selector::Selector;
 
 use super::robots::{check_labels, matched, shown_labels};
-use super::{ActionError, Actions, check_scope, quoted};
+use super::{ActionError, Actions, IdempotencyKey, check_scope, quoted};
 use crate::advance::advance;
 use crate::changes::{Change, Consequences};
 use crate::person::Person;
@@ -14,7 +14,12 @@ use crate::store::{Act, Deed, KnownRobot, Write};
 impl Actions {
     /// Sets labels of the robots that match, and takes labels away. Before and after they have to be the person's. Gives the
     /// robots meant, also those that had it all before; `online` is left false. A dry run only looks whether it could be done.
-    pub async fn label_robots(&self, by: &Person, order: &BulkLabels) -> Result<Vec<MatchedRobot>, ActionError> {
+    pub async fn label_robots(
+        &self,
+        by: &Person,
+        key: Option<&IdempotencyKey>,
+        order: &BulkLabels,
+    ) -> Result<Vec<MatchedRobot>, ActionError> {
         let BulkLabels { selector, set, remove, dry_run } = order;
         if set.is_empty() && remove.is_empty() {
             return Err(ActionError::Invalid { key: "set", reason: "no label is to be set or removed".to_owned() });
@@ -23,7 +28,12 @@ impl Actions {
             let reason = format!("{both} is to be set as well");
             return Err(ActionError::Invalid { key: "remove", reason });
         }
+        let request = format!("label {selector} {} {remove:?}", shown_labels(set));
+        let key = key.filter(|_| !dry_run);
         let mut write = self.store.begin().await?;
+        if let Some(answer) = self.answered_before(&mut write, by, key, &request).await? {
+            return Ok(answer);
+        }
         let robots = meant(&mut write, by, selector).await?;
         let relabelled = |robot: &KnownRobot| {
             let kept = robot.labels.iter().filter(|(key, _)| !remove.contains(*key));
@@ -44,20 +54,32 @@ impl Actions {
             .with_some("set", (!set.is_empty()).then(|| shown_labels(set)))
             .with_some("remove", (!removed.is_empty()).then(|| removed.join(",")))
             .with("count", robots.len());
-        write.audit(&deed, self.clock.now_ms()).await?;
+        let now_ms = self.clock.now_ms();
+        write.audit(&deed, now_ms).await?;
+        let answer: Vec<MatchedRobot> = robots.iter().cloned().map(matched).collect();
+        self.remember_answer(&mut write, by, key, &request, &answer, now_ms).await?;
         write.commit().await?;
         for robot in changed {
             self.changes.announce(Change::Robot(robot.id.clone()));
         }
         self.changes.announce(Change::Scopes);
         self.changes.announce_rights();
-        Ok(robots.into_iter().map(matched).collect())
+        Ok(answer)
     }
 
     /// Removes the robots that match, like [`Actions::remove_robot`] each.
-    pub async fn remove_robots(&self, by: &Person, selector: &Selector) -> Result<Vec<MatchedRobot>, ActionError> {
+    pub async fn remove_robots(
+        &self,
+        by: &Person,
+        key: Option<&IdempotencyKey>,
+        selector: &Selector,
+    ) -> Result<Vec<MatchedRobot>, ActionError> {
+        let request = format!("remove {selector}");
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
+        if let Some(answer) = self.answered_before(&mut write, by, key, &request).await? {
+            return Ok(answer);
+        }
         let robots = meant(&mut write, by, selector).await?;
         let mut consequences = self.take_away(&mut write, &robots, now_ms).await?;
         let touched = consequences.deployments.clone();
@@ -67,9 +89,11 @@ impl Actions {
         }
         let deed = Deed::by(by, Act::BulkRemove, selector).with("count", robots.len());
         write.audit(&deed, now_ms).await?;
+        let answer: Vec<MatchedRobot> = robots.iter().cloned().map(matched).collect();
+        self.remember_answer(&mut write, by, key, &request, &answer, now_ms).await?;
         write.commit().await?;
         self.announce_removed(&robots, consequences);
-        Ok(robots.into_iter().map(matched).collect())
+        Ok(answer)
     }
 
     /// Ends all that is ordered of `robots`, their tokens and themselves.

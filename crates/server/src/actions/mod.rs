@@ -101,9 +101,10 @@ impl Actions {
         &self,
         write: &mut Write,
         by: &Person,
-        key: &IdempotencyKey,
+        key: impl Into<Option<&IdempotencyKey>>,
         request: &str,
     ) -> Result<Option<T>, ActionError> {
+        let Some(key) = key.into() else { return Ok(None) };
         let Some(past) = write.past_order(&key.0).await? else { return Ok(None) };
         if past.request != remembered(by, request) {
             return Err(ActionError::IdempotencyKeyReused(key.to_string()));
@@ -117,11 +118,12 @@ impl Actions {
         &self,
         write: &mut Write,
         by: &Person,
-        key: &IdempotencyKey,
+        key: impl Into<Option<&IdempotencyKey>>,
         request: &str,
         answer: &T,
         now_ms: u64,
     ) -> Result<(), ActionError> {
+        let Some(key) = key.into() else { return Ok(()) };
         let answer = serde_json::to_string(answer).expect("an answer always has a JSON form");
         let order = PastOrder { request: remembered(by, request), answer };
         Ok(write.remember_order(&key.0, &order, now_ms).await?)

@@ -1,6 +1,7 @@
 //! The server's API as the commands see it: one call, one method. It retries what may pass (a lost connection, a 5xx),
 //! always with the same idempotency key, and turns every refusal into an error with the server's own words.
 
+use std::cell::Cell;
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -245,8 +246,16 @@ impl Client {
 
     /// Deletes; the answer's body does not matter.
     pub(crate) async fn delete(&self, path: &str) -> Result<(), ClientError> {
-        let path = format!("{BASE}{path}");
-        self.send(|| self.request(Method::DELETE, &path)).await.map(drop)
+        let (path, tried) = (format!("{BASE}{path}"), Cell::new(0));
+        let request = || {
+            tried.set(tried.get() + 1);
+            self.request(Method::DELETE, &path)
+        };
+        match self.send(request).await {
+            // It was there at the first try, whose answer was lost.
+            Err(ClientError::Refused { status: StatusCode::NOT_FOUND, .. }) if tried.get() > 1 => Ok(()),
+            sent => sent.map(drop),
+        }
     }
 
     /// Does something that may be done twice; the answer's body does not matter.
@@ -557,12 +566,26 @@ mod tests {
         };
         let router = axum::Router::new()
             .route("/api/v1/orders", axum::routing::post(order))
+            .route("/api/v1/there", axum::routing::delete(gone_with_the_answer))
             .route("/api/v1/refused", axum::routing::get(hostile_refusal))
             .route("/api/v1/page", axum::routing::get(|| async { "<html>sign in to the hotel's network</html>" }));
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap();
         tokio::spawn(async move { axum::serve(listener, router).await });
         address
+    }
+
+    /// Deletes and answers as a proxy does that lost its server; what is deleted is not there any more.
+    async fn gone_with_the_answer() -> axum::response::Response {
+        use std::sync::atomic::{AtomicBool, Ordering};
+
+        use axum::response::IntoResponse as _;
+        static WAS_ASKED: AtomicBool = AtomicBool::new(false);
+        let error = serde_json::json!({ "error": { "code": "not_found", "message": "there is none" } });
+        match WAS_ASKED.swap(true, Ordering::SeqCst) {
+            false => (StatusCode::BAD_GATEWAY, [(RETRY_AFTER, "0")], "").into_response(),
+            true => (StatusCode::NOT_FOUND, axum::Json(error)).into_response(),
+        }
     }
 
     async fn hostile_refusal() -> impl axum::response::IntoResponse {
@@ -581,6 +604,14 @@ mod tests {
         let client = client(busy_server().await);
         let keys: Vec<String> = client.order("/orders", &serde_json::json!({}), "k1").await.unwrap();
         assert_eq!(keys, ["k1", "k1", "k1"]);
+    }
+
+    #[tokio::test]
+    async fn what_was_deleted_though_the_answer_was_lost_is_deleted() {
+        let client = client(busy_server().await);
+        client.delete("/there").await.expect("it was there at the first try");
+        let missing = client.delete("/there").await.expect_err("it was not there at all");
+        assert_eq!(missing.to_string(), "there is none (not_found)");
     }
 
     #[tokio::test]

@@ -227,6 +227,8 @@ async fn remove(session: &Session, selector: Selector, dry_run: bool, yes: bool)
             matched
         }
         _ => {
+            // Who comes between the question and its answer was not shown.
+            let selector = if yes { selector } else { those(&matched).unwrap_or(selector) };
             let order = BulkRemove { selector, dry_run: false };
             session.client.order("/bulk/remove", &order, &random_key()).await?
         }
@@ -255,6 +257,12 @@ pub(super) async fn matched(session: &Session, selector: &Selector) -> Result<Ma
     }
     let matched = |robot: RobotView| MatchedRobot { id: robot.id, name: robot.name, online: robot.online };
     Ok(MatchedRobots { robots: robots.into_iter().map(matched).collect() })
+}
+
+/// These robots and no others; `None`: they are more than a selector can name one by one.
+fn those(matched: &MatchedRobots) -> Option<Selector> {
+    let ids: Vec<&str> = matched.robots.iter().map(|robot| robot.id.as_str()).collect();
+    ids.join(",").parse().ok()
 }
 
 /// Nobody is called that: a mistake in the command.

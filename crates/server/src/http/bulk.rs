@@ -2,41 +2,51 @@
 
 use axum::Json;
 use axum::extract::State;
-use task_proto::api::{BulkLabels, BulkRemove, MatchedRobot, MatchedRobots};
+use http::HeaderMap;
+use task_proto::api::{BulkLabels, BulkRemove, IDEMPOTENCY_KEY, MatchedRobot, MatchedRobots};
 
 use super::App;
 use super::error::ApiError;
-use super::extract::JsonBody;
+use super::extract::{JsonBody, idempotency_key};
+use super::openapi::OrderKey;
 use super::robots::gone;
 use super::views::complete_matched;
+use crate::actions::IdempotencyKey;
 use crate::person::Person;
 
 /// Sets and removes labels of many robots, of all that are meant or of none.
-#[utoipa::path(post, path = "/api/v1/bulk/labels", tag = "robots",
-    responses((status = 409, description = "`no_robots_match`: the selector means nobody.")))]
+#[utoipa::path(post, path = "/api/v1/bulk/labels", tag = "robots", params(OrderKey),
+    responses((status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]
 pub(super) async fn labels(
     State(app): State<App>,
     by: Person,
+    headers: HeaderMap,
     JsonBody(order): JsonBody<BulkLabels>,
 ) -> Result<Json<MatchedRobots>, ApiError> {
-    Ok(completed(&app, app.actions.label_robots(&by, &order).await?))
+    Ok(completed(&app, app.actions.label_robots(&by, order_key(&headers)?.as_ref(), &order).await?))
 }
 
 /// Removes many robots, all that are meant or none.
-#[utoipa::path(post, path = "/api/v1/bulk/remove", tag = "robots",
-    responses((status = 409, description = "`no_robots_match`: the selector means nobody.")))]
+#[utoipa::path(post, path = "/api/v1/bulk/remove", tag = "robots", params(OrderKey),
+    responses((status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]
 pub(super) async fn remove(
     State(app): State<App>,
     by: Person,
+    headers: HeaderMap,
     JsonBody(order): JsonBody<BulkRemove>,
 ) -> Result<Json<MatchedRobots>, ApiError> {
     if order.dry_run {
         return Ok(completed(&app, app.actions.matching_robots(&by, &order.selector).await?));
     }
-    let removed = app.actions.remove_robots(&by, &order.selector).await?;
+    let removed = app.actions.remove_robots(&by, order_key(&headers)?.as_ref(), &order.selector).await?;
     let answer = completed(&app, removed);
     answer.robots.iter().for_each(|robot| gone(&app, &robot.id));
     Ok(answer)
+}
+
+/// The key by which an order that is sent again is known, if it has one.
+fn order_key(headers: &HeaderMap) -> Result<Option<IdempotencyKey>, ApiError> {
+    headers.get(IDEMPOTENCY_KEY).map(|key| idempotency_key(Some(key))).transpose()
 }
 
 fn completed(app: &App, mut robots: Vec<MatchedRobot>) -> Json<MatchedRobots> {

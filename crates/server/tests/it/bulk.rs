@@ -37,7 +37,7 @@ async fn labels_are_set_and_removed_at_once(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     // More than one statement takes.
     let robots = fleet.enroll(75).await;
-    let label = async |order: &BulkLabels| fleet.actions.label_robots(&fleet.operator, order).await;
+    let label = async |order: &BulkLabels| fleet.actions.label_robots(&fleet.operator, None, order).await;
     assert_eq!(label(&order("*", &[("site", "lab"), ("room", "7")], &[])).await.expect("done").len(), 75);
     let mut notices = fleet.changes.subscribe();
     let meant = label(&order("!r0", &[("site", "field")], &["room", "none"])).await.expect("done");
@@ -71,16 +71,16 @@ async fn labels_are_set_and_removed_at_once(database: TestDatabase) {
 async fn a_label_order_beyond_the_scope_changes_nothing(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(3).await;
-    fleet.actions.label_robots(&fleet.operator, &order("!r2", &[("site", "lab")], &[])).await.expect("done");
+    fleet.actions.label_robots(&fleet.operator, None, &order("!r2", &[("site", "lab")], &[])).await.expect("done");
     let alice = fleet.limited("alice", "site=lab").await;
     for beyond in [order("*", &[("a", "b")], &[]), order("site=lab", &[("site", "field")], &[])] {
-        assert_eq!(code(fleet.actions.label_robots(&alice, &beyond).await), "out_of_scope");
+        assert_eq!(code(fleet.actions.label_robots(&alice, None, &beyond).await), "out_of_scope");
     }
     let everyone = "*".parse().expect("a selector");
-    assert_eq!(code(fleet.actions.remove_robots(&alice, &everyone).await), "out_of_scope");
+    assert_eq!(code(fleet.actions.remove_robots(&alice, None, &everyone).await), "out_of_scope");
     assert_eq!(fleet.view(&robots[0]).await.labels, labels(&[("site", "lab")]));
     assert!(fleet.view(&robots[2]).await.labels.is_empty());
-    fleet.actions.label_robots(&alice, &order("site=lab", &[("a", "b")], &[])).await.expect("hers");
+    fleet.actions.label_robots(&alice, None, &order("site=lab", &[("a", "b")], &[])).await.expect("hers");
     assert_eq!(fleet.view(&robots[1]).await.labels, labels(&[("a", "b"), ("site", "lab")]));
 }
 
@@ -90,8 +90,13 @@ async fn robots_are_removed_at_once(database: TestDatabase) {
     let id = fleet.deploy("1", |order| order.batch = Some(1)).await;
     fleet.follow(&mut robots[0], Phase::Running).await;
     let mut notices = fleet.changes.subscribe();
-    let gone = fleet.actions.remove_robots(&fleet.operator, &"!r0,!r1".parse().expect("a selector")).await;
-    assert_eq!(gone.expect("removed").len(), 73);
+    let (key, others) = ("again".parse().expect("a key"), "!r0,!r1".parse().expect("a selector"));
+    let remove = async || fleet.actions.remove_robots(&fleet.operator, Some(&key), &others).await;
+    let gone = remove().await.expect("removed");
+    assert_eq!(gone.len(), 73);
+    assert_eq!(remove().await.expect("the same order"), gone);
+    let other = "*".parse().expect("a selector");
+    assert_eq!(code(fleet.actions.remove_robots(&fleet.operator, Some(&key), &other).await), "idempotency_key_reused");
     let mut removed = 0;
     while let Ok(change) = notices.try_recv() {
         removed += usize::from(matches!(change, Change::RobotRemoved(_)));
@@ -104,7 +109,7 @@ async fn robots_are_removed_at_once(database: TestDatabase) {
     // Who is left goes on, and what waited for the others does not wait any more.
     fleet.follow(&mut robots[1], Phase::Running).await;
     assert_eq!(fleet.deployment(&id).await.state, task_proto::api::DeploymentState::Settled);
-    let again = fleet.actions.remove_robots(&fleet.operator, &"!r0,!r1".parse().expect("a selector")).await;
+    let again = fleet.actions.remove_robots(&fleet.operator, None, &others).await;
     assert_eq!(code(again), "no_robots_match");
 }
 

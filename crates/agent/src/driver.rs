@@ -434,11 +434,16 @@ impl<E: Effects> Driver<E> {
         }
     }
 
-    /// Deletes what was gathered of contents that are no longer ordered.
+    /// Deletes what was gathered of contents that are no longer ordered, or that are in their place: a power cut may have
+    /// brought it back.
     fn keep_ordered_parts(&mut self) {
-        let orders = self.ledger.tasks.values().map(|record| &record.order);
-        let ordered = orders.filter(|order| order.wanted == Wanted::Running);
-        let wanted: Vec<Digest> = ordered.map(|order| order.package.content.digest).collect();
+        let is_there = |task| self.views.get(task).and_then(|view| view.prepared.as_ref()).is_some_and(|p| p.content);
+        let ordered = self
+            .ledger
+            .tasks
+            .iter()
+            .filter(|(task, record)| record.order.wanted == Wanted::Running && !is_there(*task));
+        let wanted: Vec<Digest> = ordered.map(|(_, record)| record.order.package.content.digest).collect();
         if self.kept_parts.as_ref() != Some(&wanted) {
             self.effects.keep_parts(&wanted);
             self.kept_parts = Some(wanted);

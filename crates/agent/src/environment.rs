@@ -42,6 +42,16 @@ pub const ROS_VARIABLES: [&str; 20] = [
     "ROS_HOSTNAME",
 ];
 
+/// By what nodes with this environment meet, where the agent can't hear them.
+pub fn unheard_of(environment: &BTreeMap<String, String>) -> Option<&'static str> {
+    let value = |name| environment.get(name).map(String::as_str).filter(|value| !value.is_empty());
+    match (value("RMW_IMPLEMENTATION"), value("ROS_DISCOVERY_SERVER")) {
+        (Some("rmw_zenoh_cpp"), _) => Some("Zenoh"),
+        (_, Some(_)) => Some("a discovery server (ROS_DISCOVERY_SERVER)"),
+        _ => None,
+    }
+}
+
 /// The environment made of the robot's settings (`ROS_DOMAIN_ID` and the like, which win) and of what `inherited` says
 /// about the few variables every program expects.
 pub fn explicit(
@@ -93,6 +103,12 @@ mod tests {
             pairs.iter().map(|(name, value)| ((*name).to_owned(), (*value).to_owned())).collect::<BTreeMap<_, _>>()
         };
         assert_eq!(ros_facts(&[], &environment(&[])), None);
+        assert_eq!(
+            unheard_of(&environment(&[("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp"), ("ROS_DISCOVERY_SERVER", "")])),
+            None
+        );
+        assert_eq!(unheard_of(&environment(&[("RMW_IMPLEMENTATION", "rmw_zenoh_cpp")])), Some("Zenoh"));
+        assert!(unheard_of(&environment(&[("ROS_DISCOVERY_SERVER", "10.0.0.1:11811")])).is_some());
         let installation = |distro: &str, version| Installation {
             distros: vec![distro.to_owned()],
             versions: vec![version],

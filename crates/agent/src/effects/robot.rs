@@ -421,8 +421,15 @@ impl Effects for Robot {
         durable::create_dir_all(&run_dir).map_err(|error| failed(&error))?;
         durable::write(&run_dir.join(RUN_RECORD), &record, 0o600).map_err(|error| failed(&error))?;
         self.end_other_runs(&task_dir.run(), Some(&run_dir)).await.map_err(|error| failed(&error))?;
-        let facts = self.ros_facts_in(&spec.environment);
-        self.watcher.before_start(&Promise::of(&manifest), facts.as_ref()).await.map_err(|failure| {
+        let (facts, promise) = (self.ros_facts_in(&spec.environment), Promise::of(&manifest));
+        if let Some(what) = environment::unheard_of(&spec.environment).filter(|_| !promise.is_empty()) {
+            let text = format!("nodes here meet by {what}, which the agent does not speak: [ready] can't be watched");
+            return Err(StepFailure {
+                failure: Failure::new(FailureCode::GRAPH_UNAVAILABLE, text),
+                retry_after_ms: None,
+            });
+        }
+        self.watcher.before_start(&promise, facts.as_ref()).await.map_err(|failure| {
             // Whoever has the name may go away: a run that was ready before waits for that. So may what is in the graph's way.
             let may_pass = run.ever_ready || (failure.code == FailureCode::GRAPH_UNAVAILABLE && facts.is_some());
             StepFailure { failure, retry_after_ms: may_pass.then_some(0) }

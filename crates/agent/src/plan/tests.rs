@@ -197,6 +197,21 @@ fn a_start_that_a_power_cut_met_is_made_again_unless_it_may_have_been_that_of_a_
 }
 
 #[test]
+fn a_job_of_which_nothing_ran_is_started_again() {
+    let mut world = World::new(Run { kind: TaskKind::Job, ..Run::default() });
+    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+    while !matches!(world.steps[..], [(Step::Start(_), false)]) {
+        world.happen(Happening::Effect { well: true });
+        world.happen(Happening::Learn);
+    }
+    world.happen(Happening::Effect { well: false });
+    world.happen(Happening::Learn);
+    assert_eq!((phase(&world), world.alive.len()), (Phase::Starting, 0));
+    world.settle();
+    assert_eq!((phase(&world), world.alive.len()), (Phase::Running, 1));
+}
+
+#[test]
 fn a_service_that_never_gets_ready_fails_with_its_exit_code() {
     let mut world = World::new(Run::default());
     world.happen(Happening::Order { deployment: 1, run: 1, stop: false });

@@ -289,6 +289,7 @@ pub(super) fn never_started(s: &Situation<'_>) -> TaskRecord {
     let mut record = s.record.clone();
     let process = record.active.as_mut().and_then(|active| active.process.take());
     if let Some(condemned) = process.and_then(|process| process.condemned) {
+        // A job as well: nothing of it has run.
         give_up_or_retry(&mut record, s, condemned.failure, condemned.again);
     }
     record.settle_phase(s.now_ms);
@@ -302,13 +303,13 @@ pub(super) fn ended(s: &Situation<'_>, exit: &Exit) -> TaskRecord {
     active.ever_started = true;
     let run = active.clone();
     let Some(process) = active.process.take() else { return record };
-    let job_done = active.rules.kind == TaskKind::Job && exit.is_success();
+    let is_job = active.rules.kind == TaskKind::Job;
     if let Some(condemned) = process.condemned {
-        give_up_or_retry(&mut record, s, condemned.failure, condemned.again);
-    } else if process.boot_id != s.boot_id && !job_done {
+        give_up_or_retry(&mut record, s, condemned.failure, condemned.again && !is_job);
+    } else if process.boot_id != s.boot_id && !(is_job && exit.is_success()) {
         // Whatever status it left, it ended because the robot went down.
         after_reboot(&mut record, s.now_ms);
-    } else if active.rules.kind == TaskKind::Job {
+    } else if is_job {
         job_ended(active, exit);
     } else {
         let again = match active.rules.restart {
@@ -392,8 +393,7 @@ fn give_up_or_retry(record: &mut TaskRecord, s: &Situation<'_>, failure: Failure
     let Some(active) = &mut record.active else { return };
     let tried_ms = s.now_ms.saturating_sub(active.first_start_ms);
     let too_late = !active.ever_ready && tried_ms >= u64::from(active.rules.ready_timeout_s) * 1000;
-    let a_job = active.rules.kind == TaskKind::Job;
-    if !again || a_job || too_late || active.restarts_in_a_row >= MAX_RESTARTS_IN_A_ROW {
+    if !again || too_late || active.restarts_in_a_row >= MAX_RESTARTS_IN_A_ROW {
         return give_up(record, s, failure);
     }
     active.restarts = active.restarts.saturating_add(1);

@@ -212,6 +212,29 @@ fn a_job_of_which_nothing_ran_is_started_again() {
 }
 
 #[test]
+fn files_of_a_run_that_was_replaced_before_it_was_ready_come_back() {
+    let mut world = World::new(Run::default());
+    world.outputs = Outputs { paths: vec!["maps/*".to_owned()] };
+    world.health = health(Sight::NotAll, 0);
+    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+    while world.alive.is_empty() {
+        world.happen(Happening::Effect { well: true });
+        world.happen(Happening::Learn);
+    }
+    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
+    let mut collected = Vec::new();
+    for _ in 0..20 {
+        collected.extend(world.steps.iter().filter_map(|(step, _)| match step {
+            Step::Collect(files) => Some(files.package.clone()),
+            _ => None,
+        }));
+        world.happen(Happening::Effect { well: true });
+        world.happen(Happening::Learn);
+    }
+    assert_eq!(collected.first(), Some(&package(0)), "{collected:?}");
+}
+
+#[test]
 fn a_service_that_never_gets_ready_fails_with_its_exit_code() {
     let mut world = World::new(Run::default());
     world.happen(Happening::Order { deployment: 1, run: 1, stop: false });

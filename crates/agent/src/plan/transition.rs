@@ -57,7 +57,9 @@ pub fn adopted(record: &TaskRecord, order: &DesiredTask, now_ms: u64) -> TaskRec
     let mut record = record.clone();
     let is_down = record.active.as_ref().is_none_or(|active| active.process.is_none());
     if record.order.wanted == Wanted::Stopped && is_down {
+        let fallback = record.fallback.clone();
         record.forget_stopped(order, now_ms);
+        collect_if_left(&mut record, fallback, now_ms);
     }
     record.order = order.clone();
     record.preparation = Preparation::default();
@@ -83,7 +85,11 @@ pub fn begun(record: &TaskRecord, step: &Step, boot_id: &str, start: u64, now_ms
     if let Step::Start(run) = step {
         let same = |active: &ActiveRun| active.deployment == run.deployment && active.run == run.run;
         if !record.active.as_ref().is_some_and(same) {
+            let runs = [record.active.clone(), record.fallback.clone()];
             record.retire_active(run);
+            for left in runs {
+                collect_if_left(&mut record, left.filter(|left| left.package != run.package), now_ms);
+            }
         }
         record.gate = None;
         record.starts = record.starts.saturating_add(1);
@@ -289,8 +295,13 @@ pub(super) fn never_started(s: &Situation<'_>) -> TaskRecord {
     let mut record = s.record.clone();
     let process = record.active.as_mut().and_then(|active| active.process.take());
     if let Some(condemned) = process.and_then(|process| process.condemned) {
+        let run = record.active.clone();
         // A job as well: nothing of it has run.
         give_up_or_retry(&mut record, s, condemned.failure, condemned.again);
+        // Processes of it may have run before.
+        if let Some(run) = run.filter(ActiveRun::has_started) {
+            collect_if_over(&mut record, &run, s.now_ms);
+        }
     }
     record.settle_phase(s.now_ms);
     record
@@ -332,6 +343,16 @@ fn collect_if_over(record: &mut TaskRecord, run: &ActiveRun, now_ms: u64) {
     // One that was replaced may come back; it is over once the new one is ready.
     if !goes_on || stopped {
         collect_files(record, run, now_ms);
+    }
+}
+
+/// Sees to the files of a run that has left the record without an end of its own: it was stopped for another one, and will
+/// not come back.
+fn collect_if_left(record: &mut TaskRecord, run: Option<ActiveRun>, now_ms: u64) {
+    let Some(run) = run.filter(|run| run.end.is_none() && run.has_started()) else { return };
+    let is_it = |other: &ActiveRun| other.deployment == run.deployment && other.run == run.run;
+    if ![&record.active, &record.fallback].into_iter().flatten().any(is_it) {
+        collect_files(record, &run, now_ms);
     }
 }
 

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use task_proto::desired::{Delivery, DesiredTask, PackageRef, Wanted};
 use task_proto::envelope::Envelope;
 use task_proto::manifest::{OnBoot, TaskKind};
-use task_proto::report::{Failure, Phase};
+use task_proto::report::{Failure, FailureCode, Phase};
 use task_proto::{DeploymentId, Digest, Generation, TaskName};
 
 use crate::durable;
@@ -481,12 +481,16 @@ impl TaskRecord {
         self.finished.drain(..surplus);
     }
 
-    /// The versions that must stay on disk: ordered, active, the one before and the one that may come back.
+    /// The versions that must stay on disk: ordered, active, the one that may come back, and the one before while there is room
+    /// for what is ordered: it lies there only so that a later rollback need not fetch it.
     pub fn kept_versions(&self) -> Vec<Digest> {
+        let lacks_room =
+            self.preparation.failure.as_ref().is_some_and(|failure| failure.code == FailureCode::DISK_FULL);
+        let previous = self.previous.iter().filter(|_| !lacks_room);
         let runs = [&self.active, &self.fallback].into_iter().flatten().map(|run| &run.package);
         let files = self.collections.iter().map(|files| &files.package);
         let mut kept: Vec<Digest> =
-            runs.chain(files).chain([&self.order.package]).chain(&self.previous).map(digest_of).collect();
+            runs.chain(files).chain([&self.order.package]).chain(previous).map(digest_of).collect();
         kept.sort();
         kept.dedup();
         kept
@@ -615,6 +619,16 @@ mod tests {
         drop("/active/process", &["condemned"]);
         drop("/active/rules", &["deadline_s", "has_outputs"]);
         assert_eq!(serde_json::from_value::<Ledger>(old).expect("read"), ledger);
+    }
+
+    #[test]
+    fn the_version_before_makes_room_for_the_ordered_one() {
+        let mut record = TaskRecord::new(order(), 1);
+        let before = PackageRef { manifest: BlobRef { digest: Digest::of(b"before"), size: 1 }, ..order().package };
+        record.previous = Some(before.clone());
+        assert!(record.kept_versions().contains(&before.manifest.digest));
+        record.preparation.failure = Some(Failure::new(FailureCode::DISK_FULL, "the disk is full"));
+        assert_eq!(record.kept_versions(), [order().package.manifest.digest]);
     }
 
     #[test]

@@ -299,8 +299,14 @@ drawWith((frame) => {
   giveFocusBack();
   page.view.drawn?.();
   settleDialog();
-  if (page.serverVersion !== page.version && !isAsking()) renew();
+  if (page.serverVersion !== page.version && !isAsking() && !isAtWork()) renew();
 });
+
+/** Whether something would be lost: what is typed, or what was chosen to be sent. */
+function isAtWork() {
+  const isTyping = document.activeElement?.matches('input:not([type=checkbox], [type=radio]), textarea');
+  return isTyping || page.view.isUnsaved || !app.uploads.isEmpty;
+}
 
 /** Loads the page that another server brings; once for each, lest two of them behind one address make it load for ever. */
 function renew() {

@@ -112,6 +112,10 @@ export class RobotView {
     this.#shownPart = this.#current && this.#chosen;
   }
 
+  get isUnsaved() {
+    return [...this.#parts.values()].some(({ isUnsaved }) => isUnsaved);
+  }
+
   #show(chosen) {
     if (this.#current?.id === chosen?.id) return;
     this.#current?.part.leave?.();

@@ -99,6 +99,47 @@ test('labels that somebody else changes while a robot’s page is edited stay', 
   assertQuiet(page);
 });
 
+/** A stream that can be broken, as by a server that is started anew. */
+function breakableStream() {
+  delete window.SharedWorker;
+  const { fetch } = window;
+  window.fetch = async (url, options) => {
+    const response = await fetch(url, options);
+    if (url !== '/api/v1/events') return response;
+    const [{ readable, writable }, end] = [new TransformStream(), new AbortController()];
+    response.body.pipeTo(writable, { signal: end.signal }).catch(() => {});
+    window.breakStream = () => end.abort();
+    return new Response(readable, response);
+  };
+}
+
+test('what is typed outlives an upgrade of the server, and the page is loaded anew after', async (t) => {
+  const server = await Server.start(t);
+  await enrolAll(server, { atlas: { site: 'lab' } });
+  const page = await open(t, server, { hash: '#/robots/atlas/edit' });
+  await page.addInitScript(breakableStream);
+  await page.reload();
+  await live(page);
+  const labels = page.getByRole('textbox', { name: 'Labels' });
+  await labels.fill('site=yard');
+  await page.getByRole('heading', { name: 'ROS', exact: true }).click();
+  await page.evaluate(() => (window.isSameDocument = true));
+  await page.route('**/api/v1/server', async (route) => {
+    const response = await route.fetch();
+    await route.fulfill({ response, json: { ...(await response.json()), version: '99.0.0' } });
+  });
+  const asked = page.waitForResponse('**/api/v1/server');
+  await page.evaluate(() => window.breakStream());
+  await asked;
+  await live(page);
+  assert.equal(await labels.inputValue(), 'site=yard');
+  assert.equal(await page.evaluate(() => window.isSameDocument), true);
+  const loaded = page.waitForEvent('load');
+  await page.getByRole('button', { name: 'Undo changes' }).click();
+  await loaded;
+  assert.equal(await page.evaluate(() => window.isSameDocument), undefined);
+});
+
 /** A stream that is open and says nothing, as behind a proxy that keeps back what it gets. */
 function stallStream() {
   delete window.SharedWorker;

@@ -52,6 +52,10 @@ export class Uploads {
     this.#forget(one);
   }
 
+  get isEmpty() {
+    return !this.#all.length;
+  }
+
   /** Breaks all of them off. */
   stop() {
     for (const { end } of this.#all) end.abort();

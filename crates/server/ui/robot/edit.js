@@ -26,8 +26,12 @@ export class Edit {
     this.#page = page;
   }
 
+  get isUnsaved() {
+    return Object.keys(this.#draft).length > 0;
+  }
+
   draw(robot) {
-    const isTouched = Object.keys(this.#draft).length > 0;
+    const isTouched = this.isUnsaved;
     return html`
       <form class="edit" novalidate @submit=${(event) => this.#save(event)}>
         <section aria-labelledby="identity">

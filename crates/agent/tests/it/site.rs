@@ -23,6 +23,8 @@ use tokio_util::sync::CancellationToken;
 use crate::archive::{Tar, noise};
 
 const CHUNK_BYTES: usize = 64 * 1024;
+/// A refusal in a registry's words.
+pub const BLOB_UNKNOWN: &str = r#"{"errors":[{"code":"BLOB_UNKNOWN","message":"the blob is not here"}]}"#;
 pub const TOKEN: &str = "the robot's token";
 /// Whatever a server does, a pull has ended by then.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -209,10 +211,7 @@ async fn answer(
             });
             exact(response).body(Body::from_stream(drops))
         }
-        Answer::Refused(status) => {
-            let words = r#"{"errors":[{"code":"BLOB_UNKNOWN","message":"the blob is not here"}]}"#;
-            Response::builder().status(status).body(Body::from(words))
-        }
+        Answer::Refused(status) => Response::builder().status(status).body(Body::from(BLOB_UNKNOWN)),
         Answer::Status(status, headers) => {
             let response = Response::builder().status(status);
             headers

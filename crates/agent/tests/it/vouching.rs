@@ -30,6 +30,7 @@ use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 use crate::harness::{eventually, within};
+use crate::site::BLOB_UNKNOWN;
 
 /// What the server has, by digest, and what was asked for.
 #[derive(Default)]
@@ -124,7 +125,7 @@ async fn answer(State(shelf): State<Arc<Mutex<Shelf>>>, Path(path): Path<String>
     let digest = path.rsplit('/').next().unwrap().to_owned();
     match shelf.blobs.get(&digest) {
         Some(bytes) => ([("docker-content-digest", digest)], bytes.clone()).into_response(),
-        None => StatusCode::NOT_FOUND.into_response(),
+        None => (StatusCode::NOT_FOUND, BLOB_UNKNOWN).into_response(),
     }
 }
 

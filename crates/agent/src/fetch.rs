@@ -33,7 +33,7 @@ use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
 use self::download::Download;
-pub(crate) use self::download::{CONTENT_DIGEST, MAX_RETRY_AFTER};
+pub(crate) use self::download::MAX_RETRY_AFTER;
 pub use self::error::FetchError;
 use self::intake::Intake;
 use self::offered::Offered;

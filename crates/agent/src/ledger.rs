@@ -513,6 +513,11 @@ impl ActiveRun {
         self.end.is_some() && self.ever_ready && is_up_at_boot && self.restarts_in_a_row >= MAX_RESTARTS_IN_A_ROW
     }
 
+    /// Whether this is the same run, perhaps with another process.
+    pub fn is_same(&self, other: &Self) -> bool {
+        self.deployment == other.deployment && self.run == other.run
+    }
+
     /// Whether a process of it was started before. An earlier agent wrote down only that one was ready.
     pub fn has_started(&self) -> bool {
         self.ever_started || self.ever_ready

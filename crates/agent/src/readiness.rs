@@ -88,16 +88,6 @@ struct Shortfall {
     certain: bool,
 }
 
-impl Shortfall {
-    /// A name that somebody else has, in words that stand alone.
-    fn as_taken(&self) -> String {
-        match &self.item {
-            Item::Alone(name) => format!("`{name}` is already on the graph: {}", self.seen),
-            _ => self.what.clone(),
-        }
-    }
-}
-
 /// How long a shortfall has lasted.
 #[derive(Debug, Clone)]
 struct Lasting {
@@ -148,7 +138,7 @@ impl Promise {
 
     /// Why the run can't be started: a living process has one of its names already.
     pub fn taken(&self, snapshot: &Snapshot, others: &BTreeMap<ParticipantId, String>) -> Option<Failure> {
-        let texts: Vec<String> = self.foreign(snapshot, others).iter().map(Shortfall::as_taken).collect();
+        let texts: Vec<String> = self.foreign(snapshot, others).map(|(name, whose)| taken(name, &whose)).collect();
         (!texts.is_empty()).then(|| Failure::new(FailureCode::NODE_NAME_TAKEN, texts.join("; ")))
     }
 
@@ -159,8 +149,12 @@ impl Promise {
         named.chain(offering).map(|node| node.participant).filter(|id| others.contains_key(id)).collect()
     }
 
-    /// Promised names that somebody else has.
-    fn foreign(&self, snapshot: &Snapshot, others: &BTreeMap<ParticipantId, String>) -> Vec<Shortfall> {
+    /// Promised names that somebody else has, and who that is.
+    fn foreign<'a>(
+        &'a self,
+        snapshot: &'a Snapshot,
+        others: &'a BTreeMap<ParticipantId, String>,
+    ) -> impl Iterator<Item = (&'a GraphName, String)> {
         let nodes = self.nodes.iter().filter_map(|name| {
             let whose = snapshot.named(name).find_map(|node| others.get(&node.participant))?;
             Some((name, format!("{whose} has a node of that name")))
@@ -170,14 +164,7 @@ impl Promise {
             let (node, whose) = snapshot.servers_of(name).find_map(offered)?;
             Some((name, format!("`{node}` of {whose} offers that service")))
         });
-        let taken = |(name, seen): (&GraphName, String)| Shortfall {
-            item: Item::Alone(name.clone()),
-            code: FailureCode::NODE_NAME_TAKEN,
-            what: format!("`{name}` was not free"),
-            seen,
-            certain: false,
-        };
-        nodes.chain(services).map(taken).collect()
+        nodes.chain(services)
     }
 }
 
@@ -257,7 +244,14 @@ impl Readiness {
     }
 
     fn shortfalls(&self, look: &Look<'_>, now_ms: u64) -> Vec<Shortfall> {
-        let mut shortfalls = self.promise.foreign(look.snapshot, look.others);
+        let foreign = self.promise.foreign(look.snapshot, look.others).map(|(name, seen)| Shortfall {
+            item: Item::Alone(name.clone()),
+            code: FailureCode::NODE_NAME_TAKEN,
+            what: format!("`{name}` was not free"),
+            seen,
+            certain: false,
+        });
+        let mut shortfalls: Vec<Shortfall> = foreign.collect();
         for name in &self.promise.nodes {
             let here = look.snapshot.named(name).any(|node| look.ours.contains(&node.participant));
             shortfalls.extend(if here { self.unprepared(name, now_ms) } else { Some(self.absent(name, look)) });
@@ -371,16 +365,23 @@ impl Readiness {
         if matches!(self.health, Health::Refused(_)) {
             return;
         }
-        let is_its_own = !counted.iter().all(|shortfall| matches!(shortfall.item, Item::Alone(_)));
-        self.health = match (refused, self.missing(&counted, is_its_own, now_ms)) {
-            (Some(refused), _) if !self.was_ready => Health::Refused(refused),
+        let lacking = match refused {
+            Some(refused) if !self.was_ready => {
+                self.health = Health::Refused(refused);
+                return;
+            }
             // What one node that came back refuses is no reason to take down the others.
-            (Some(refused), _) => self.missing_since(refused.code, refused.text, String::new(), is_its_own, now_ms),
-            (_, Some(missing)) => missing,
-            (None, None) => match self.health {
-                Health::Holds { since_ms } => Health::Holds { since_ms },
-                _ => Health::Holds { since_ms: now_ms },
-            },
+            Some(refused) => Some((refused.code, refused.text, String::new())),
+            None => in_words(&counted),
+        };
+        let is_strangers = !counted.is_empty() && counted.iter().all(|lacks| matches!(lacks.item, Item::Alone(_)));
+        self.health = match (lacking, &self.health) {
+            (None, Health::Holds { since_ms }) => Health::Holds { since_ms: *since_ms },
+            (None, _) => Health::Holds { since_ms: now_ms },
+            (Some((code, what, seen)), before) => {
+                let since_ms = if let Health::Missing(missing) = before { missing.since_ms } else { now_ms };
+                Health::Missing(Missing { since_ms, code, what, seen, is_its_own: !is_strangers })
+            }
         };
         self.was_ready |= self.has_held(now_ms);
     }
@@ -393,30 +394,31 @@ impl Readiness {
 
     /// A name that somebody else has had for long enough.
     fn taken(&self, now_ms: u64) -> Option<Failure> {
-        let mut names = self.lasting.iter().filter(|(item, _)| matches!(item, Item::Alone(_)));
-        let (_, lasting) = names.find(|(_, lasting)| now_ms.saturating_sub(lasting.since_ms) >= FOREIGN_MS)?;
-        lasting.said.as_ref().map(|shortfall| Failure::new(shortfall.code.clone(), shortfall.as_taken()))
-    }
-
-    fn missing(&self, counted: &[Shortfall], is_its_own: bool, now_ms: u64) -> Option<Health> {
-        let code = counted.first()?.code.clone();
-        let what = counted.iter().map(|shortfall| shortfall.what.as_str()).collect::<Vec<_>>().join(", ");
-        let mut seen: Vec<&str> = Vec::new();
-        for shortfall in counted.iter().filter(|shortfall| !shortfall.seen.is_empty()) {
-            if !seen.contains(&shortfall.seen.as_str()) {
-                seen.push(&shortfall.seen);
+        self.lasting.iter().find_map(|(item, lasting)| match (item, &lasting.said) {
+            (Item::Alone(name), Some(said)) if now_ms.saturating_sub(lasting.since_ms) >= FOREIGN_MS => {
+                Some(Failure::new(said.code.clone(), taken(name, &said.seen)))
             }
-        }
-        Some(self.missing_since(code, what, seen.join("; "), is_its_own, now_ms))
+            _ => None,
+        })
     }
+}
 
-    fn missing_since(&self, code: FailureCode, what: String, seen: String, is_its_own: bool, now_ms: u64) -> Health {
-        let since_ms = match &self.health {
-            Health::Missing(missing) => missing.since_ms,
-            _ => now_ms,
-        };
-        Health::Missing(Missing { since_ms, code, what, seen, is_its_own })
+/// What lacks, by the code of the first, and what is there instead; each said once.
+fn in_words(counted: &[Shortfall]) -> Option<(FailureCode, String, String)> {
+    let code = counted.first()?.code.clone();
+    let what = counted.iter().map(|shortfall| shortfall.what.as_str()).collect::<Vec<_>>().join(", ");
+    let mut seen: Vec<&str> = Vec::new();
+    for shortfall in counted.iter().filter(|shortfall| !shortfall.seen.is_empty()) {
+        if !seen.contains(&shortfall.seen.as_str()) {
+            seen.push(&shortfall.seen);
+        }
     }
+    Some((code, what, seen.join("; ")))
+}
+
+/// That somebody else has a name, in words that stand alone.
+fn taken(name: &GraphName, whose: &str) -> String {
+    format!("`{name}` is already on the graph: {whose}")
 }
 
 /// The names on the graph.

@@ -1,9 +1,13 @@
-//! What a registry says when it refuses: the error body of the OCI distribution specification. Who answers with anything else
-//! is a proxy or a portal, and not the server.
+//! By what a registry is known (OCI distribution specification): the header that names the bytes it has, and the error body when
+//! it refuses. Who answers with anything else is a proxy or a portal, and not the server.
 
 use std::borrow::Cow;
 
+use http::HeaderName;
 use reqwest::Response;
+
+/// The digest of what an answer is about.
+pub(crate) const CONTENT_DIGEST: HeaderName = HeaderName::from_static("docker-content-digest");
 
 /// The most of an error's body that is read.
 const MAX_BYTES: usize = 4096;

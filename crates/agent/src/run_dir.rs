@@ -73,7 +73,8 @@ pub struct Started {
     pub task: ProcessIdentity,
 }
 
-/// The end of a run. When this is on disk, none of the run's processes is left that the shim could see.
+/// The end of a run. When this is on disk, none of the run's processes is left that the shim could see and end, and what the run
+/// wrote for bringing back is on the disk as well.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Ended {
     /// How the first process ended.

@@ -424,10 +424,8 @@ impl Effects for Robot {
         let (facts, promise) = (self.ros_facts_in(&spec.environment), Promise::of(&manifest));
         if let Some(what) = environment::unheard_of(&spec.environment).filter(|_| !promise.is_empty()) {
             let text = format!("nodes here meet by {what}, which the agent does not speak: [ready] can't be watched");
-            return Err(StepFailure {
-                failure: Failure::new(FailureCode::GRAPH_UNAVAILABLE, text),
-                retry_after_ms: None,
-            });
+            let failure = Failure::new(FailureCode::GRAPH_UNAVAILABLE, text);
+            return Err(StepFailure { failure, retry_after_ms: None });
         }
         self.watcher.before_start(&promise, facts.as_ref()).await.map_err(|failure| {
             // Whoever has the name may go away: a run that was ready before waits for that. So may what is in the graph's way.

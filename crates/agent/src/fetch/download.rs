@@ -15,10 +15,8 @@ use tokio::sync::mpsc;
 use tokio::time::Instant;
 
 use super::FetchError;
-use crate::registry_words::RegistryWords;
+use crate::registry_words::{CONTENT_DIGEST, RegistryWords};
 
-/// The digest of the blob in an answer (OCI distribution-spec).
-pub(crate) const CONTENT_DIGEST: HeaderName = HeaderName::from_static("docker-content-digest");
 /// What must come within each stall timeout.
 const MIN_PROGRESS_BYTES: u64 = 16 * 1024;
 /// Overrides whatever limit the client has for whole requests: a large package on a bad link takes its time, and the

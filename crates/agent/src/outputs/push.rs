@@ -18,8 +18,8 @@ use tokio::sync::{Semaphore, watch};
 
 use super::{OutputError, OutputOrder};
 use crate::credential::Credential;
-use crate::fetch::{CONTENT_DIGEST, MAX_RETRY_AFTER};
-use crate::registry_words::RegistryWords;
+use crate::fetch::MAX_RETRY_AFTER;
+use crate::registry_words::{CONTENT_DIGEST, RegistryWords};
 use crate::task_user::{self, TaskUser};
 use crate::{durable, foreign_file};
 

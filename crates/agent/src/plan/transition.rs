@@ -83,8 +83,7 @@ pub fn begun(record: &TaskRecord, step: &Step, boot_id: &str, start: u64, now_ms
         record.preparation.phase = phase;
     }
     if let Step::Start(run) = step {
-        let same = |active: &ActiveRun| active.deployment == run.deployment && active.run == run.run;
-        if !record.active.as_ref().is_some_and(same) {
+        if !record.active.as_ref().is_some_and(|active| active.is_same(run)) {
             let runs = [record.active.clone(), record.fallback.clone()];
             record.retire_active(run);
             for left in runs {
@@ -337,8 +336,7 @@ pub(super) fn ended(s: &Situation<'_>, exit: &Exit) -> TaskRecord {
 
 /// Sees to the files of `run`, whose process is gone, unless the run goes on: with another process, or later.
 fn collect_if_over(record: &mut TaskRecord, run: &ActiveRun, now_ms: u64) {
-    let same = |active: &&ActiveRun| active.deployment == run.deployment && active.run == run.run;
-    let goes_on = record.active.as_ref().filter(same).is_some_and(|active| active.end.is_none());
+    let goes_on = record.active.as_ref().is_some_and(|active| active.is_same(run) && active.end.is_none());
     let stopped = record.order.wanted == Wanted::Stopped;
     // One that was replaced may come back; it is over once the new one is ready.
     if !goes_on || stopped {
@@ -350,8 +348,7 @@ fn collect_if_over(record: &mut TaskRecord, run: &ActiveRun, now_ms: u64) {
 /// not come back.
 fn collect_if_left(record: &mut TaskRecord, run: Option<ActiveRun>, now_ms: u64) {
     let Some(run) = run.filter(|run| run.end.is_none() && run.has_started()) else { return };
-    let is_it = |other: &ActiveRun| other.deployment == run.deployment && other.run == run.run;
-    if ![&record.active, &record.fallback].into_iter().flatten().any(is_it) {
+    if ![&record.active, &record.fallback].into_iter().flatten().any(|other| other.is_same(&run)) {
         collect_files(record, &run, now_ms);
     }
 }

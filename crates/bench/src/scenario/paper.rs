@@ -20,7 +20,7 @@ const SLOW_POLL: Duration = Duration::from_secs(300);
 /// How long the robots may take to connect.
 const START_LIMIT: Duration = Duration::from_secs(60);
 /// How long an order may take, whatever its size.
-const ORDER_LIMIT: Duration = Duration::from_secs(60);
+const ORDER_LIMIT: Duration = Duration::from_secs(20);
 /// The rate that an unlimited machine reaches at least, bytes per second of all robots together.
 const SLOW_MACHINE_BYTES_PER_S: u64 = 20_000_000;
 /// What counts as about as fast: this many times as long,

@@ -22,6 +22,7 @@ async fn the_corridors_map_is_built_on_a_robot_and_comes_back() {
     assert_ne!(quick, toml);
     std::fs::write(package.join("task.toml"), quick).expect("task.toml");
     stage.server.push(&package, "*").await;
+    stage.builds("corridor_mapping").await;
     stage.succeeds("corridor_mapping").await;
 
     let list = stage.server.operate(["output", "list", "robot-1", "-o", "json"]).await;

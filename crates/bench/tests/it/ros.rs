@@ -94,6 +94,16 @@ impl Stage {
         self.server.robot("robot-1").await?.tasks.into_iter().find(|task| task.task.as_str() == name)
     }
 
+    /// Waits until the task, which is built on the robot, runs.
+    pub async fn builds(&self, name: &str) {
+        eventually_within(JOB_PATIENCE, &format!("{name} to be built"), async || {
+            let task = self.task(name).await?;
+            assert!(!task.phase.is_final(), "{name} is {}: {:?}", task.phase, task.failure);
+            (task.phase == Phase::Running).then_some(())
+        })
+        .await;
+    }
+
     /// Waits until the task runs as it should.
     pub async fn runs(&self, name: &str) -> RobotTask {
         self.is(name, Phase::Running, |task| task.degraded.is_none().then_some(task)).await
@@ -213,11 +223,7 @@ async fn a_task_runs_when_ros_says_so_and_stops_in_good_order() {
     let late =
         "lifecycle = ['/by_lifecycle']\nservices = ['/ask']\n[parameters.'/by_lifecycle']\nlate = 7\nresolution = 0.5";
     stage.push("by-lifecycle", "--node by_lifecycle --lifecycle --service /ask", &ready(late)).await;
-    eventually_within(JOB_PATIENCE, "the robot to have built by-node", async || {
-        let phase = stage.task("by-node").await?.phase;
-        (phase == Phase::Running || phase.is_final()).then_some(())
-    })
-    .await;
+    stage.builds("by-node").await;
     for name in ["by-node", "by-service", "by-topic", "by-lifecycle"] {
         stage.runs(name).await;
     }

@@ -279,7 +279,7 @@ async fn silence_beyond_the_keepalive_ends_the_session() {
     let mut raw = broker.raw_with(&connect.packet()).await;
     raw.expect(&[0x20, 2, 0, 0]).await;
     raw.expect_close().await;
-    assert!(begin.elapsed() >= Duration::from_millis(1500), "{:?}", begin.elapsed());
+    assert!((Duration::from_millis(1500)..Duration::from_secs(5)).contains(&begin.elapsed()), "{:?}", begin.elapsed());
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -44,6 +44,15 @@ impl Stage {
         }
     }
 
+    /// With a lifecycle node that has said in which state it is.
+    fn managed(state: LifecycleState) -> Self {
+        let mut stage = Self::new(lifecycle(&[]), false);
+        stage.add(OURS, "/mapper", &[], &[]);
+        stage.after(0);
+        stage.answers(&Ask::State, Answer::State(state));
+        stage
+    }
+
     fn add(&mut self, participant: ParticipantId, node: &str, services: &[&str], topics: &[&str]) {
         let endpoints = |names: &[&str]| {
             let endpoint = |text: &&str| Endpoint { name: name(text), kind: "test_msgs/msg/Empty".to_owned() };
@@ -255,10 +264,7 @@ const ASK_AGAIN_MS: u64 = 500;
 
 #[test]
 fn a_failed_transition_is_named_with_the_state_it_led_to() {
-    let mut stage = Stage::new(lifecycle(&[]), false);
-    stage.add(OURS, "/mapper", &[], &[]);
-    stage.after(0);
-    stage.answers(&Ask::State, Answer::State(LifecycleState::Inactive));
+    let mut stage = Stage::managed(LifecycleState::Inactive);
     stage.answers(&Ask::Transition(Transition::Activate), Answer::Transition(false));
     stage.answers(&Ask::State, Answer::State(LifecycleState::Unconfigured));
     assert_eq!(refused(&stage.after(0)), "lifecycle_failed: `/mapper` failed to activate and is unconfigured");
@@ -266,10 +272,7 @@ fn a_failed_transition_is_named_with_the_state_it_led_to() {
 
 #[test]
 fn a_transition_that_somebody_else_made_a_moment_earlier_has_not_failed() {
-    let mut stage = Stage::new(lifecycle(&[]), false);
-    stage.add(OURS, "/mapper", &[], &[]);
-    stage.after(0);
-    stage.answers(&Ask::State, Answer::State(LifecycleState::Unconfigured));
+    let mut stage = Stage::managed(LifecycleState::Unconfigured);
     stage.answers(&Ask::Transition(Transition::Configure), Answer::Transition(false));
     stage.answers(&Ask::State, Answer::State(LifecycleState::Changing));
     missing(&stage.after(ASK_AGAIN_MS));
@@ -282,10 +285,7 @@ fn a_transition_that_somebody_else_made_a_moment_earlier_has_not_failed() {
 
 #[test]
 fn a_lost_answer_is_asked_for_by_the_state_not_by_another_transition() {
-    let mut stage = Stage::new(lifecycle(&[]), false);
-    stage.add(OURS, "/mapper", &[], &[]);
-    stage.after(0);
-    stage.answers(&Ask::State, Answer::State(LifecycleState::Unconfigured));
+    let mut stage = Stage::managed(LifecycleState::Unconfigured);
     stage.answers(&Ask::Transition(Transition::Configure), Answer::None);
     assert_eq!(stage.asked(), []);
     assert_eq!(missing(&stage.after(ASK_AGAIN_MS)).seen, "it does not answer as a lifecycle node");

@@ -32,6 +32,7 @@ pub mod part_requests;
 pub mod passwords;
 pub mod person;
 pub mod presence;
+pub mod readiness;
 pub mod report_meter;
 pub mod report_writer;
 pub mod requests;

@@ -35,6 +35,7 @@ use crate::http::{App, AppParts, listener};
 use crate::mqtt_access::MqttAccess;
 use crate::oidc::{OidcSetUpError, Provider};
 use crate::presence::Presence;
+use crate::readiness::{DiskProbe, Readiness, ReadinessCheck};
 use crate::report_writer::ReportWriter;
 use crate::requests::Requests;
 use crate::robot_logs::RobotLogs;
@@ -177,8 +178,10 @@ impl Server {
             trusted_proxies: config.trusted_proxies.clone().into(),
             http_traffic: http_traffic.clone(),
             data: data.path().to_owned(),
+            readiness: Readiness::default(),
             stop: stop.clone(),
         });
+        start_readiness(&tasks, &app).await;
         start_tasks(&tasks, &app, &config);
         if let Some(tls) = tls.clone() {
             tasks.spawn(tls.keep_current(stop.clone()));
@@ -289,6 +292,18 @@ fn start_tasks(tasks: &TaskTracker, app: &App, config: &Config) {
     tasks.spawn(app.feed.clone().run(source, app.changes.clone(), app.stop.clone()));
     tasks.spawn(notice_silence(app.clone()));
     tasks.spawn(show_conduct(app.clone()));
+}
+
+/// Checks once, so that the first answer of `/readyz` is true, and goes on beside the listeners.
+async fn start_readiness(tasks: &TaskTracker, app: &App) {
+    let mut check = ReadinessCheck {
+        readiness: app.readiness.clone(),
+        store: app.store.clone(),
+        broker: app.broker.clone(),
+        disk: DiskProbe::new(app.data.clone()),
+    };
+    check.check().await;
+    tasks.spawn(check.run(app.stop.clone()));
 }
 
 async fn expire_assignments(app: App) {

@@ -64,6 +64,7 @@ use crate::feed::Feed;
 use crate::mqtt_access::MqttAccess;
 use crate::oidc::Provider;
 use crate::presence::Presence;
+use crate::readiness::Readiness;
 use crate::report_writer::ReportWriter;
 use crate::requests::Requests;
 use crate::robot_logs::RobotLogs;
@@ -137,8 +138,10 @@ pub struct AppParts {
     pub trusted_proxies: Arc<[IpAddr]>,
     /// What went over HTTP.
     pub http_traffic: Arc<traffic::HttpTotals>,
-    /// The data directory, which must be writable.
+    /// The data directory.
     pub data: PathBuf,
+    /// Whether the server can do its work.
+    pub readiness: Readiness,
     /// Cancelled when the server stops.
     pub stop: CancellationToken,
 }

@@ -38,6 +38,20 @@ async fn the_first_start_makes_what_is_needed_and_nobody_else_reads_it() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn readyz_asked_often_writes_seldom() {
+    let server = TestServer::start().await;
+    let probe = server.data().join(".ready");
+    let mut written = 0;
+    for _ in 0..100 {
+        // The background check may write it again at any time.
+        written += usize::from(std::fs::remove_file(&probe).is_ok());
+        let response = server.bare(Method::GET, "/readyz").send().await.expect("an answer");
+        assert_eq!(response.status(), StatusCode::OK);
+    }
+    assert!((1..50).contains(&written), "{written} of 100 requests found that the file was written");
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_second_server_on_the_same_directory_is_refused() {
     let server = TestServer::start().await;
     let mut config = Config::with_data(server.data().to_owned());

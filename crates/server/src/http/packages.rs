@@ -16,7 +16,7 @@ use http::StatusCode;
 use serde::Deserialize;
 use task_archive::UnpackError;
 use task_proto::api::{PackageDiff, PackageFile, PackageFiles, PackageList, PackageVersions, PackageView};
-use task_proto::{Digest, RobotId, TaskName};
+use task_proto::{Digest, RepositoryName, RobotId, TaskName};
 use utoipa::{IntoParams, ToSchema};
 
 use super::App;
@@ -25,7 +25,7 @@ use super::extract::{PathParam, PathParams, QueryParams};
 use crate::changes::Change;
 use crate::package::contents;
 use crate::person::Person;
-use crate::store::{Act, Deed, DeletePackage, PackageUsers, Reference};
+use crate::store::{Act, Deed, Deletion, PackageUsers, Reference};
 
 /// The most robots and deployments that are named where a package is in use.
 const MOST_NAMED: usize = 5;
@@ -139,13 +139,13 @@ pub(super) async fn remove(
     let package = find(&app, &name, &version).await?.package;
     let (digest, now_ms) = (package.manifest.digest, app.clock.now_ms());
     let deed = Deed::by(&by, Act::ManifestDelete, &name).with("manifest", digest).with("version", &package.version);
-    match app.store.delete_package(&name, &digest, &deed, now_ms).await? {
-        DeletePackage::Unknown => return Err(unknown(&name, &version)),
-        DeletePackage::InUse(users) => {
+    match app.store.delete_manifest(&RepositoryName::of_package(&name), &digest, &deed, now_ms).await? {
+        Deletion::Unknown => return Err(unknown(&name, &version)),
+        Deletion::InUse(users) => {
             let message = in_use(&by, &format!("{name} {}", package.version), &users);
             return Err(ApiError::conflict("package_in_use", message));
         }
-        DeletePackage::Deleted(parts) => {
+        Deletion::Deleted(parts) => {
             app.changes.announce(Change::Package(name));
             // An order that looked the package up a moment ago still finds its bytes: they stay for a while.
             for blob in parts.into_iter().chain([digest]) {
@@ -165,7 +165,7 @@ fn unknown(name: &TaskName, version: &PackageReference) -> ApiError {
 }
 
 /// Says who keeps a package in use; of robots that are none of the person's, and deployments for none of theirs, only how many.
-fn in_use(by: &Person, package: &str, users: &PackageUsers) -> String {
+pub(super) fn in_use(by: &Person, package: &str, users: &PackageUsers) -> String {
     let own = users.robots.iter().filter(|robot| by.scope.covers(&robot.id, &robot.name, &robot.labels));
     let (ids, names): (HashSet<&RobotId>, Vec<&str>) = own.map(|robot| (&robot.id, robot.name.as_str())).unzip();
     let is_own = |robots: &[RobotId]| by.scope.is_everything() || robots.iter().any(|robot| ids.contains(robot));

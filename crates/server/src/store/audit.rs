@@ -9,7 +9,8 @@ use task_proto::api::{AuditPage, AuditQuery};
 use task_proto::audit::{AuditEntry, AuditRecord, Link};
 
 use super::rows::{id, json, number, stored};
-use super::{Store, StoreError, Write};
+use super::{KnownRobot, Store, StoreError, Write};
+use crate::pace::{Pace, seconds};
 use crate::person::Person;
 
 /// The most entries in one answer.
@@ -168,6 +169,13 @@ impl Deed {
             Some(value) => self.with(key, value),
             None => self,
         }
+    }
+}
+
+impl Deed {
+    /// Whether a robot is in the scope of the person who does it.
+    pub(super) fn covers(&self, robot: &KnownRobot) -> bool {
+        self.by.as_ref().is_some_and(|by| by.scope.covers(&robot.id, &robot.name, &robot.labels))
     }
 }
 

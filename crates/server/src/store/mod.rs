@@ -49,7 +49,7 @@ pub use earlier::{EarlierPackage, Unsuccessful};
 use first_use::FirstUses;
 pub use orders::PastOrder;
 pub use outputs::NewOutput;
-pub use package_use::{DeletePackage, PackageUsers};
+pub use package_use::{Deletion, PackageUsers};
 pub use packages::{NewManifest, PutManifest, Reference, StoredManifest};
 pub use publishers::SignedDocument;
 pub use referrers::ReferrersPage;

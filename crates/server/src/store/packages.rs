@@ -11,7 +11,7 @@ use task_proto::desired::{BlobRef, PackageRef};
 use task_proto::manifest::TaskManifest;
 use task_proto::{Digest, RepositoryName, Tag, TaskName};
 
-use super::{Deed, NewOutput, SignedDocument, Store, StoreError, Write, rows};
+use super::{Deed, NewOutput, PackageUsers, SignedDocument, Store, StoreError, Write, rows};
 
 /// A manifest's name inside its repository.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -65,6 +65,8 @@ pub enum PutManifest {
     PartsMissing(Vec<Digest>),
     /// Nothing is stored: it is a list of publishers, and another has its version or a later one.
     Outdated,
+    /// Nothing is stored: this tag points to a package of robots that are none of the person's.
+    TagInUse(Tag, PackageUsers),
 }
 
 impl Store {
@@ -94,6 +96,9 @@ impl Store {
         }
         write.insert_manifest(repository, new, now_ms).await?;
         for tag in &new.tags {
+            if let Some(users) = write.refusal_to_move(repository, tag, Some(&new.manifest.digest), deed).await? {
+                return Ok(PutManifest::TagInUse(tag.clone(), users));
+            }
             write.point_tag(repository, tag, &new.manifest.digest).await?;
         }
         if let Some((package, task_manifest)) = &new.package {
@@ -139,39 +144,6 @@ impl Store {
         .transpose()
     }
 
-    /// Removes a manifest with all its tags and says what it was made of; `None` if it was not there.
-    pub async fn delete_manifest(
-        &self,
-        repository: &RepositoryName,
-        digest: &Digest,
-        deed: Option<&Deed>,
-        now_ms: u64,
-    ) -> Result<Option<Vec<Digest>>, StoreError> {
-        let mut write = self.begin().await?;
-        let parts = write.delete_manifest(repository, digest).await?;
-        write.commit_with(deed.filter(|_| parts.is_some()), now_ms).await?;
-        Ok(parts)
-    }
-
-    /// Removes a tag; false if it was not there.
-    pub async fn delete_tag(
-        &self,
-        repository: &RepositoryName,
-        tag: &Tag,
-        deed: Option<&Deed>,
-        now_ms: u64,
-    ) -> Result<bool, StoreError> {
-        let mut write = self.begin().await?;
-        let deleted = sqlx::query("DELETE FROM tags WHERE repository = $1 AND tag = $2")
-            .bind(repository.as_str())
-            .bind(tag.as_str())
-            .execute(write.connection())
-            .await?;
-        let is_deleted = deleted.rows_affected() > 0;
-        write.commit_with(deed.filter(|_| is_deleted), now_ms).await?;
-        Ok(is_deleted)
-    }
-
     /// A repository's tags in the order of their bytes; `None` if there is no such repository.
     pub async fn tags(&self, repository: &RepositoryName) -> Result<Option<Vec<Tag>>, StoreError> {
         let known: Option<i64> = sqlx::query_scalar(
@@ -208,25 +180,6 @@ impl Store {
             write.count_link(repository, blob).await?;
         }
         write.commit().await
-    }
-
-    /// Takes a blob out of a repository; false if it was not in it.
-    pub async fn unlink_blob(
-        &self,
-        repository: &RepositoryName,
-        digest: &Digest,
-        deed: Option<&Deed>,
-        now_ms: u64,
-    ) -> Result<bool, StoreError> {
-        let mut write = self.begin().await?;
-        let deleted = sqlx::query("DELETE FROM repository_blobs WHERE repository = $1 AND digest = $2")
-            .bind(repository.as_str())
-            .bind(digest.to_string())
-            .execute(write.connection())
-            .await?;
-        let is_deleted = deleted.rows_affected() > 0;
-        write.commit_with(deed.filter(|_| is_deleted), now_ms).await?;
-        Ok(is_deleted)
     }
 
     /// Whether a blob is in `repository`, or in any if that is `None`.
@@ -266,6 +219,25 @@ impl Store {
 }
 
 impl Write {
+    /// Removes a tag; false if it was not there.
+    pub(super) async fn delete_tag(&mut self, repository: &RepositoryName, tag: &Tag) -> Result<bool, StoreError> {
+        let query = sqlx::query("DELETE FROM tags WHERE repository = $1 AND tag = $2");
+        let query = query.bind(repository.as_str()).bind(tag.as_str());
+        Ok(query.execute(self.connection()).await?.rows_affected() > 0)
+    }
+
+    /// Takes a blob out of a repository; false if it was not in it.
+    pub(super) async fn unlink_blob(
+        &mut self,
+        repository: &RepositoryName,
+        digest: &Digest,
+    ) -> Result<bool, StoreError> {
+        let query = sqlx::query("DELETE FROM repository_blobs WHERE repository = $1 AND digest = $2");
+        let query = query.bind(repository.as_str()).bind(digest.to_string());
+        Ok(query.execute(self.connection()).await?.rows_affected() > 0)
+    }
+
+    /// Removes a manifest with all its tags and says what it was made of; `None` if it was not there.
     pub(super) async fn delete_manifest(
         &mut self,
         repository: &RepositoryName,

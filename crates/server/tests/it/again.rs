@@ -57,12 +57,10 @@ impl Fleet {
         view
     }
 
-    /// Deletes it, as crane can whoever has it.
+    /// Deletes it, whoever has it.
     pub async fn unpublish(&self, version: &str) {
         let digest = package(version, TaskKind::Service).package.manifest.digest;
-        let repository = RepositoryName::of_package(&task());
-        let gone = self.database.store.delete_manifest(&repository, &digest, None, self.clock.now_ms()).await;
-        assert!(gone.expect("writes").is_some());
+        self.database.drop_package(task().as_str(), &digest).await;
     }
 
     async fn fail(&self, robot: &mut Robot, code: FailureCode) {

@@ -3,7 +3,7 @@
 #![expect(clippy::disallowed_methods, reason = "making a test's database takes SQL")]
 
 use sqlx::{Connection as _, Row as _};
-use task_proto::{DeploymentId, RobotId};
+use task_proto::{DeploymentId, Digest, RobotId};
 use taskd::store::{Store, sqlite_url};
 
 /// An empty, migrated database of one test.
@@ -61,6 +61,20 @@ impl TestDatabase {
         let mut connection = sqlx::AnyConnection::connect(&self.url).await.expect("connects");
         let query = sqlx::query("DELETE FROM audit WHERE number = $1").bind(number);
         assert_eq!(query.execute(&mut connection).await.expect("drops").rows_affected(), 1);
+    }
+
+    /// Takes a package's manifest away, as it could be deleted once while robots should have it.
+    pub async fn drop_package(&self, name: &str, manifest: &Digest) {
+        let mut connection = sqlx::AnyConnection::connect(&self.url).await.expect("connects");
+        for query in [
+            "DELETE FROM packages WHERE name = $1 AND manifest = $2",
+            "DELETE FROM manifest_parts WHERE repository = $1 AND manifest = $2",
+            "DELETE FROM tags WHERE repository = $1 AND manifest = $2",
+            "DELETE FROM manifests WHERE repository = $1 AND digest = $2",
+        ] {
+            let query = sqlx::query(query).bind(name).bind(manifest.to_string());
+            query.execute(&mut connection).await.expect("drops");
+        }
     }
 
     /// Makes all assignments such as they were before decisions were kept.

@@ -94,7 +94,9 @@ async fn a_package_in_use_outlives_its_manifest(database: TestDatabase) {
 
     let manifest = ordered.package.manifest.digest;
     let path = format!("/v2/talker/manifests/{manifest}");
-    assert_eq!(registry.status(Method::DELETE, &path).await, StatusCode::ACCEPTED);
+    assert_eq!(registry.status(Method::DELETE, &path).await, StatusCode::CONFLICT);
+    assert_eq!(registry.status(Method::GET, &path).await, StatusCode::OK);
+    fleet.database.drop_package("talker", &manifest).await;
     assert_eq!(registry.status(Method::GET, &path).await, StatusCode::NOT_FOUND);
     let loose = registry.push_blob("talker", b"loose").await.digest;
     assert_eq!(registry.collect(NOW_MS + YEAR_MS).await.blobs, 1);

@@ -14,7 +14,7 @@ use task_proto::token::{Token, TokenKind};
 use task_proto::{Digest, RobotId, TokenId, UserName};
 use taskd::actions::{ActionError, TaskOrder};
 use taskd::person::Person;
-use taskd::store::{Store, StoreError, TokenHolder};
+use taskd::store::{Deletion, Store, StoreError, TokenHolder};
 use taskd::tls::ClientProof;
 
 use crate::database::{TestDatabase, on_both_databases};
@@ -425,9 +425,10 @@ async fn an_act_that_fails_leaves_no_entry(database: TestDatabase) {
     let repository = "talker".parse().expect("a name");
     let deed = taskd::store::Deed::by(&fleet.operator, taskd::store::Act::ManifestDelete, &repository);
     let store = &fleet.database.store;
-    let missing = store.delete_manifest(&repository, &Digest::of(b"x"), Some(&deed), 1).await.expect("reads");
-    assert_eq!(missing, None);
-    assert!(!store.delete_tag(&repository, &"latest".parse().expect("a tag"), Some(&deed), 1).await.expect("reads"));
+    let missing = store.delete_manifest(&repository, &Digest::of(b"x"), &deed, 1).await.expect("reads");
+    assert_eq!(missing, Deletion::Unknown);
+    let missing = store.delete_tag(&repository, &"latest".parse().expect("a tag"), &deed, 1).await.expect("reads");
+    assert_eq!(missing, Deletion::Unknown);
     // A write that is dropped after its entry was written takes the entry with it.
     let mut write = store.begin().await.expect("begins");
     write.audit(&deed, 1).await.expect("written");

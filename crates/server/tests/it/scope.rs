@@ -6,9 +6,11 @@ use std::time::Duration;
 use futures_util::StreamExt as _;
 use reqwest::{Method, RequestBuilder, StatusCode};
 use serde_json::{Value, json};
-use task_proto::TokenId;
 use task_proto::api::{AccessToken, DeploymentList, DeploymentView, OutputList, RobotList};
+use task_proto::oci::MANIFEST_TYPE;
+use task_proto::publisher::PackageStatement;
 use task_proto::report::Phase;
+use task_proto::{Digest, TokenId};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 
@@ -16,6 +18,8 @@ use crate::harness::{TestRobot, TestServer, answer, refusal};
 use crate::mqtt_harness::{Connect, PATIENCE, Raw};
 use crate::outputs::{Push, file, output};
 use crate::people::PASSWORD;
+use crate::registry::header;
+use crate::signatures::{key, push_signature};
 
 /// A server with a robot in the lab, one in the field, and people.
 struct Sites {
@@ -160,6 +164,56 @@ async fn an_order_says_how_many_robots_are_not_ones_own() {
     let me = alice.ask(Method::DELETE, "/api/v1/robots/atlas").send().await.expect("an answer");
     let body: Value = me.json().await.expect("json");
     assert_eq!(body["error"]["message"], "alice has no permission to maintain (roles: operator)");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_registry_deletes_and_renames_nothing_of_a_package_that_others_use() {
+    let sites = Sites::new().await;
+    let package = sites.server.push("talker", "1.0.0").await;
+    let later = sites.server.push("talker", "2.0.0").await;
+    let signature = PackageStatement { package: package.clone() }.seal(&key(1));
+    let signed = push_signature(&sites.server, &package, &signature).await;
+    let signed = header(&signed, "docker-content-digest");
+    sites.server.deploy(&package, "*", "fleet").await;
+    sites.add("pia", &["publisher"], Some("site=lab")).await;
+    let pia = Asker { server: &sites.server, token: sites.log_in("pia").await.token };
+    let operator = Asker { server: &sites.server, token: sites.server.operator.reveal() };
+    let (manifest, content) = (package.manifest.digest, package.content.digest);
+    let envelope = Digest::of(&serde_json::to_vec(&signature).expect("json"));
+    let everybody =
+        [format!("manifests/{manifest}"), format!("blobs/{content}"), format!("blobs/{}", package.config.digest)];
+    let limited = ["manifests/1.0.0".to_owned(), format!("manifests/{signed}"), format!("blobs/{envelope}")];
+    for path in everybody.iter().chain(&limited) {
+        assert_eq!(pia.status(Method::DELETE, &format!("/v2/talker/{path}")).await, 409, "{path}");
+    }
+    for path in &everybody {
+        assert_eq!(operator.status(Method::DELETE, &format!("/v2/talker/{path}")).await, 409, "{path}");
+    }
+    let refused = pia.ask(Method::DELETE, &format!("/v2/talker/manifests/{manifest}")).send().await.expect("an answer");
+    let said = refused.text().await.expect("text");
+    assert!(said.contains("is what 2 robots should have: atlas, …") && !said.contains("boreas"), "{said}");
+    // The tag stays where it is as well; it may be set again to what it points to.
+    let bytes = |digest| pia.ask(Method::GET, &format!("/v2/talker/manifests/{digest}")).send();
+    let moved = async |by: &Asker<'_>, digest: Digest| {
+        let manifest = bytes(digest).await.expect("an answer").bytes().await.expect("a manifest");
+        let put = by.ask(Method::PUT, "/v2/talker/manifests/1.0.0").header("content-type", MANIFEST_TYPE);
+        put.body(manifest).send().await.expect("an answer").status().as_u16()
+    };
+    assert_eq!((moved(&pia, later.manifest.digest).await, moved(&pia, manifest).await), (409, 201));
+    for path in everybody.iter().chain(&limited) {
+        assert_eq!(operator.status(Method::GET, &format!("/v2/talker/{path}")).await, 200, "{path}");
+    }
+
+    // Where all of them are her own she may but for the package itself, and once nobody has it that goes too.
+    sites.server.deploy(&later, "boreas", "elsewhere").await;
+    assert_eq!(pia.status(Method::DELETE, &format!("/v2/talker/manifests/{manifest}")).await, 409);
+    for path in &limited {
+        assert_eq!(pia.status(Method::DELETE, &format!("/v2/talker/{path}")).await, 202, "{path}");
+    }
+    sites.server.deploy(&later, "atlas", "here").await;
+    for path in everybody.iter().rev() {
+        assert_eq!(pia.status(Method::DELETE, &format!("/v2/talker/{path}")).await, 202, "{path}");
+    }
 }
 
 /// The events that come on a stream, by name and data.

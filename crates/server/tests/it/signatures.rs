@@ -14,7 +14,7 @@ use tempfile::TempDir;
 use crate::database::{TestDatabase, on_both_databases};
 use crate::harness::{TestRobot, TestServer};
 
-fn key(seed: u8) -> SigningKey {
+pub fn key(seed: u8) -> SigningKey {
     SigningKey::from_bytes([seed; 32])
 }
 
@@ -69,7 +69,7 @@ async fn push(
     request.header("content-type", MANIFEST_TYPE).body(manifest).send().await.expect("an answer")
 }
 
-async fn push_signature(server: &TestServer, package: &PackageRef, envelope: &Envelope) -> Response {
+pub async fn push_signature(server: &TestServer, package: &PackageRef, envelope: &Envelope) -> Response {
     let bytes = serde_json::to_vec(envelope).expect("json");
     push(server, package.name.as_str(), (SIGNATURE_ARTIFACT, Some(package.manifest)), &bytes, None).await
 }

@@ -13,7 +13,8 @@ use http::request::Parts;
 use http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode};
 use task_proto::{Digest, RepositoryName, RobotId};
 
-use super::{Answer, OciError, Registry, empty};
+use super::manifests::deleted;
+use super::{Answer, OciError, Registry};
 use crate::blobs::Blob;
 use crate::person::Person;
 use crate::store::{Act, Deed};
@@ -66,18 +67,10 @@ pub(super) async fn get_for_robot(registry: &Registry, robot: &RobotId, digest: 
 }
 
 /// `DELETE /v2/<name>/blobs/<digest>`: out of this repository; the bytes go when nothing needs them.
-pub(super) async fn delete(
-    registry: &Registry,
-    by: Option<&Person>,
-    repository: &RepositoryName,
-    digest: Digest,
-) -> Answer {
-    let deed = by.map(|by| Deed::by(by, Act::BlobDelete, repository).with("digest", digest));
-    if registry.store.unlink_blob(repository, &digest, deed.as_ref(), registry.clock.now_ms()).await? {
-        empty(StatusCode::ACCEPTED, [])
-    } else {
-        Err(OciError::blob_unknown())
-    }
+pub(super) async fn delete(registry: &Registry, by: &Person, repository: &RepositoryName, digest: Digest) -> Answer {
+    let deed = Deed::by(by, Act::BlobDelete, repository).with("digest", digest);
+    let deletion = registry.store.unlink_blob(repository, &digest, &deed, registry.clock.now_ms()).await?;
+    deleted(by, deletion, &format!("{repository}@{digest}"), OciError::blob_unknown)
 }
 
 async fn read(registry: &Registry, digest: Digest, request: &Parts) -> Answer {

@@ -42,6 +42,11 @@ impl OciError {
         Self::new(StatusCode::FORBIDDEN, "DENIED", message)
     }
 
+    /// 409: robots should have the package that this belongs to.
+    pub fn in_use(message: impl Into<String>) -> Self {
+        Self::new(StatusCode::CONFLICT, "DENIED", message)
+    }
+
     /// 404: not an endpoint of the specification.
     pub fn no_endpoint() -> Self {
         Self::new(StatusCode::NOT_FOUND, "UNSUPPORTED", "this is not an endpoint of the distribution API")
@@ -188,6 +193,7 @@ impl From<OciError> for ApiError {
             StatusCode::PAYLOAD_TOO_LARGE => "too_large",
             StatusCode::INSUFFICIENT_STORAGE => "disk_full",
             StatusCode::TOO_MANY_REQUESTS => "too_many_requests",
+            StatusCode::CONFLICT if error.code == "DENIED" => "package_in_use",
             StatusCode::INTERNAL_SERVER_ERROR => "internal",
             _ => "invalid_request",
         };

@@ -20,8 +20,9 @@ use super::uploads::kept_bytes;
 use super::{Answer, OciError, Registry, empty, signed};
 use crate::blobs::Blob;
 use crate::changes::Change;
+use crate::http::packages::in_use;
 use crate::person::Person;
-use crate::store::{Act, Deed, NewManifest, NewOutput, PutManifest, Reference, StoredManifest, bytes_taken};
+use crate::store::{Act, Deed, Deletion, NewManifest, NewOutput, PutManifest, Reference, StoredManifest, bytes_taken};
 
 /// The largest manifest; the specification asks for at least this.
 const MAX_MANIFEST_BYTES: usize = 4 * 1024 * 1024;
@@ -134,6 +135,10 @@ pub(super) async fn push(
     match registry.store.put_manifest(repository, &new, deed.as_ref(), now_ms).await? {
         PutManifest::PartsMissing(missing) => Err(OciError::parts_unknown(&missing)),
         PutManifest::Outdated => Err(OciError::manifest_invalid("there is a list of publishers as new as this one")),
+        PutManifest::TagInUse(tag, users) => {
+            let message = by.map(|by| in_use(by, &format!("{repository}:{tag}"), &users)).unwrap_or_default();
+            Err(OciError::in_use(message))
+        }
         PutManifest::Stored => {
             signed::tell(registry, repository, new.document.as_ref()).await;
             if let Some((package, _)) = &new.package {
@@ -164,33 +169,43 @@ fn pushed(by: &Person, repository: &RepositoryName, new: &NewManifest) -> Deed {
 /// `DELETE`: a tag alone, or a manifest with all its tags.
 pub(super) async fn delete(
     registry: &Registry,
-    by: Option<&Person>,
+    by: &Person,
     repository: &RepositoryName,
     reference: Reference,
 ) -> Answer {
     let now_ms = registry.clock.now_ms();
-    match reference {
+    let (deletion, named) = match reference {
         Reference::Tag(tag) => {
-            let deed = by.map(|by| Deed::by(by, Act::TagDelete, repository).with("tag", &tag));
-            if !registry.store.delete_tag(repository, &tag, deed.as_ref(), now_ms).await? {
-                return Err(OciError::manifest_unknown());
-            }
+            let deed = Deed::by(by, Act::TagDelete, repository).with("tag", &tag);
+            let deletion = registry.store.delete_tag(repository, &tag, &deed, now_ms).await?;
+            (deletion, format!("{repository}:{tag}"))
         }
         Reference::Digest(digest) => {
             let _hold = registry.blobs.hold_collection().await;
-            let deed = by.map(|by| Deed::by(by, Act::ManifestDelete, repository).with("manifest", digest));
-            let parts = registry.store.delete_manifest(repository, &digest, deed.as_ref(), now_ms).await?;
-            let parts = parts.ok_or_else(OciError::manifest_unknown)?;
-            if let Ok(name) = repository.as_str().parse() {
-                registry.changes.announce(Change::Package(name));
+            let deed = Deed::by(by, Act::ManifestDelete, repository).with("manifest", digest);
+            let deletion = registry.store.delete_manifest(repository, &digest, &deed, now_ms).await?;
+            if let Deletion::Deleted(parts) = &deletion {
+                if let Ok(name) = repository.as_str().parse() {
+                    registry.changes.announce(Change::Package(name));
+                }
+                // An order that looked the package up a moment ago still finds its bytes: they stay for a while.
+                for &blob in parts.iter().chain([&digest]) {
+                    registry.blobs.touch(blob, now_ms).await?;
+                }
             }
-            // An order that looked the package up a moment ago still finds its bytes: they stay for a while.
-            for blob in parts.into_iter().chain([digest]) {
-                registry.blobs.touch(blob, now_ms).await?;
-            }
+            (deletion, format!("{repository}@{digest}"))
         }
+    };
+    deleted(by, deletion, &named, OciError::manifest_unknown)
+}
+
+/// The answer to a deletion of what is `named` so.
+pub(super) fn deleted(by: &Person, deletion: Deletion, named: &str, unknown: fn() -> OciError) -> Answer {
+    match deletion {
+        Deletion::Deleted(_) => empty(StatusCode::ACCEPTED, []),
+        Deletion::InUse(users) => Err(OciError::in_use(in_use(by, named, &users))),
+        Deletion::Unknown => Err(unknown()),
     }
-    empty(StatusCode::ACCEPTED, [])
 }
 
 async fn read_body(body: Body) -> Result<Bytes, OciError> {

@@ -144,7 +144,7 @@ pub async fn dispatch(
                     blobs::head_before_push(&registry, &repository, digest, &parts).await
                 }
                 Method::GET | Method::HEAD => blobs::get(&registry, &repository, digest, &parts).await,
-                Method::DELETE => blobs::delete(&registry, person, &repository, digest).await,
+                Method::DELETE => blobs::delete(&registry, deleter(person)?, &repository, digest).await,
                 _ => Err(OciError::method("GET, HEAD, DELETE")),
             }
         }
@@ -175,7 +175,7 @@ pub async fn dispatch(
                     manifests::put(&registry, push, &parts, body).await
                 }
                 Method::DELETE if is_of_another_algorithm(text) => Err(OciError::manifest_unknown()),
-                Method::DELETE => manifests::delete(&registry, person, &repository, reference?).await,
+                Method::DELETE => manifests::delete(&registry, deleter(person)?, &repository, reference?).await,
                 _ => Err(OciError::method("GET, HEAD, PUT, DELETE")),
             }
         }
@@ -222,6 +222,11 @@ fn needed(repository: &RepositoryName, method: &Method, endpoint: &Endpoint<'_>)
         _ if is_output || repository.as_str() == LIST_REPOSITORY => Permission::Administer,
         _ => Permission::Publish,
     }
+}
+
+/// Only people delete.
+fn deleter(person: Option<&Person>) -> Result<&Person, OciError> {
+    person.ok_or_else(|| OciError::denied("a robot deletes nothing"))
 }
 
 /// Whether who was let in to this repository may push there: a robot comes this far only to its own outputs.

@@ -1,6 +1,6 @@
 //! Orders that follow from earlier ones: what failed once more, and back to what was there before.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 
 use task_proto::api::{CreateDeployment, DeploymentView, MatchedRobot, RetryDeployment};
 use task_proto::desired::PackageRef;
@@ -11,7 +11,7 @@ use task_proto::{DeploymentId, Digest, RobotId, TaskName};
 use super::deployments::Placed;
 use super::robots::matched;
 use super::tasks::meant;
-use super::{ActionError, Actions, IdempotencyKey, check_scope};
+use super::{ActionError, Actions, IdempotencyKey, Remembered, check_scope};
 use crate::advance::advance;
 use crate::changes::Consequences;
 use crate::person::Person;
@@ -26,6 +26,13 @@ pub struct Rollback {
     pub robots: Vec<MatchedRobot>,
     /// Who has nothing to go back to, likewise.
     pub without: Vec<MatchedRobot>,
+}
+
+impl Remembered for Rollback {
+    fn keep_robots(&mut self, own: &HashSet<RobotId>) {
+        self.robots.keep_robots(own);
+        self.without.keep_robots(own);
+    }
 }
 
 /// Those who go back to one package.

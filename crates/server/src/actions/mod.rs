@@ -12,12 +12,14 @@ mod robots;
 pub mod sign_in;
 mod tasks;
 
+use std::collections::HashSet;
 use std::fmt;
 use std::str::FromStr;
 use std::sync::Arc;
 
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+use task_proto::api::MatchedRobot;
 use task_proto::envelope::SigningKey;
 use task_proto::selector::Selector;
 use task_proto::{CaPin, DeploymentId, Digest, MacAddress, RobotId, RobotName, TaskName, TokenId, UserName, Version};
@@ -97,7 +99,8 @@ impl Actions {
     }
 
     /// What was answered when `key` came with this `request` before; an error if it came with another, or from someone else.
-    async fn answered_before<T: DeserializeOwned>(
+    /// Robots that are no longer the person's are left out.
+    async fn answered_before<T: Remembered>(
         &self,
         write: &mut Write,
         by: &Person,
@@ -110,11 +113,16 @@ impl Actions {
             return Err(ActionError::IdempotencyKeyReused(key.to_string()));
         }
         let answer = serde_json::from_str(&past.answer);
-        Ok(Some(answer.map_err(|_| StoreError::Unreadable { column: "orders.answer" })?))
+        let mut answer: T = answer.map_err(|_| StoreError::Unreadable { column: "orders.answer" })?;
+        if !by.scope.is_everything() {
+            let own: HashSet<RobotId> = write.robots_ever_in(&by.scope).await?.into_iter().collect();
+            answer.keep_robots(&own);
+        }
+        Ok(Some(answer))
     }
 
     /// Remembers the answer to `request`, so that a retry gets the same.
-    async fn remember_answer<T: Serialize>(
+    async fn remember_answer<T: Remembered>(
         &self,
         write: &mut Write,
         by: &Person,
@@ -128,6 +136,23 @@ impl Actions {
         let order = PastOrder { request: remembered(by, request), answer };
         Ok(write.remember_order(&key.0, &order, now_ms).await?)
     }
+}
+
+/// An answer that is given again when its order comes again.
+trait Remembered: Serialize + DeserializeOwned {
+    /// Leaves out the robots that are not among these.
+    fn keep_robots(&mut self, own: &HashSet<RobotId>);
+}
+
+impl Remembered for Vec<MatchedRobot> {
+    fn keep_robots(&mut self, own: &HashSet<RobotId>) {
+        self.retain(|robot| own.contains(&robot.id));
+    }
+}
+
+impl Remembered for DeploymentId {
+    /// It names none: what is shown of the deployment is a question of its own.
+    fn keep_robots(&mut self, _own: &HashSet<RobotId>) {}
 }
 
 /// A request as it is remembered with its answer. That of the first token is remembered as it was before there were users.

@@ -253,6 +253,14 @@ impl Write {
         matching(sqlx::query(ORDERABLE).fetch_all(self.connection()).await?, selector)
     }
 
+    /// The robots of a scope, and those that were when they were removed.
+    pub async fn robots_ever_in(&mut self, scope: &Scope) -> Result<Vec<RobotId>, StoreError> {
+        let rows = sqlx::query("SELECT id, name, mac, labels FROM robots").fetch_all(self.connection()).await?;
+        let robots = rows.iter().map(known_robot).collect::<Result<Vec<_>, _>>()?;
+        let own = robots.into_iter().filter(|robot| scope.covers(&robot.id, &robot.name, &robot.labels));
+        Ok(own.map(|robot| robot.id).collect())
+    }
+
     /// The robots that should have `task`.
     pub async fn robots_with_task(&mut self, task: &TaskName) -> Result<Vec<RobotId>, StoreError> {
         let rows: Vec<String> = sqlx::query_scalar(WITH_TASK).bind(task.as_str()).fetch_all(self.connection()).await?;

@@ -216,6 +216,48 @@ async fn the_registry_deletes_and_renames_nothing_of_a_package_that_others_use()
     }
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn an_answer_that_is_given_again_names_only_robots_that_are_ones_own_now() {
+    let sites = Sites::new().await;
+    sites.add("alice", &["operator"], Some("site=lab")).await;
+    sites.add("mia", &["admin"], Some("site=lab")).await;
+    let label = async |robot: &TestRobot, site: &str| {
+        let edit = sites.server.request(Method::PATCH, &format!("/api/v1/robots/{}", robot.id));
+        let _: Value = answer(edit.json(&json!({ "labels": { "site": site } }))).await;
+    };
+    label(&sites.field, "lab").await;
+    let [old, new] = [sites.server.push("talker", "1.0.0").await, sites.server.push("talker", "2.0.0").await];
+    for (package, key) in [(&old, "old"), (&new, "new")] {
+        sites.server.deploy(package, "*", key).await;
+    }
+    let alice = Asker { server: &sites.server, token: sites.log_in("alice").await.token };
+    let mia = Asker { server: &sites.server, token: sites.log_in("mia").await.token };
+    let deploy = json!({ "package": new.name, "manifest": new.manifest.digest, "selector": "site=lab" });
+    let all = json!({ "selector": "*" });
+    let orders = [
+        (&alice, "deployments", &deploy),
+        (&alice, "tasks/talker/stop", &all),
+        (&alice, "tasks/talker/start", &all),
+        (&mia, "bulk/labels", &json!({ "selector": "site=lab", "set": { "hall": "2" } })),
+    ];
+    let said = async |(by, path, body): &(&Asker<'_>, &str, &Value)| {
+        let order = by.ask(Method::POST, &format!("/api/v1/{path}")).header("idempotency-key", path.replace('/', "-"));
+        let answer = order.json(body).send().await.expect("an answer");
+        assert!(answer.status().is_success(), "{path}: {}", answer.status());
+        answer.text().await.expect("text")
+    };
+    for order in &orders {
+        let said = said(order).await;
+        assert!(said.contains("atlas") && said.contains("boreas"), "{}: {said}", order.1);
+    }
+    label(&sites.field, "field").await;
+    for order in &orders {
+        let said = said(order).await;
+        assert!(said.contains("atlas") && !said.contains("boreas"), "{}: {said}", order.1);
+        assert!(!said.contains(sites.field.id.as_str()), "{}: {said}", order.1);
+    }
+}
+
 /// The events that come on a stream, by name and data.
 struct Events {
     chunks: futures_util::stream::BoxStream<'static, reqwest::Result<bytes::Bytes>>,

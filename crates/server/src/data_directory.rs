@@ -1,10 +1,10 @@
 //! The server's directory: made on the first start, locked while a server runs, home of the signing key, the private
 //! certificate authority, the secret behind robots' passwords at an external broker, the first operator's token and the
-//! addresses that are bound. It never touches the database or the blobs in it.
+//! addresses that are bound. It never touches the database or the blobs in it, but for who may read and write them.
 
-use std::fs::{DirBuilder, File, OpenOptions, TryLockError};
+use std::fs::{DirBuilder, File, OpenOptions, Permissions, TryLockError};
 use std::io::{self, Write as _};
-use std::os::unix::fs::{DirBuilderExt as _, OpenOptionsExt as _};
+use std::os::unix::fs::{DirBuilderExt as _, MetadataExt as _, OpenOptionsExt as _, PermissionsExt as _};
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
@@ -91,6 +91,15 @@ pub enum DataError {
         /// Why.
         source: io::Error,
     },
+    /// Every account of the machine may put files into it.
+    #[error(
+        "{0} can be written by everybody on this machine, and belongs to somebody else: take that away (chmod o-w {0}), \
+         or name another directory", path.display()
+    )]
+    OpenToAll {
+        /// The directory.
+        path: PathBuf,
+    },
     /// A file holds something else than it should.
     #[error("{} does not hold {expected}; put the right file back, or move it away to get a new one", path.display())]
     Content {
@@ -120,6 +129,7 @@ impl DataDirectory {
             match lock.try_lock() {
                 Ok(()) => {
                     let data = Self { path: path.to_owned(), lock };
+                    data.close_to_others()?;
                     data.unpublish();
                     return Ok(data);
                 }
@@ -129,6 +139,36 @@ impl DataDirectory {
                 Err(TryLockError::Error(source)) => return Err(DataError::Io { path: lock_path, source }),
             }
         }
+    }
+
+    /// Takes from other accounts what an earlier version, an umask or a copy has given them: nobody else writes to the
+    /// directory, and nobody else reads what is in it.
+    fn close_to_others(&self) -> Result<(), DataError> {
+        let io_error = |source| DataError::Io { path: self.path.clone(), source };
+        let own = std::fs::metadata(&self.path).map_err(io_error)?;
+        let (mode, shown) = (own.mode(), self.path.display());
+        if mode & 0o022 != 0 {
+            if std::fs::set_permissions(&self.path, Permissions::from_mode(mode & 0o7755)).is_ok() {
+                tracing::warn!("others could write to {shown}: they can no longer");
+            } else if mode & 0o002 != 0 {
+                return Err(DataError::OpenToAll { path: self.path.clone() });
+            } else {
+                tracing::warn!("the group of {shown} can write to it, and so replace the server's keys");
+            }
+        }
+        for entry in std::fs::read_dir(&self.path).map_err(io_error)? {
+            let path = entry.map_err(io_error)?.path();
+            // What a link leads to is somewhere else, and a command may take its own file away meanwhile.
+            let Ok(found) = path.symlink_metadata() else { continue };
+            if found.is_symlink() || found.mode() & 0o077 == 0 {
+                continue;
+            }
+            match std::fs::set_permissions(&path, Permissions::from_mode(found.mode() & 0o700)) {
+                Ok(()) => tracing::info!("others could look into {}: they can no longer", path.display()),
+                Err(error) => tracing::warn!(%error, "others can look into {}", path.display()),
+            }
+        }
+        Ok(())
     }
 
     /// Where it is.
@@ -250,7 +290,6 @@ mod tests {
     use std::sync::atomic::Ordering::Relaxed;
 
     use super::*;
-    use std::os::unix::fs::PermissionsExt as _;
 
     fn mode(path: &Path) -> u32 {
         std::fs::metadata(path).expect("exists").permissions().mode() & 0o777
@@ -270,6 +309,28 @@ mod tests {
         std::fs::write(path.join(SIGNING_KEY), "nonsense").expect("written");
         let message = data.signing_key().err().expect("refused").to_string();
         assert!(message.contains("signing.key does not hold a signing key"), "{message}");
+    }
+
+    #[test]
+    fn what_others_could_read_or_write_is_closed_to_them() {
+        let directory = tempfile::tempdir().expect("temp dir");
+        let (path, elsewhere) = (directory.path().join("data"), directory.path().join("elsewhere"));
+        std::fs::create_dir(&path).expect("made");
+        std::fs::create_dir(path.join("blobs")).expect("made");
+        for file in [&elsewhere, &path.join("taskd.sqlite"), &path.join("taskd.sqlite-wal"), &path.join(SIGNING_KEY)] {
+            std::fs::write(file, "").expect("written");
+            std::fs::set_permissions(file, Permissions::from_mode(0o664)).expect("set");
+        }
+        std::os::unix::fs::symlink(&elsewhere, path.join("link")).expect("linked");
+        std::fs::set_permissions(path.join("blobs"), Permissions::from_mode(0o775)).expect("set");
+        std::fs::set_permissions(&path, Permissions::from_mode(0o777)).expect("set");
+        drop(DataDirectory::open(&path).expect("opens"));
+        assert_eq!(mode(&path), 0o755, "who could read the names still can");
+        assert_eq!(mode(&path.join("blobs")), 0o700);
+        for file in ["taskd.sqlite", "taskd.sqlite-wal", SIGNING_KEY, LOCK] {
+            assert_eq!(mode(&path.join(file)), 0o600, "{file}");
+        }
+        assert_eq!(mode(&elsewhere), 0o664, "what a link leads to is not ours");
     }
 
     #[test]

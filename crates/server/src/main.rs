@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
+use nix::sys::stat::{Mode, umask};
 use task_proto::line::OneLineEach;
 use taskd::clock::Clock;
 use taskd::command_line::{Command, CommandLine};
@@ -46,6 +47,8 @@ fn main() -> ExitCode {
 }
 
 async fn serve(flags: &ServeFlags) -> anyhow::Result<ExitCode> {
+    // All that a server keeps is its own: also what SQLite makes beside its database.
+    umask(Mode::from_bits_truncate(0o077));
     let filter =
         EnvFilter::try_from_env("TASKD_LOG").unwrap_or_else(|_| EnvFilter::new("info,sqlx=warn,rumqttd=error"));
     let has_colours = std::io::stderr().is_terminal();

@@ -32,11 +32,15 @@ mod timelines;
 mod tokens;
 mod users;
 
+use std::fs::File;
+use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::Path;
+use std::str::FromStr as _;
 use std::sync::Arc;
 use std::time::Duration;
 
 use sqlx::migrate::MigrateError;
+use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{AnyConnection, Connection as _};
 
 use access::{Access, Ending};
@@ -202,6 +206,7 @@ impl Store {
     pub async fn open(url: &str) -> Result<Self, StoreError> {
         sqlx::any::install_default_drivers();
         let open_error = |source| StoreError::Open { url: without_password(url), source };
+        make_file(url);
         let mut first = first_connection(url).await.map_err(open_error)?;
         migrate::run(&mut first).await.map_err(|source| match source {
             MigrateError::VersionMissing(version) => StoreError::Newer { url: without_password(url), version },
@@ -254,6 +259,17 @@ impl Store {
             .await?;
         let ending = self.access.until_ended();
         Ok(Write { lent, turn: rows::number(turn), ending, vouched_for: None })
+    }
+}
+
+/// Makes the file of a SQLite database that is to be created, so that only its owner reads it: SQLite gives the files beside
+/// it the same mode. What can't be made is said by whoever opens it.
+fn make_file(url: &str) {
+    if !url.contains("mode=rwc") {
+        return;
+    }
+    if let Ok(options) = SqliteConnectOptions::from_str(url) {
+        let _ = File::options().write(true).create_new(true).mode(0o600).open(options.get_filename());
     }
 }
 

@@ -25,6 +25,7 @@ pub mod gatekeeper;
 pub mod happening;
 pub mod http;
 pub mod key_file;
+pub mod log_limits;
 pub mod mqtt_access;
 pub mod oidc;
 pub mod package;

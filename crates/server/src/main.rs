@@ -12,9 +12,13 @@ use taskd::clock::Clock;
 use taskd::command_line::{Command, CommandLine};
 use taskd::commands;
 use taskd::config::{Config, ConfigError, ServeFlags};
+use taskd::log_limits::LogLimits;
 use taskd::serve::Server;
 use tokio::signal::unix::{Signal, SignalKind, signal};
+use tokio_util::sync::CancellationToken;
 use tracing_subscriber::EnvFilter;
+use tracing_subscriber::layer::SubscriberExt as _;
+use tracing_subscriber::util::SubscriberInitExt as _;
 
 /// The C library's allocator took a quarter of the time of a short answer, where memory is taken by one thread and given back
 /// by another all the time; see docs/measurements.md.
@@ -51,12 +55,17 @@ async fn serve(flags: &ServeFlags) -> anyhow::Result<ExitCode> {
     umask(Mode::from_bits_truncate(0o077));
     let filter =
         EnvFilter::try_from_env("TASKD_LOG").unwrap_or_else(|_| EnvFilter::new("info,sqlx=warn,rumqttd=error"));
-    let has_colours = std::io::stderr().is_terminal();
+    let (limits, has_colours) = (LogLimits::default(), std::io::stderr().is_terminal());
     tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(move || OneLineEach::new(std::io::stderr(), has_colours))
         .with_ansi(has_colours)
+        .finish()
+        .with(limits.clone())
         .init();
+    let stop = CancellationToken::new();
+    let _stopped = stop.clone().drop_guard();
+    tokio::spawn(limits.run(stop));
     let mut config = Config::load(flags, std::env::vars_os())?;
     match open_files() {
         Ok(files) => fit_to(&mut config, files),

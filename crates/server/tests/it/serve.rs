@@ -249,7 +249,7 @@ struct Program {
     http: String,
     mqtt: String,
     token: String,
-    _directory: tempfile::TempDir,
+    directory: tempfile::TempDir,
 }
 
 impl Program {
@@ -273,7 +273,11 @@ impl Program {
         let addresses = std::fs::read(data.join("addresses.json")).expect("published");
         let addresses: taskd::data_directory::Addresses = serde_json::from_slice(&addresses).expect("json");
         let token = std::fs::read_to_string(data.join("operator.token")).expect("a token").trim().to_owned();
-        Self { process, http: addresses.http, mqtt: addresses.mqtt, token, _directory: directory }
+        Self { process, http: addresses.http, mqtt: addresses.mqtt, token, directory }
+    }
+
+    fn data(&self) -> std::path::PathBuf {
+        self.directory.path().join("data")
     }
 
     /// Begins an upload of ten bytes and sends five.
@@ -364,6 +368,47 @@ async fn whatever_a_robot_says_is_one_line_of_the_log() {
     assert!(line.contains("ERROR forged"), "{line:?}");
     let bad = |c: char| (c.is_control() && c != '\n') || c == '\u{202e}';
     assert!(!log.contains(bad), "{log:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_a_robot_sends_again_and_again_fills_no_log_and_the_data_is_the_servers_alone() {
+    let directory = tempfile::TempDir::new().expect("a directory");
+    let path = directory.path().join("log");
+    let program = Program::start_logging_to(std::fs::File::create(&path).expect("created").into());
+    let client = crate::registry::client();
+    let post = |path: &str, token: &str, body: &Value| {
+        answer::<Value>(client.post(format!("http://{}/api/v1/{path}", program.http)).bearer_auth(token).json(body))
+    };
+    let enrolment = post("enrollment-tokens", &program.token, &json!({})).await;
+    let enrolment = enrolment["token"].as_str().expect("a token");
+    let robot = post("enroll", enrolment, &json!({ "mac": "02:00:00:00:00:07", "name": "atlas" })).await;
+    let id: task_proto::RobotId = robot["robot_id"].as_str().expect("an id").parse().expect("an id");
+    let mut raw = Raw { stream: TcpStream::connect(&program.mqtt).await.expect("connects") };
+    let password = robot["token"].as_str().map(str::to_owned);
+    raw.send(&Connect { password, ..Connect::robot(&id) }.packet()).await;
+    raw.expect(&[0x20, 2, 0, 0]).await;
+    for number in 1..=200_u8 {
+        raw.send(&publish(&topic(&id, RobotTopic::Telemetry), 1, number.into(), b"no vitals")).await;
+        raw.expect(&[0x40, 2, 0, number]).await;
+    }
+    // SQLite's own files are there while it runs.
+    let mut looked_at = 0;
+    let mut directories = vec![program.data()];
+    while let Some(directory) = directories.pop() {
+        for entry in std::fs::read_dir(directory).expect("a directory").map(|entry| entry.expect("an entry")) {
+            let metadata = entry.metadata().expect("there");
+            assert_eq!(metadata.permissions().mode() & 0o077, 0, "{:?}", entry.path());
+            looked_at += 1;
+            if metadata.is_dir() {
+                directories.push(entry.path());
+            }
+        }
+    }
+    assert!(looked_at >= 8, "{looked_at}");
+    program.signal(Signal::SIGTERM);
+    assert_eq!(program.exit_code().await, Some(0));
+    let log = std::fs::read_to_string(&path).expect("text");
+    assert_eq!(log.lines().filter(|line| line.contains("can't be read and is dropped")).count(), 10);
 }
 
 #[test]

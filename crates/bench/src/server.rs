@@ -19,6 +19,8 @@ use crate::package::Package;
 
 /// How long one answer may take.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(60);
+/// After how long a robot asks again that has to wait to enrol.
+const AGAIN: Duration = Duration::from_secs(1);
 /// The payload of a package that only has to exist.
 const SMALL_BYTES: u64 = 32;
 
@@ -59,10 +61,15 @@ impl Server {
         read("an enrolment token", self.request(Method::POST, "/api/v1/enrollment-tokens").json(order)).await
     }
 
-    /// What a robot does with the enrolment token.
+    /// What a robot does with the enrolment token: where too many come at once it asks again.
     pub async fn enroll(&self, token: &str, request: &EnrollRequest) -> Result<EnrollResponse, ServerError> {
-        let post = self.http.post(self.url("/api/v1/enroll")).bearer_auth(token);
-        read("an enrolment", post.json(request)).await
+        loop {
+            let post = self.http.post(self.url("/api/v1/enroll")).bearer_auth(token);
+            match read("an enrolment", post.json(request)).await {
+                Err(ServerError::Refused(_, StatusCode::TOO_MANY_REQUESTS, _)) => tokio::time::sleep(AGAIN).await,
+                answer => return answer,
+            }
+        }
     }
 
     /// The robots that a selector means.

@@ -56,7 +56,9 @@ impl TaskdOrder {
 
 impl Default for TaskdOrder {
     fn default() -> Self {
-        Self { listen: Ipv4Addr::LOCALHOST.into(), configuration: String::new(), settings: Vec::new() }
+        // A fleet under measurement enrols all at once.
+        let settings = vec![("TASKD_ENROLMENT_PER_MINUTE".to_owned(), "1000000".to_owned())];
+        Self { listen: Ipv4Addr::LOCALHOST.into(), configuration: String::new(), settings }
     }
 }
 

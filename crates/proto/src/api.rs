@@ -123,9 +123,12 @@ pub struct CreateEnrollmentToken {
     /// Only for this robot, by id or name, which may register again with it.
     #[serde(default)]
     pub robot: Option<String>,
-    /// How many enrolments it is good for; absent: any number.
+    /// How many enrolments it is good for; absent: as many as the server's setting `enrolment.uses` says.
     #[serde(default)]
     pub uses: Option<u64>,
+    /// Whether it is good for any number of them; not with `uses`.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub unlimited: bool,
     /// Lifetime in seconds; the server's default is a day.
     #[serde(default)]
     pub ttl_s: Option<u64>,
@@ -146,6 +149,9 @@ pub struct EnrollmentToken {
     pub id: String,
     /// The whole token.
     pub token: String,
+    /// How many enrolments it is good for; absent: any number.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub uses_left: Option<u64>,
     /// When it ends.
     pub expires_at_ms: u64,
 }

@@ -86,6 +86,12 @@ pub struct Config {
     pub robots: ConductLimits,
     /// Whether every new robot waits to be approved.
     pub enrolment_approval: bool,
+    /// How many robots an enrolment token is good for whose maker does not say.
+    pub enrolment_uses: u64,
+    /// How many robots may enrol in a minute; by one token half of them.
+    pub enrolment_per_minute: u64,
+    /// What people's packages and uploads leave free on the disk; absent: a fortieth of it, 1 GB at most.
+    pub disk_reserve: Option<u64>,
 }
 
 /// `[delivery]`: how packages travel to robots.
@@ -285,6 +291,9 @@ impl Config {
             transfers: TransferLimits::default(),
             robots: ConductLimits::default(),
             enrolment_approval: false,
+            enrolment_uses: 100,
+            enrolment_per_minute: 3_000,
+            disk_reserve: None,
         }
     }
 

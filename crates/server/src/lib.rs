@@ -28,6 +28,7 @@ pub mod key_file;
 pub mod log_limits;
 pub mod mqtt_access;
 pub mod oidc;
+pub mod pace;
 pub mod package;
 pub mod part_requests;
 pub mod passwords;

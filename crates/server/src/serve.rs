@@ -402,6 +402,8 @@ fn action_settings(config: &Config, tls: Option<&Tls>) -> ActionSettings {
         assignment_lifetime_ms: milliseconds(config.assignment_expiry),
         desired_lifetime_ms: milliseconds(config.desired_lifetime),
         enrolment_approval: config.enrolment_approval,
+        enrolment_token_uses: config.enrolment_uses,
+        enrolments_per_minute: config.enrolment_per_minute,
         ..ActionSettings::default()
     }
 }

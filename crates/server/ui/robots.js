@@ -222,7 +222,7 @@ export class RobotsView {
       <section class="empty onboarding">
         <h2>Waiting for the first robot…</h2>
         ${can('administer') ? html`
-          <p class="quiet">On each robot, run this once. The token in it is good for a day, for any number of robots.</p>
+          <p class="quiet">On each robot, run this once. The token in it is good for a day and 100 robots, unless the server is set up otherwise.</p>
           ${this.enrolment ? command(enrolCommand(this.enrolment)) : html`<p><button class="primary" @click=${() => this.#makeToken()}>Show the command</button></p>`}
           <p class="quiet">Then start the agent. The robot appears here by itself.</p>
           ${command('task-agent run')}`

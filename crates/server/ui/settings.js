@@ -128,7 +128,7 @@ export class SettingsView {
       body: () => html`
         <div class="fields">
           <label class="wide">Labels each robot gets <input name="labels" class="code" placeholder="site=lab" autocomplete="off" autocapitalize="none" spellcheck="false"></label>
-          <label>How many robots <input name="uses" type="number" min="1" placeholder="any number"></label>
+          <label>How many robots <input name="uses" type="number" min="1" placeholder="100"></label>
           <label>Days it is good for <input name="days" type="number" min="1" placeholder="1"></label>
           <label class="wide">Only for a robot that is known <input name="robot" placeholder="name or ID; it may register again" autocomplete="off" spellcheck="false"></label>
         </div>

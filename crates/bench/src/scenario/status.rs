@@ -48,8 +48,9 @@ pub async fn run(flags: StatusFlags) -> anyhow::Result<Run> {
     let mut databases = vec![("SQLite", TaskdOrder::default())];
     match &flags.postgres {
         Some(url) => {
-            let settings = vec![("TASKD_DATABASE".to_owned(), url.clone())];
-            databases.push(("Postgres", TaskdOrder { settings, ..TaskdOrder::default() }));
+            let mut order = TaskdOrder::default();
+            order.settings.push(("TASKD_DATABASE".to_owned(), url.clone()));
+            databases.push(("Postgres", order));
         }
         None => say("no --postgres: SQLite is measured alone"),
     }

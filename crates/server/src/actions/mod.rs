@@ -27,6 +27,7 @@ use task_proto::{CaPin, DeploymentId, Digest, MacAddress, RobotId, RobotName, Ta
 use crate::changes::Changes;
 use crate::chooser::Chooser;
 use crate::clock::Clock;
+use crate::pace::Pace;
 use crate::passwords::Passwords;
 use crate::person::Person;
 use crate::sign_ins::SignIns;
@@ -49,6 +50,13 @@ pub struct Actions {
     envelopes: Arc<desired::Envelopes>,
     passwords: Passwords,
     sign_ins: Arc<SignIns>,
+    enrolments: Arc<Enrolments>,
+}
+
+/// How often robots enrol.
+struct Enrolments {
+    by_token: Pace,
+    all: Pace,
 }
 
 /// Lifetimes the operator may set.
@@ -60,6 +68,10 @@ pub struct ActionSettings {
     pub desired_lifetime_ms: u64,
     /// How long an enrolment token is good for when its maker does not say.
     pub enrolment_token_lifetime_ms: u64,
+    /// How many robots it is good for when its maker does not say.
+    pub enrolment_token_uses: u64,
+    /// How many robots may enrol in a minute; by one token half of them.
+    pub enrolments_per_minute: u64,
     /// The certificate authority that robots are told to trust, if they are to trust the server's own.
     pub ca_pin: Option<CaPin>,
     /// Whether every new robot waits to be approved.
@@ -76,6 +88,8 @@ impl Default for ActionSettings {
             assignment_lifetime_ms: 7 * DAY_MS,
             desired_lifetime_ms: 30 * DAY_MS,
             enrolment_token_lifetime_ms: DAY_MS,
+            enrolment_token_uses: 100,
+            enrolments_per_minute: 3_000,
             ca_pin: None,
             enrolment_approval: false,
         }
@@ -95,7 +109,10 @@ impl Actions {
     ) -> Self {
         let (key, envelopes) = (Arc::new(key), Arc::default());
         let (passwords, sign_ins) = (Passwords::default(), Arc::default());
-        Self { store, clock, changes, key, settings, chooser, envelopes, passwords, sign_ins }
+        let per_minute = settings.enrolments_per_minute;
+        let (by_token, all) = (Pace::per_minute(per_minute / 2), Pace::per_minute(per_minute));
+        let enrolments = Arc::new(Enrolments { by_token, all });
+        Self { store, clock, changes, key, settings, chooser, envelopes, passwords, sign_ins, enrolments }
     }
 
     /// What was answered when `key` came with this `request` before; an error if it came with another, or from someone else.
@@ -296,6 +313,12 @@ pub enum ActionError {
     /// So many wait that no other may.
     #[error("{0} robots wait to be approved: approve or reject some of them first")]
     TooManyPending(u64),
+    /// So many enrol that this one has to wait.
+    #[error("too many robots enrol at once; try again in {seconds} s (enrolment.per_minute)")]
+    TooManyEnrolments {
+        /// When there is room.
+        seconds: u64,
+    },
     /// No such enrolment token, or it has ended.
     #[error("there is no enrolment token {0}")]
     EnrolmentNotFound(TokenId),
@@ -340,7 +363,10 @@ impl ActionError {
             Self::NoRobotsMatch(_) => "no_robots_match",
             Self::OutOfScope { .. } => "out_of_scope",
             Self::NotPermitted(_) => "forbidden",
-            Self::SignInBlocked { .. } | Self::TooManySignIns | Self::TooManyPending(_) => "too_many_requests",
+            Self::SignInBlocked { .. }
+            | Self::TooManySignIns
+            | Self::TooManyPending(_)
+            | Self::TooManyEnrolments { .. } => "too_many_requests",
             Self::NotPending(_) => "not_pending",
             Self::NoRole { .. } => "no_role",
             Self::NoName => "no_name",

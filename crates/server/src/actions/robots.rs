@@ -1,6 +1,7 @@
 //! Robots come, are edited and go; and the tokens they come with.
 
 use std::net::IpAddr;
+use std::time::Instant;
 
 use task_proto::api::{
     CreateEnrollmentToken, EditRobot, EnrollRequest, EnrollmentToken, EnrollmentTokenList, MatchedRobot,
@@ -18,6 +19,7 @@ use super::bulk::removal;
 use super::{ActionError, Actions, MAX_LIFETIME_MS, check_scope, quoted};
 use crate::advance::advance;
 use crate::changes::{Change, Consequences};
+use crate::pace::seconds;
 use crate::person::Person;
 use crate::store::{Act, Deed, EnrolmentTerms, KnownRobot, StoreError, Write};
 
@@ -49,7 +51,9 @@ impl Actions {
         address: Option<IpAddr>,
     ) -> Result<Enrolled, ActionError> {
         check_labels(&request.labels)?;
-        let now_ms = self.clock.now_ms();
+        let (now_ms, now) = (self.clock.now_ms(), Instant::now());
+        let in_time = self.enrolments.by_token.take(&token.id(), now).and_then(|()| self.enrolments.all.take("", now));
+        in_time.map_err(|wait| ActionError::TooManyEnrolments { seconds: seconds(wait) })?;
         let mut write = self.store.begin().await?;
         let terms = write.enrolment_terms(token, now_ms).await?.ok_or(ActionError::TokenRefused)?;
         let known = write.robot_by_mac(&request.mac).await?;
@@ -119,6 +123,11 @@ impl Actions {
         if order.uses == Some(0) {
             return Err(ActionError::Invalid { key: "uses", reason: "a token needs at least one use".to_owned() });
         }
+        if order.unlimited && order.uses.is_some() {
+            let reason = "a token for any number of enrolments (unlimited) has no number of uses".to_owned();
+            return Err(ActionError::Invalid { key: "uses", reason });
+        }
+        let uses_left = (!order.unlimited).then_some(order.uses.unwrap_or(self.settings.enrolment_token_uses));
         let now_ms = self.clock.now_ms();
         let lifetime_ms = match order.ttl_s {
             Some(ttl_s) => lifetime_ms("ttl_s", ttl_s)?,
@@ -131,7 +140,7 @@ impl Actions {
         };
         let expires_at_ms = now_ms + lifetime_ms;
         let (labels, approval) = (order.labels.clone(), order.approval);
-        let terms = EnrolmentTerms { robot, labels, uses_left: order.uses, expires_at_ms, approval };
+        let terms = EnrolmentTerms { robot, labels, uses_left, expires_at_ms, approval };
         let token = Token::random_enrolment(self.key.public_key(), self.settings.ca_pin);
         write.create_enrolment_token(&token, &terms, now_ms).await?;
         let deed = Deed::by(by, Act::EnrolmentCreate, token.id())
@@ -142,7 +151,7 @@ impl Actions {
             .with("expires_at_ms", expires_at_ms);
         write.audit(&deed, now_ms).await?;
         write.commit().await?;
-        Ok(EnrollmentToken { id: token.id(), token: token.reveal(), expires_at_ms })
+        Ok(EnrollmentToken { id: token.id(), token: token.reveal(), uses_left, expires_at_ms })
     }
 
     /// The enrolment tokens that are good for something.

@@ -1,5 +1,6 @@
 //! `taskd enroll-token`: the tokens that robots enrol with.
 
+use std::str::FromStr;
 use std::time::Duration;
 
 use clap::Subcommand;
@@ -7,10 +8,31 @@ use task_proto::TokenId;
 use task_proto::api::{CreateEnrollmentToken, EnrollmentToken, EnrollmentTokenList, EnrollmentTokenView};
 use task_proto::id::{LabelKey, LabelValue};
 
-use super::output::{say, time};
+use super::output::{robots, say, time};
 use super::table::Columns;
 use super::{CommandError, Outcome, Session, complete};
 use crate::config::{at_least_one, lifetime};
+
+/// How many enrolments a token is good for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Uses {
+    /// So many.
+    Number(u64),
+    /// Any number.
+    Unlimited,
+}
+
+impl FromStr for Uses {
+    type Err = String;
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text {
+            "unlimited" => Ok(Self::Unlimited),
+            text => at_least_one(text)
+                .map(Self::Number)
+                .map_err(|_| format!("{text:?} is neither a whole number, at least 1, nor \"unlimited\"")),
+        }
+    }
+}
 
 /// What to do with enrolment tokens.
 #[derive(Debug, Subcommand)]
@@ -20,9 +42,9 @@ pub enum Action {
         /// Only this robot (id or name) may register again with it
         #[arg(long, value_name = "ROBOT", add = complete::robots())]
         robot: Option<String>,
-        /// How many enrolments it is good for [default: any number]
-        #[arg(long, value_name = "N", value_parser = at_least_one)]
-        uses: Option<u64>,
+        /// How many enrolments it is good for [default: the server's setting enrolment.uses, 100]
+        #[arg(long, value_name = "N|unlimited")]
+        uses: Option<Uses>,
         /// How long it lives, like 2h or 7d [default: 1d]
         #[arg(long, value_name = "TIME", value_parser = lifetime)]
         ttl: Option<Duration>,
@@ -47,11 +69,19 @@ pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, Co
     match action {
         Action::Create { robot, uses, ttl, labels, approval } => {
             let ttl_s = ttl.map(|ttl| ttl.as_secs());
-            let request = CreateEnrollmentToken { robot, uses, ttl_s, labels: labels.into_iter().collect(), approval };
+            let (unlimited, uses) = match uses {
+                Some(Uses::Unlimited) => (true, None),
+                Some(Uses::Number(uses)) => (false, Some(uses)),
+                None => (false, None),
+            };
+            let labels = labels.into_iter().collect();
+            let request = CreateEnrollmentToken { robot, uses, unlimited, ttl_s, labels, approval };
             let key = super::client::random_key();
             let token: EnrollmentToken = session.client.order("/enrollment-tokens", &request, &key).await?;
             session.output.described(&token, |token| token.id.clone(), |token| token.token.clone())?;
-            say(&format!("{}, valid until {}; it is not shown again", token.id, time(token.expires_at_ms)));
+            let good_for = token.uses_left.map_or_else(|| "any number of robots".to_owned(), |uses| robots(uses));
+            let until = time(token.expires_at_ms);
+            say(&format!("{}, good for {good_for}, valid until {until}; it is not shown again", token.id));
         }
         Action::List => {
             let list: EnrollmentTokenList = session.client.get("/enrollment-tokens", &[]).await?;

@@ -331,6 +331,26 @@ pub(super) const SETTINGS: &[Setting] = &[
         set: |config, text| boolean(text).map(|approval| config.enrolment_approval = approval),
     },
     Setting {
+        name: "enrolment-uses",
+        value_name: "N",
+        help: "How many robots an enrolment token is good for if its maker does not say [default: 100]",
+        set: |config, text| count(text, 1_000_000).map(|n| config.enrolment_uses = n),
+    },
+    Setting {
+        name: "enrolment-per-minute",
+        value_name: "N",
+        help: "How many robots may enrol in a minute, by one token half of them; ten seconds' worth may come at once \
+               [default: 3000]",
+        set: |config, text| count(text, 1_000_000).map(|n| config.enrolment_per_minute = n),
+    },
+    Setting {
+        name: "disk-reserve",
+        value_name: "SIZE",
+        help: "What people's packages and uploads leave free on the disk for database, logs and reports; what robots bring \
+               back leaves twice as much [default: a fortieth of the disk, 1 GB at most]",
+        set: |config, text| size_within(text, 0, 1 << 50).map(|bytes| config.disk_reserve = Some(bytes)),
+    },
+    Setting {
         name: "robots-messages-per-s",
         value_name: "N",
         help: "MQTT messages a second of one robot, beyond which it is slowed; ten seconds' worth may come at once [default: 100]",

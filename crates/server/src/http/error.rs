@@ -158,6 +158,9 @@ impl From<ActionError> for ApiError {
             | ActionError::NotPermitted(_)
             | ActionError::NoRole { .. }
             | ActionError::NoName => StatusCode::FORBIDDEN,
+            ActionError::TooManyEnrolments { seconds } => {
+                return Self { retry_after_s: seconds, ..Self::too_many(error.to_string()) };
+            }
             ActionError::SignInBlocked { .. } | ActionError::TooManySignIns | ActionError::TooManyPending(_) => {
                 StatusCode::TOO_MANY_REQUESTS
             }

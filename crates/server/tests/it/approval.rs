@@ -69,7 +69,8 @@ async fn a_robot_waits_until_it_is_approved_or_turned_away_or_a_week_has_passed(
 
 async fn no_more_than_a_thousand_wait(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
-    let token = fleet.enrolment_token(CreateEnrollmentToken { approval: true, ..Default::default() }).await;
+    let token =
+        fleet.enrolment_token(CreateEnrollmentToken { approval: true, unlimited: true, ..Default::default() }).await;
     let mut first = None;
     for number in 0..1_000 {
         let came = fleet.try_enroll(&token, mac(number), None).await.expect("enrols");

@@ -42,7 +42,7 @@ async fn enrolment_tokens_are_listed_and_revoked_at_once() {
     let shown = &list.tokens[..2];
     assert_eq!((shown[0].id.as_str(), shown[0].uses_left), (one.id.as_str(), Some(1)));
     assert_eq!(shown[0].robot.as_ref().map(|name| name.as_str()), Some("atlas"));
-    assert_eq!((shown[1].id.as_str(), shown[1].uses_left, shown[1].labels.len()), (all.id.as_str(), None, 1));
+    assert_eq!((shown[1].id.as_str(), shown[1].uses_left, shown[1].labels.len()), (all.id.as_str(), Some(100), 1));
     assert!(!serde_json::to_string(&list).expect("json").contains(&all.token[18..40]), "a secret is listed");
 
     let came: EnrollResponse = answer(enrol(&server, &all.token, "02:00:00:00:00:01")).await;
@@ -128,4 +128,55 @@ async fn a_revoked_robot_is_told_so_and_comes_back_only_by_a_token_made_for_it()
     let reply: ReportReply = server.report(&mut back, &state, Phase::Running).await.json().await.expect("stored");
     assert_eq!(reply.generation, state.generation);
     assert!(server.robot(&back).await.conditions.is_empty());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_token_is_for_so_many_unless_somebody_wants_it_for_more() {
+    let server = TestServer::start_in(tempfile::TempDir::new().expect("a directory"), |config| {
+        config.enrolment_uses = 2;
+    });
+    let server = server.await;
+    let common = token(&server, json!({})).await;
+    assert_eq!(common.uses_left, Some(2));
+    for number in 1..=2 {
+        let _: EnrollResponse = answer(enrol(&server, &common.token, &format!("02:00:00:00:01:0{number}"))).await;
+    }
+    assert_eq!(refusal(enrol(&server, &common.token, "02:00:00:00:01:03")).await, (401, "unauthorized".to_owned()));
+    let unlimited = token(&server, json!({ "unlimited": true })).await;
+    assert_eq!(unlimited.uses_left, None);
+    for number in 1..=5 {
+        let _: EnrollResponse = answer(enrol(&server, &unlimited.token, &format!("02:00:00:00:02:0{number}"))).await;
+    }
+    let both = server.request(Method::POST, "/api/v1/enrollment-tokens").json(&json!({ "uses": 1, "unlimited": true }));
+    assert_eq!(refusal(both).await, (400, "invalid_request".to_owned()));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn robots_enrol_at_a_rate_and_one_token_takes_half_of_it() {
+    let server = TestServer::start_in(tempfile::TempDir::new().expect("a directory"), |config| {
+        config.enrolment_per_minute = 24;
+    });
+    let server = server.await;
+    let leaked = token(&server, json!({ "unlimited": true })).await;
+    let other = token(&server, json!({})).await;
+    let mut number = 0;
+    let mut came_by = async |token: &EnrollmentToken| {
+        let mut came = 0;
+        loop {
+            number += 1;
+            let refused = enrol(&server, &token.token, &format!("02:00:00:00:03:{number:02}")).send().await;
+            let refused = refused.expect("an answer");
+            if refused.status().is_success() {
+                came += 1;
+                continue;
+            }
+            assert_eq!(refused.status().as_u16(), 429);
+            let wait: u64 = refused.headers()["retry-after"].to_str().expect("text").parse().expect("a number");
+            assert!((1..=5).contains(&wait), "{wait}");
+            return came;
+        }
+    };
+    // Ten seconds' worth at once: two of the four are left to others. A machine that is slow has a few more.
+    let (by_leaked, by_other) = (came_by(&leaked).await, came_by(&other).await);
+    assert!((2..=6).contains(&by_leaked) && by_other >= 2, "{by_leaked}, {by_other}");
 }

@@ -69,7 +69,7 @@ impl Fleet {
             clock.clone(),
             changes.clone(),
             key,
-            ActionSettings::default(),
+            ActionSettings { enrolments_per_minute: 1_000_000, ..ActionSettings::default() },
             chooser.clone(),
         );
         let token = Token::random(TokenKind::Operator);
@@ -110,7 +110,7 @@ impl Fleet {
 
     /// Registers `count` robots named `r0`, `r1`, …
     pub async fn enroll(&self, count: u32) -> Vec<Robot> {
-        let token = self.enrolment_token(CreateEnrollmentToken::default()).await;
+        let token = self.enrolment_token(CreateEnrollmentToken { unlimited: true, ..Default::default() }).await;
         let mut robots = Vec::new();
         for number in 0..count {
             let enrolled = self.try_enroll(&token, mac(number), Some(&format!("r{number}"))).await.expect("enrols");

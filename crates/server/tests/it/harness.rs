@@ -49,6 +49,7 @@ impl TestServer {
         let mut config = Config::with_data(directory.path().join("data"));
         config.http.set_port(0);
         config.mqtt.set_port(0);
+        config.enrolment_per_minute = 1_000_000;
         configure(&mut config);
         let clock = Clock::fixed(NOW_MS);
         let server = Server::start(config, clock.clone()).await.expect("the server starts");

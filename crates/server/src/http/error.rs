@@ -141,6 +141,9 @@ impl From<StoreError> for ApiError {
     fn from(error: StoreError) -> Self {
         match error {
             StoreError::RightsEnded => Self::unauthorized(error.to_string()),
+            StoreError::TooManyActs { seconds, .. } => {
+                Self { retry_after_s: seconds, ..Self::too_many(error.to_string()) }
+            }
             _ => Self::internal(&error),
         }
     }

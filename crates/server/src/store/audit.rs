@@ -1,12 +1,15 @@
-//! The audit's entries: each is added by the write that it tells of, and none is ever changed or removed.
+//! The audit's entries: each is added by the write that it tells of, and none is ever changed or removed. So that it does not
+//! grow without bound, what a person does to themselves alone is done so often a day and no more.
 
 use std::collections::BTreeMap;
 use std::net::IpAddr;
+use std::time::{Duration, Instant};
 
 use sqlx::{AssertSqlSafe, Row as _};
 use task_proto::TokenId;
 use task_proto::api::{AuditPage, AuditQuery};
 use task_proto::audit::{AuditEntry, AuditRecord, Link};
+use task_proto::person::Permission;
 
 use super::rows::{id, json, number, stored};
 use super::{KnownRobot, Store, StoreError, Write};
@@ -132,6 +135,20 @@ impl Act {
     }
 }
 
+impl Act {
+    /// Whether everybody may do it again and again, whatever their role, and to nobody but themselves. Of what they began by
+    /// it, signing out and revoking a token end each once. All else takes somebody who is trusted with more than the length
+    /// of the audit, and an order must not wait.
+    fn is_everybodys(self) -> bool {
+        matches!(self, Self::SignIn | Self::TokenCreate | Self::UserPassword)
+    }
+}
+
+/// How often a person may do what everybody may: so often after a rest, and then 2,000 times a day.
+pub(super) fn everybodys_pace() -> Pace {
+    Pace::new(Duration::from_secs(24 * 60 * 60) / 2_000, 200)
+}
+
 /// An act that is being done, as whoever does it tells of it. A secret never belongs in here.
 #[derive(Debug, Clone)]
 pub struct Deed {
@@ -195,6 +212,10 @@ impl Write {
     pub async fn audit(&mut self, deed: &Deed, now_ms: u64) -> Result<(), StoreError> {
         if let Some(by) = &deed.by {
             self.check_rights(by, now_ms).await?;
+        }
+        if deed.act.is_everybodys() && !deed.by.as_ref().is_some_and(|by| by.may(Permission::Administer)) {
+            let taken = self.everybodys.take(&deed.who, Instant::now());
+            taken.map_err(|wait| StoreError::TooManyActs { who: deed.who.clone(), seconds: seconds(wait) })?;
         }
         let last = sqlx::query("SELECT number, digest FROM audit ORDER BY number DESC LIMIT 1")
             .fetch_optional(self.connection())

@@ -45,6 +45,7 @@ use sqlx::{AnyConnection, Connection as _};
 
 use access::{Access, Ending};
 pub use assignments::{Released, TaskOrder};
+use audit::everybodys_pace;
 pub use audit::{Act, Deed};
 use connections::{Connections, Lent, Statement, Terms};
 pub use deliveries::{Decided, DeliveryOrder, RobotFacts};
@@ -66,6 +67,7 @@ pub use timelines::{HistoryPage, HistoryQuery};
 pub use tokens::{Admitted, EnrolmentTerms, TokenHolder};
 pub use users::{NewToken, User};
 
+use crate::pace::Pace;
 use crate::person::Person;
 
 /// What of a SQLite database the writer keeps in memory: 16 MiB.
@@ -84,6 +86,7 @@ pub struct Store {
     writes: Connections,
     access: Access,
     first_uses: FirstUses,
+    everybodys: Arc<Pace>,
     is_postgres: bool,
 }
 
@@ -132,6 +135,14 @@ pub enum StoreError {
     /// Whoever asked had the right to when the request began, and has it no longer.
     #[error("your rights have changed since this request began; sign in, or send it again")]
     RightsEnded,
+    /// The person has done it very often.
+    #[error("{who} has signed in, made tokens or set a password so often that the next time is in {seconds} s")]
+    TooManyActs {
+        /// Who.
+        who: String,
+        /// When the next one may be.
+        seconds: u64,
+    },
     /// A row holds what this version can't read.
     #[error("column {column} of the database holds what this version of taskd can't read")]
     Unreadable {
@@ -154,6 +165,8 @@ pub struct Write {
     ending: Ending,
     /// Who was found to have their rights still.
     vouched_for: Option<Person>,
+    /// How often people do what everybody may.
+    everybodys: Arc<Pace>,
 }
 
 impl Write {
@@ -217,7 +230,8 @@ impl Store {
         let writes = Connections::open(terms(url, 1, WRITER_CACHE)).await.map_err(open_error)?;
         let reads = Connections::open(terms(url, READERS, READER_CACHE)).await.map_err(open_error)?;
         let is_postgres = is_postgres(url);
-        Ok(Self { reads, writes, access: Access::default(), first_uses: FirstUses::default(), is_postgres })
+        let (access, first_uses, everybodys) = (Access::default(), FirstUses::default(), Arc::new(everybodys_pace()));
+        Ok(Self { reads, writes, access, first_uses, everybodys, is_postgres })
     }
 
     /// Ends all connections, after the writes that are under way.
@@ -258,7 +272,8 @@ impl Store {
             .fetch_one(lent.connection())
             .await?;
         let ending = self.access.until_ended();
-        Ok(Write { lent, turn: rows::number(turn), ending, vouched_for: None })
+        let everybodys = self.everybodys.clone();
+        Ok(Write { lent, turn: rows::number(turn), ending, vouched_for: None, everybodys })
     }
 }
 
@@ -353,6 +368,18 @@ mod tests {
         store.close().await;
         let newer = refused("newer").await;
         assert!(newer.contains("a newer taskd (its tables are at 9999)"), "{newer}");
+    }
+
+    #[tokio::test]
+    async fn a_database_and_what_lies_beside_it_are_for_their_owner_alone() {
+        use std::os::unix::fs::PermissionsExt as _;
+        let directory = tempfile::tempdir().expect("a directory");
+        let store = Store::open(&sqlite_url(&directory.path().join("a b.sqlite"))).await.expect("opens");
+        store.begin().await.expect("begins").commit().await.expect("written");
+        let files = std::fs::read_dir(directory.path()).expect("there").map(|entry| entry.expect("an entry"));
+        let modes: Vec<_> = files.map(|file| file.metadata().expect("there").permissions().mode() & 0o777).collect();
+        assert_eq!(modes, [0o600; 3], "the database, its log and the index of that");
+        store.close().await;
     }
 
     #[test]

@@ -13,6 +13,7 @@ use task_proto::selector::Selector;
 use task_proto::token::{Token, TokenKind};
 use task_proto::{Digest, RobotId, TokenId, UserName};
 use taskd::actions::{ActionError, TaskOrder};
+use taskd::http::error::ApiError;
 use taskd::person::Person;
 use taskd::store::{Deletion, Store, StoreError, TokenHolder};
 use taskd::tls::ClientProof;
@@ -31,6 +32,7 @@ on_both_databases! {
     tokens_end_with_what_they_came_from,
     what_is_done_is_written_down_and_nothing_else_is,
     an_act_that_fails_leaves_no_entry,
+    everybodys_own_acts_are_bounded_and_orders_are_not,
     a_changed_audit_is_found_out,
     another_persons_key_is_another_key,
 }
@@ -438,6 +440,39 @@ async fn an_act_that_fails_leaves_no_entry(database: TestDatabase) {
     write.audit(&deed, 1).await.expect("written");
     write.commit().await.expect("stored");
     assert_eq!(fleet.acts_since(before).await, [act("operator.token", "manifest.delete", "talker")]);
+}
+
+async fn everybodys_own_acts_are_bounded_and_orders_are_not(database: TestDatabase) {
+    let fleet = Fleet::new(database).await;
+    fleet.enroll(1).await;
+    fleet.deploy("1", |_| {}).await;
+    fleet.add("vera", "viewer", None).await;
+    let vera = fleet.signed_in("vera").await;
+    let order = CreateToken { ttl_s: Some(60), ..CreateToken::default() };
+    let before = fleet.audit().await.len();
+    let mut made = 0;
+    let refused = loop {
+        let token = match fleet.actions.create_token(&vera, &order).await {
+            Ok(token) => token,
+            Err(refused) => break refused,
+        };
+        made += 1;
+        fleet.actions.revoke_token(&vera, &token.id).await.expect("one may always end one's own");
+        assert!(made < 1_000, "it goes on without end");
+    };
+    let ApiError { status, code, message, retry_after_s } = refused.into();
+    assert_eq!((status.as_u16(), code), (429, "too_many_requests"));
+    assert!(message.starts_with("vera has ") && (1..=44).contains(&retry_after_s), "{message}");
+    assert!(made < 210, "{made}");
+    assert_eq!(fleet.audit().await.len(), before + 2 * made);
+    // Others are not held up, nor is she for what she orders.
+    fleet.add("ada", "operator", None).await;
+    let ada = fleet.signed_in("ada").await;
+    for _ in 0..250 {
+        let task = "talker".parse().expect("a name");
+        let all = "*".parse().expect("a selector");
+        fleet.actions.order_task(&ada, &random_key(), TaskOrder::Stop, &task, &all).await.expect("ordered");
+    }
 }
 
 async fn a_changed_audit_is_found_out(database: TestDatabase) {

@@ -63,9 +63,9 @@ const EXPIRY_INTERVAL: Duration = Duration::from_secs(30);
 const SILENCE_INTERVAL: Duration = Duration::from_secs(5);
 /// How often it looks for robots that misbehave no longer.
 const FORGIVING_INTERVAL: Duration = Duration::from_secs(1);
-/// What robots leave free on the disk: this share of it, but no more than so many bytes.
-const SPARE_SHARE: u64 = 20;
-const MAX_SPARE_BYTES: u64 = 2 << 30;
+/// What people leave free on the disk unless somebody wants it otherwise: this share of it, but no more than so many bytes.
+const RESERVE_SHARE: u64 = 40;
+const MAX_RESERVE_BYTES: u64 = 1 << 30;
 /// What is kept of one robot is at most this share of the disk, unless somebody wants more.
 const ROBOT_SHARE: u64 = 8;
 /// How often it looks at how busy it is.
@@ -422,7 +422,7 @@ fn blob_settings(config: &Config) -> BlobSettings {
         reading: config.blob_read,
         max_blob_bytes: config.max_blob_bytes,
         max_robot_bytes: config.max_robot_bytes.unwrap_or(defaults.max_robot_bytes.min(disk_bytes / ROBOT_SHARE)),
-        spare_bytes: MAX_SPARE_BYTES.min(disk_bytes / SPARE_SHARE),
+        reserve_bytes: config.disk_reserve.unwrap_or(MAX_RESERVE_BYTES.min(disk_bytes / RESERVE_SHARE)),
         ..defaults
     }
 }

@@ -24,6 +24,7 @@ use upload::Uploads;
 pub use upload::{InvalidUploadId, UploadId};
 
 use crate::config::BlobRead;
+use crate::delivery::shown_bytes;
 
 /// Reads from the disk for answers at the same time. More would not be faster, and would keep the processor from those who
 /// wait for something else.
@@ -44,8 +45,8 @@ pub struct BlobSettings {
     pub max_open_blobs: usize,
     /// The most bytes kept of what one robot brings back. While older ones go, it may have twice as many on the disk.
     pub max_robot_bytes: u64,
-    /// What robots leave free on the disk, in bytes, for everybody else and for the database.
-    pub spare_bytes: u64,
+    /// What people leave free on the disk, in bytes, for the database and all else. Robots leave twice as much.
+    pub reserve_bytes: u64,
 }
 
 impl Default for BlobSettings {
@@ -56,7 +57,7 @@ impl Default for BlobSettings {
             max_uploads: 256,
             max_open_blobs: 64,
             max_robot_bytes: 40 << 30,
-            spare_bytes: 0,
+            reserve_bytes: 0,
         }
     }
 }
@@ -114,6 +115,15 @@ pub enum BlobError {
     /// The disk is full.
     #[error("the server's disk is full")]
     DiskFull,
+    /// What is free of the disk is not for this.
+    #[error(
+        "the server's disk is nearly full: the last {} of it are kept for its database and what robots report \
+         (disk_reserve)", shown_bytes(*reserve)
+    )]
+    DiskReserved {
+        /// What is kept free, in bytes.
+        reserve: u64,
+    },
     /// The disk refused.
     #[error("the blob store can't {action} {path}")]
     Disk {
@@ -129,7 +139,7 @@ pub enum BlobError {
 impl BlobError {
     /// Whether the bytes are more than there is room for.
     fn is_want_of_room(&self) -> bool {
-        matches!(self, Self::DiskFull | Self::TooMuchOfRobot { .. } | Self::TooLarge { .. })
+        matches!(self, Self::DiskFull | Self::DiskReserved { .. } | Self::TooMuchOfRobot { .. } | Self::TooLarge { .. })
     }
 
     fn disk(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Self {

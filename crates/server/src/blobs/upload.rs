@@ -209,10 +209,15 @@ impl Uploads {
         if kept.saturating_add(bytes) > max {
             return Err(BlobError::TooMuchOfRobot { max, kept });
         }
+        self.check_reserve(bytes, self.settings.reserve_bytes.saturating_mul(2))
+    }
+
+    /// Whether so many bytes more leave `reserve` free on the disk.
+    fn check_reserve(&self, bytes: u64, reserve: u64) -> Result<(), BlobError> {
         // Where the disk can't be asked, it is full when it says so.
         match room(&self.directory) {
-            Some((free, _)) if bytes > 0 && free < self.settings.spare_bytes.saturating_add(bytes) => {
-                Err(BlobError::DiskFull)
+            Some((free, _)) if bytes > 0 && free < reserve.saturating_add(bytes) => {
+                Err(BlobError::DiskReserved { reserve })
             }
             _ => Ok(()),
         }
@@ -259,7 +264,17 @@ impl Blobs {
         if bytes > max {
             return Err(BlobError::TooLarge { max });
         }
-        owner(repository).map_or(Ok(()), |(robot, _)| self.shared.uploads.check_room_of(&robot, bytes, kept))
+        let uploads = &self.shared.uploads;
+        match owner(repository) {
+            Some((robot, _)) => uploads.check_room_of(&robot, bytes, kept),
+            None => uploads.check_reserve(bytes, uploads.settings.reserve_bytes),
+        }
+    }
+
+    /// How many bytes more people may bring, as far as the disk goes.
+    pub fn room_for_people(&self) -> u64 {
+        let uploads = &self.shared.uploads;
+        room(&uploads.directory).map_or(u64::MAX, |(free, _)| free.saturating_sub(uploads.settings.reserve_bytes))
     }
 
     /// The largest blob that a repository takes.
@@ -435,7 +450,8 @@ mod tests {
     #[tokio::test]
     async fn robots_leave_some_of_the_disk_to_everybody_else() {
         let directory = tempfile::tempdir().expect("a directory");
-        let settings = BlobSettings { spare_bytes: u64::MAX, ..BlobSettings::default() };
+        let (free, _) = room(directory.path()).expect("a disk");
+        let settings = BlobSettings { reserve_bytes: free / 3 * 2, ..BlobSettings::default() };
         let blobs = Blobs::open(directory.path(), settings).expect("opens");
         let push = async |repository: &str| {
             let repository: RepositoryName = repository.parse().expect("a name");
@@ -444,8 +460,22 @@ mod tests {
             blobs.append(&repository, &id, None, body, 0).await
         };
         let refused = push("outputs/r00000000000000a1/mapping").await;
-        assert!(matches!(refused, Err(BlobError::DiskFull)), "{refused:?}");
+        assert!(matches!(refused, Err(BlobError::DiskReserved { .. })), "{refused:?}");
         assert_eq!(push("talker").await.expect("there is room"), 4);
+    }
+
+    #[tokio::test]
+    async fn people_leave_some_of_the_disk_to_the_database() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let settings = BlobSettings { reserve_bytes: 1 << 60, ..BlobSettings::default() };
+        let blobs = Blobs::open(directory.path(), settings).expect("opens");
+        let repository: RepositoryName = "talker".parse().expect("a name");
+        let id = blobs.begin_upload(&repository).await.expect("begins");
+        let body = futures_util::stream::iter([Ok::<_, io::Error>(Bytes::from_static(b"some"))]);
+        let refused = blobs.append(&repository, &id, None, body, 0).await.expect_err("refused");
+        assert!(refused.to_string().contains("(disk_reserve)"), "{refused}");
+        assert_eq!(blobs.room_for_people(), 0);
+        assert_eq!(fs::read_dir(&blobs.shared.uploads.directory).expect("there").count(), 0, "the upload ends");
     }
 
     #[tokio::test]

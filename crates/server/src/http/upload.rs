@@ -19,8 +19,9 @@ use tokio::time::timeout;
 
 use super::App;
 use super::error::ApiError;
-use super::oci::{self, Registry};
+use super::oci::{self, OciError, Registry};
 use super::openapi::Created;
+use crate::blobs::BlobError;
 use crate::package::{PackageError, Packed, pack_into};
 use crate::person::Person;
 
@@ -123,15 +124,24 @@ async fn receive(
 ) -> Result<(Packed, OwnedSemaphorePermit), ApiError> {
     let (sender, receiver) = mpsc::channel(WAITING);
     let (directory, limits) = (app.uploads.directory.clone(), app.uploads.limits);
+    // What is unpacked is packed again beside it.
+    let room = app.blobs.room_for_people() / 2;
+    let (limits, is_short) = (Limits { bytes: limits.bytes.min(room), ..limits }, room < limits.bytes);
     let most = limits.bytes.saturating_add(OVERHEAD_BYTES);
     let work = tokio::task::spawn_blocking(move || {
         packed(Arriving { receiver, current: Bytes::new() }, compression, &limits, &directory).map(|it| (it, place))
     });
     let (fed, worked) = tokio::join!(feed(body, sender, most, PATIENCE), work);
+    let of_disk = |error: ApiError| match error.status {
+        StatusCode::PAYLOAD_TOO_LARGE if is_short => {
+            OciError::from(BlobError::DiskReserved { reserve: app.blobs.settings().reserve_bytes }).into()
+        }
+        _ => error,
+    };
     // Where the body did not come whole, the archive in it was not whole either.
-    fed?;
+    fed.map_err(of_disk)?;
     match worked {
-        Ok(worked) => worked.map_err(refused),
+        Ok(worked) => worked.map_err(|error| of_disk(refused(error))),
         Err(panic) => std::panic::resume_unwind(panic.into_panic()),
     }
 }

@@ -51,6 +51,22 @@ impl TestServer {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn what_people_bring_leaves_the_reserve_of_the_disk() {
+    let directory_of_server = tempfile::TempDir::new().expect("a directory");
+    let server = TestServer::start_in(directory_of_server, |config| config.disk_reserve = Some(1 << 50)).await;
+    let dir = directory("1.0.0", &[("main.sh", "true")]);
+    let upload = server.upload("application/x-tar", archive(dir.path(), ""));
+    assert_eq!(refusal(upload).await, (507, "disk_full".to_owned()));
+    assert!(server.is_clean());
+    let digest = task_proto::Digest::of(b"blob");
+    let push = server.request(Method::POST, &format!("/v2/mapper/blobs/uploads/?digest={digest}")).body("blob");
+    let refused = push.send().await.expect("an answer");
+    assert_eq!(refused.status(), StatusCode::INSUFFICIENT_STORAGE);
+    let said = refused.text().await.expect("text");
+    assert!(said.contains("kept for its database") && said.contains("disk_reserve"), "{said}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn an_uploaded_directory_is_the_package_that_the_command_makes() {
     let server = TestServer::start().await;
     let dir =

@@ -180,7 +180,9 @@ impl From<BlobError> for OciError {
             }
             BlobError::WrongDigest { .. } => Self::digest_invalid(message),
             BlobError::Interrupted(_) => Self::new(StatusCode::REQUEST_TIMEOUT, "BLOB_UPLOAD_INVALID", message),
-            BlobError::DiskFull => Self::new(StatusCode::INSUFFICIENT_STORAGE, "DENIED", message),
+            BlobError::DiskFull | BlobError::DiskReserved { .. } => {
+                Self::new(StatusCode::INSUFFICIENT_STORAGE, "DENIED", message)
+            }
             BlobError::Disk { .. } => Self::internal(&error),
         }
     }

@@ -115,7 +115,9 @@ pub(super) async fn push(
         return Err(OciError::denied("a robot may only tag an output with its own run"));
     }
     let now_ms = registry.clock.now_ms();
-    registry.blobs.check_room(repository, 0, kept_bytes(registry, repository).await?)?;
+    // A robot's manifest is counted with what it lists.
+    let more = if by.is_some() { manifest.size } else { 0 };
+    registry.blobs.check_room(repository, more, kept_bytes(registry, repository).await?)?;
     // First, for whoever hangs up in the middle has it counted as well.
     registry.store.count_blob(repository, &manifest).await?;
     registry.blobs.put(digest.algorithm(), bytes).await?;

@@ -1,6 +1,7 @@
 //! Bodies of the HTTP API under `/api/v1`. Times are milliseconds since the Unix epoch by the server's clock, sizes are
 //! bytes. Unknown fields are tolerated in answers; requests are checked by the server.
 
+mod awaited;
 mod bulk;
 mod conduct;
 mod delivery;
@@ -17,6 +18,7 @@ mod status;
 
 use serde::{Deserialize, Deserializer, Serialize};
 
+pub use self::awaited::{Awaited, names};
 pub use self::bulk::{BulkLabels, BulkRemove};
 pub use self::conduct::ConductTotals;
 pub use self::delivery::{DeliveryChoice, DeliveryDecision, MAX_PRIORITY, MIN_PRIORITY};

@@ -66,6 +66,11 @@ impl Chooser {
         self.inline_bytes
     }
 
+    /// For how long each of these robots has been offline; `None`: it is online.
+    pub fn offline_ms<'a>(&self, robots: impl IntoIterator<Item = &'a RobotId>, now_ms: u64) -> Vec<Option<u64>> {
+        self.presence.offline_ms(robots, now_ms)
+    }
+
     /// Decides for `batch`, robots of `deployment` that begin now.
     pub async fn decide(
         &self,

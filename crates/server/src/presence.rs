@@ -17,6 +17,8 @@ const MAX_CHANGES: usize = 8;
 /// Everyone who was seen by this process.
 pub struct Presence {
     window_ms: u64,
+    /// Robots that were not seen since are offline since then.
+    started_ms: u64,
     robots: Mutex<HashMap<RobotId, Sightings>>,
 }
 
@@ -54,8 +56,8 @@ struct Connection {
 
 impl Presence {
     /// Nobody seen yet. A robot that polls is online for `window_ms` after it was heard.
-    pub fn new(window_ms: u64) -> Self {
-        Self { window_ms, robots: Mutex::default() }
+    pub fn new(window_ms: u64, now_ms: u64) -> Self {
+        Self { window_ms, started_ms: now_ms, robots: Mutex::default() }
     }
 
     /// The robot's MQTT session number `connection` began.
@@ -111,6 +113,20 @@ impl Presence {
     /// Whether the robot is online.
     pub fn is_online(&self, robot: &RobotId, now_ms: u64) -> bool {
         self.get(robot, now_ms).is_some_and(|sighting| sighting.online)
+    }
+
+    /// For how long each of these robots has been offline, as far as this process knows; `None`: it is online.
+    pub fn offline_ms<'a>(&self, robots: impl IntoIterator<Item = &'a RobotId>, now_ms: u64) -> Vec<Option<u64>> {
+        let known = self.robots();
+        let offline_ms = |robot: &RobotId| {
+            let since_ms = match known.get(robot).map(|sightings| sightings.view(self.window_ms, now_ms)) {
+                Some(sighting) if sighting.online => return None,
+                Some(sighting) => sighting.last_seen_ms.max(self.started_ms),
+                None => self.started_ms,
+            };
+            Some(now_ms.saturating_sub(since_ms))
+        };
+        robots.into_iter().map(offline_ms).collect()
     }
 
     /// Whether it is connected over MQTT.
@@ -306,7 +322,7 @@ mod tests {
 
     #[test]
     fn a_connection_or_a_recent_poll_is_online() {
-        let presence = Presence::new(1000);
+        let presence = Presence::new(1000, 0);
         let robot = RobotId::random();
         assert_eq!(presence.get(&robot, 0), None);
         presence.seen(&robot, address(), 10);
@@ -329,8 +345,20 @@ mod tests {
     }
 
     #[test]
+    fn an_absence_is_counted_from_the_last_word_or_the_start() {
+        let presence = Presence::new(1000, 500);
+        let (unseen, polls, hung_up) = (RobotId::random(), RobotId::random(), RobotId::random());
+        presence.seen(&polls, address(), 600);
+        presence.connected(&hung_up, None, 1, 600);
+        let robots = [unseen, polls, hung_up.clone()];
+        assert_eq!(presence.offline_ms(&robots, 1500), [Some(1000), None, None]);
+        presence.disconnected(&hung_up, 1, 1500);
+        assert_eq!(presence.offline_ms(&robots, 1700), [Some(1200), Some(1100), Some(200)]);
+    }
+
+    #[test]
     fn a_duplicate_ends_when_only_one_is_let_in() {
-        let presence = Presence::new(1000);
+        let presence = Presence::new(1000, 0);
         let (robot, a, b) = (RobotId::random(), InstanceId::random(), InstanceId::random());
         for instance in [&a, &b, &a, &b] {
             presence.instance_seen(&robot, None, instance, 1);
@@ -342,7 +370,7 @@ mod tests {
 
     #[test]
     fn silence_is_noticed_once_and_only_of_robots_that_poll() {
-        let presence = Presence::new(1000);
+        let presence = Presence::new(1000, 0);
         let (polls, connected) = (RobotId::random(), RobotId::random());
         presence.seen(&polls, address(), 500);
         presence.seen(&connected, address(), 500);
@@ -354,7 +382,7 @@ mod tests {
 
     #[test]
     fn a_late_end_of_the_old_connection_leaves_the_new_one() {
-        let presence = Presence::new(1000);
+        let presence = Presence::new(1000, 0);
         let robot = RobotId::random();
         presence.connected(&robot, Some(address()), 2, 0);
         presence.connected(&robot, Some(address()), 1, 1);
@@ -364,7 +392,7 @@ mod tests {
 
     #[test]
     fn a_sessions_port_stays_while_requests_come_from_others() {
-        let presence = Presence::new(1000);
+        let presence = Presence::new(1000, 0);
         let robot = RobotId::random();
         let shown = || presence.get(&robot, 0)?.address.map(|address| address.to_string());
         presence.seen(&robot, "10.0.0.7:5000".parse().expect("valid"), 0);

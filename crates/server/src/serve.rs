@@ -7,6 +7,10 @@ use std::time::Duration;
 
 use task_proto::api::{FeedKind, ListenerView};
 use task_proto::envelope::PublicKey;
+use tokio::sync::broadcast::{
+    self,
+    error::{RecvError, TryRecvError},
+};
 use tokio::task::JoinHandle;
 use tokio::time::{Interval, MissedTickBehavior};
 use tokio_util::sync::CancellationToken;
@@ -61,6 +65,10 @@ const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
 const EXPIRY_INTERVAL: Duration = Duration::from_secs(30);
 /// How often it looks for robots that have fallen silent.
 const SILENCE_INTERVAL: Duration = Duration::from_secs(5);
+/// How often it looks for rollouts that go on without robots that stay away.
+const ROLLOUT_INTERVAL: Duration = Duration::from_secs(10);
+/// The pause between two looks at rollouts, however many robots come meanwhile.
+const ROLLOUT_PAUSE: Duration = Duration::from_millis(250);
 /// How often it looks for robots that misbehave no longer.
 const FORGIVING_INTERVAL: Duration = Duration::from_secs(1);
 /// What people leave free on the disk unless somebody wants it otherwise: this share of it, but no more than so many bytes.
@@ -129,7 +137,8 @@ impl Server {
         let http = listen(config.http).map_err(|source| ServeError::Listen { address: config.http, source })?;
         let http_address = http.local_addr().map_err(|source| ServeError::Listen { address: config.http, source })?;
 
-        let (changes, presence) = (Changes::new(), Arc::new(Presence::new(milliseconds(config.presence_timeout))));
+        let presence = Arc::new(Presence::new(milliseconds(config.presence_timeout), clock.now_ms()));
+        let changes = Changes::new();
         let (load, visits) = (Arc::<ServerLoad>::default(), Arc::<Visits>::default());
         let chooser = Chooser::new(&config.delivery, presence.clone(), load.clone());
         let settings = action_settings(&config, tls.as_ref());
@@ -291,6 +300,7 @@ fn start_tasks(tasks: &TaskTracker, app: &App, config: &Config) {
     };
     tasks.spawn(app.feed.clone().run(source, app.changes.clone(), app.stop.clone()));
     tasks.spawn(notice_silence(app.clone()));
+    tasks.spawn(advance_rollouts(app.clone()));
     tasks.spawn(show_conduct(app.clone()));
 }
 
@@ -318,6 +328,40 @@ async fn expire_assignments(app: App) {
             ),
         }
     }
+}
+
+/// Moves rollouts on where robots come or stay away: what a report or an order changes moves them on by itself.
+async fn advance_rollouts(app: App) {
+    let mut ticks = ticks(ROLLOUT_INTERVAL);
+    let mut happenings = app.changes.happenings();
+    while !app.stop.is_cancelled() {
+        tokio::select! {
+            () = app.stop.cancelled() => return,
+            _ = ticks.tick() => {}
+            () = robot_came(&mut happenings) => {}
+        }
+        if let Err(error) = app.actions.advance_rollouts().await {
+            tracing::error!(error = &error as &dyn std::error::Error, "rollouts could not be moved on");
+        }
+        // Robots that come at once, as after a restart, are looked at once.
+        tokio::select! {
+            () = app.stop.cancelled() => return,
+            () = tokio::time::sleep(ROLLOUT_PAUSE) => {}
+        }
+    }
+}
+
+/// Waits until some robot has come online. Takes all that has been said so far.
+async fn robot_came(happenings: &mut broadcast::Receiver<Happening>) {
+    let mut came = false;
+    while !came {
+        came = match happenings.recv().await {
+            Ok(happening) => matches!(happening, Happening::Presence(_, true)),
+            Err(RecvError::Lagged(_)) => true,
+            Err(RecvError::Closed) => std::future::pending().await,
+        };
+    }
+    while !matches!(happenings.try_recv(), Err(TryRecvError::Empty | TryRecvError::Closed)) {}
 }
 
 /// Shows that robots misbehave, and that they do so no longer.

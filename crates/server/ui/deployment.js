@@ -27,6 +27,8 @@ const ORDER_PAUSE_MS = 1_000;
 // The whole is fetched anew at most this often, and more seldom where that takes long: ten thousand robots are some megabytes.
 const REFETCH_PAUSE_MS = 5_000;
 const REFETCH_SHARE = 10;
+// Robots that are named where it is said which are waited for.
+const AWAITED_NAMES = 5;
 
 /** Phases that always have a place, so that nothing moves when the first robot gets there. */
 const PLACES = ['assigned', 'fetching', 'unpacking', 'building', 'starting', 'running', 'failed'];
@@ -169,7 +171,7 @@ export class DeploymentView {
   #head(now, { retried, newer }) {
     const deployment = this.#deployment;
     const { package: { name, version, manifest }, selector, created_at_ms: created, expires_at_ms: expires, state } = deployment;
-    const isUnsettled = state === 'active' || state === 'paused';
+    const isUnsettled = this.#isUnsettled;
     return html`
       <p class="path"><a href=${at(['deployments'])}>Deployments</a> <span class="quiet">/ <span class="code">${this.id}</span></span></p>
       <header class="bar-of-tools deployment-head">
@@ -188,6 +190,10 @@ export class DeploymentView {
       ${this.#problem ? html`<p class="bad" role="alert">▲ ${this.#problem}</p>` : nothing}`;
   }
 
+  get #isUnsettled() {
+    return ['active', 'paused'].includes(this.#deployment.state);
+  }
+
   /** The deployments before and after it. */
   #relations(newer) {
     const { supersedes } = this.#deployment;
@@ -201,7 +207,7 @@ export class DeploymentView {
   }
 
   /** The counters, which are the filter as well, and how the bytes come along. */
-  #figures(now, { phases, done, total, awaited }) {
+  #figures(now, { phases, done, total, awaited, busy, offline }) {
     const places = this.#deployment.kind === 'job' ? JOB_PLACES : PLACES;
     const shown = [...places, ...LIFE.filter((phase) => !places.includes(phase) && phases.get(phase))];
     const all = this.#parts.all.size;
@@ -220,6 +226,9 @@ export class DeploymentView {
         <div><dt>Transferred</dt><dd>${total ? bytes({ done, total }) : '–'}</dd></div>
         <div><dt>Throughput</dt><dd>${rate ? `${size(rate)}/s` : '–'}</dd></div>
         <div><dt>Time left</dt><dd>${timeLeft(this.#deployment.state, done, total, awaited, rate)}</dd></div>
+        ${this.#isUnsettled ? html`
+          <div class="awaited"><dt>Waits for</dt><dd>${busy.length ? someNames(busy) : '–'}</dd></div>
+          <div class="awaited"><dt>Offline</dt><dd>${offline.length ? html`${someNames(offline)}: ${offline.length === 1 ? 'goes' : 'go'} on when back` : '–'}</dd></div>` : nothing}
       </dl>`;
   }
 
@@ -360,6 +369,12 @@ function timeLeft(state, done, total, awaited, rate) {
   return done < total ? 'the rest is offline or waits' : '–';
 }
 
+/** The names of the first robots, each a link, and how many more there are. */
+function someNames(parts) {
+  const rest = parts.length - AWAITED_NAMES;
+  return html`${parts.slice(0, AWAITED_NAMES).map(({ name }, index) => html`${index ? ', ' : ''}<a href=${at(['robots', name])}>${name}</a>`)}${rest > 0 ? ` and ${number(rest)} more` : ''}`;
+}
+
 const capital = (text) => text.charAt(0).toUpperCase() + text.slice(1);
 
 /** What else is known of a robot's part: how far, why not, or what it waits for. */
@@ -369,7 +384,7 @@ function note(part, { package: { name } }) {
   const bar = progressBar({ task: name, phase, progress });
   if (bar) return bar;
   if (degraded) return html`<span class="bad" title=${degraded.text}>▲ degraded: ${words(degraded.code)}</span>`;
-  if (!released) return html`<span class="quiet">waits for its batch</span>`;
-  if (phase === 'assigned' && !part.online) return html`<span class="quiet">begins when the robot is back</span>`;
+  if (['assigned', 'deferred'].includes(phase) && !part.online) return html`<span class="quiet">begins when the robot is back</span>`;
+  if (!released && phase === 'assigned') return html`<span class="quiet">waits for its batch</span>`;
   return nothing;
 }

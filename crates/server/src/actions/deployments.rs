@@ -11,11 +11,12 @@ use task_proto::{DeploymentId, RobotId, UserName};
 use super::approval::give_up_pending;
 use super::robots::lifetime_ms;
 use super::{ActionError, Actions, DAY_MS, IdempotencyKey, check_scope, quoted};
-use crate::advance::advance;
+use crate::advance::{advance, parts};
 use crate::changes::{Change, Consequences};
 use crate::chooser::{Chooser, travelling_bytes};
 use crate::delivery::shown_bytes;
 use crate::person::Person;
+use crate::rollout::Tally;
 use crate::store::{Act, Deed, NewDeployment, Revocable, Write};
 
 /// How long an idempotency key is remembered.
@@ -119,7 +120,8 @@ impl Actions {
         Ok(())
     }
 
-    /// Lets a paused deployment go on; the failures so far are forgiven.
+    /// Lets a paused deployment go on; the failures so far are forgiven. Of one that is not paused the error says why
+    /// nothing more begins there.
     pub async fn resume_deployment(&self, by: &Person, id: &DeploymentId) -> Result<(), ActionError> {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
@@ -128,16 +130,47 @@ impl Actions {
         if is_cancelled {
             return Err(ActionError::DeploymentCancelled(id.clone()));
         }
-        let Some((rollout, tally)) = write.rollout(id).await?.filter(|(rollout, _)| rollout.paused) else {
-            return Ok(());
+        let Some(open) = write.rollout(id).await?.filter(|open| open.rollout.paused) else {
+            drop(write);
+            return Err(self.not_paused(id).await?);
         };
-        write.resume(id, rollout.forgiven.max(tally.failed)).await?;
+        let tally = Tally::of(open.failed, parts(&self.chooser, &open, now_ms));
+        write.resume(id, open.rollout.forgiven.max(tally.failures())).await?;
         write.audit(&Deed::by(by, Act::DeploymentResume, id), now_ms).await?;
         let touched = BTreeSet::from([id.clone()]);
         let mut consequences = Consequences { deployments: touched.clone(), ..Consequences::default() };
         advance(&mut write, &self.chooser, touched, now_ms, &mut consequences).await?;
         write.commit().await?;
         self.changes.publish(consequences);
+        Ok(())
+    }
+
+    /// Says why a deployment that is not paused can't be resumed.
+    async fn not_paused(&self, id: &DeploymentId) -> Result<ActionError, ActionError> {
+        let found = self.store.deployment(id, false).await?;
+        let mut view = found.ok_or_else(|| ActionError::DeploymentNotFound(id.clone()))?;
+        let assignments = view.assignments.get_or_insert_default();
+        let offline = self.chooser.offline_ms(assignments.iter().map(|one| &one.robot), self.clock.now_ms());
+        assignments.iter_mut().zip(offline).for_each(|(one, offline_ms)| one.online = offline_ms.is_none());
+        Ok(ActionError::NotPaused { id: id.clone(), why: view.awaited().to_string() })
+    }
+
+    /// Begins batches that are due because robots have come back or stay away. To be called when a robot has come, and
+    /// every few seconds.
+    pub async fn advance_rollouts(&self) -> Result<(), ActionError> {
+        let open = self.store.open_rollouts().await?;
+        if open.is_empty() {
+            return Ok(());
+        }
+        let now_ms = self.clock.now_ms();
+        let mut write = self.store.begin_keeping_rights().await?;
+        let mut consequences = Consequences::default();
+        advance(&mut write, &self.chooser, open, now_ms, &mut consequences).await?;
+        // Where nothing has moved, nothing is to be committed.
+        if !consequences.deployments.is_empty() {
+            write.commit().await?;
+            self.changes.publish(consequences);
+        }
         Ok(())
     }
 

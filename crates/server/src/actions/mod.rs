@@ -348,6 +348,14 @@ pub enum ActionError {
     /// The deployment was cancelled before.
     #[error("deployment {0} was cancelled")]
     DeploymentCancelled(DeploymentId),
+    /// It does not wait for the operator.
+    #[error("deployment {id} is not paused: {why}")]
+    NotPaused {
+        /// The deployment.
+        id: DeploymentId,
+        /// What it waits for.
+        why: String,
+    },
     /// The robot's generation is higher than ours: the database was restored. It is left alone until its next order.
     #[error("robot {0} reports a later state than the server knows; it is left alone until its next order")]
     Diverged(RobotId),
@@ -387,6 +395,7 @@ impl ActionError {
             | Self::TokenNotFound(_)
             | Self::EnrolmentNotFound(_) => "not_found",
             Self::DeploymentCancelled(_) => "deployment_cancelled",
+            Self::NotPaused { .. } => "not_paused",
             Self::NothingToRetry(_) => "nothing_to_retry",
             Self::NothingToRollBack(_) => "nothing_to_roll_back",
             Self::PackageNotFound(..) => "package_not_found",

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 
 use indicatif::{MultiProgress, ProgressBar, ProgressFinish, ProgressStyle};
 use task_proto::RobotId;
-use task_proto::api::{AssignmentView, DeploymentView};
+use task_proto::api::{AssignmentView, DeploymentView, names};
 use task_proto::report::Phase;
 use tokio::time::Instant;
 
@@ -13,6 +13,8 @@ use super::output::{printable, say, stderr_is_terminal};
 
 /// Up to this many robots each gets its own bar.
 const MAX_BARS: usize = 20;
+/// Robots that are named behind the counts.
+const MAX_NAMES: usize = 3;
 
 /// A bar for an upload of `size` bytes.
 pub(super) fn upload_bar(size: u64) -> ProgressBar {
@@ -106,7 +108,13 @@ impl DeploymentProgress {
 
     fn show_summary(&mut self, view: &DeploymentView, assignments: &[AssignmentView]) {
         let counts: Vec<_> = view.counts.iter().map(|count| format!("{} {}", count.count, count.phase)).collect();
-        let text = counts.join(", ");
+        let awaited = view.awaited();
+        let mut text = counts.join(", ");
+        for (title, robots) in [("waits for", &awaited.busy), ("offline", &awaited.offline)] {
+            if !robots.is_empty() {
+                text.push_str(&printable(&format!("; {title}: {}", names(robots, MAX_NAMES))));
+            }
+        }
         if !self.moving {
             if self.said_summary != text {
                 say(&text);

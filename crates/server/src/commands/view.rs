@@ -2,7 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use task_proto::api::{AssignmentView, DeliveryDecision, DeploymentState, DeploymentView, MatchedRobot, MatchedRobots};
+use task_proto::api::{
+    AssignmentView, DeliveryDecision, DeploymentState, DeploymentView, MatchedRobot, MatchedRobots, names,
+};
 use task_proto::desired::Delivery;
 use task_proto::report::Phase;
 
@@ -13,6 +15,8 @@ use crate::delivery::{FELL_BEHIND, ORDERED};
 
 /// Reasons for waiting that are shown; a gate may give each robot one of its own.
 const MAX_REASONS: usize = 5;
+/// Robots that are named in one fact.
+const MAX_NAMES: usize = 20;
 
 /// A deployment's state, in a word.
 pub(super) fn state(state: DeploymentState) -> &'static str {
@@ -79,6 +83,12 @@ fn describe(view: &DeploymentView) -> String {
     if !supersedes.is_empty() {
         facts.push(("supersedes", supersedes.join(" ")));
     }
+    let awaited = view.awaited();
+    for (title, robots) in [("waits for", &awaited.busy), ("next", &awaited.queued), ("offline", &awaited.offline)] {
+        if view.state != DeploymentState::Cancelled && !robots.is_empty() {
+            facts.push((title, names(robots, MAX_NAMES)));
+        }
+    }
     let assignments = view.assignments.as_deref().unwrap_or_default();
     facts.extend(mechanisms(assignments).into_iter().map(|line| ("travels", line)));
     facts.extend(deferred(assignments).into_iter().map(|line| ("deferred", line)));
@@ -138,7 +148,9 @@ fn assignment_row(assignment: &AssignmentView) -> Vec<String> {
     let detail = match (&assignment.failure, &assignment.superseded_by) {
         (Some(failure), _) => failure.to_string(),
         (None, Some(newer)) => format!("by {newer}"),
-        (None, None) if !assignment.released => "waits for its batch".to_owned(),
+        (None, None) if assignment.phase.is_final() => "-".to_owned(),
+        (None, None) if !assignment.released && assignment.online => "waits for its batch".to_owned(),
+        (None, None) if !assignment.released => "begins when the robot is back".to_owned(),
         (None, None) => "-".to_owned(),
     };
     let progress = assignment.progress.filter(|progress| progress.total > 0);

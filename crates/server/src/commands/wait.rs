@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use task_proto::DeploymentId;
-use task_proto::api::{AssignmentView, DeploymentState, DeploymentView};
+use task_proto::api::{AssignmentView, DeploymentState, DeploymentView, names};
 use tokio::time::{Instant, sleep, timeout_at};
 
 use super::client::ClientError;
@@ -17,6 +17,8 @@ use super::{CommandError, Outcome, Session, view};
 const MIN_PAUSE: Duration = Duration::from_millis(100);
 /// The longest pause.
 pub(super) const MAX_PAUSE: Duration = Duration::from_secs(1);
+/// Robots named in one line of the verdict.
+const MAX_NAMES: usize = 20;
 
 /// Waits, then prints the deployment and the reasons of every robot that did not make it.
 pub(super) async fn until_settled(
@@ -97,13 +99,13 @@ fn judge(view: &DeploymentView) -> Verdict {
     lines.extend(by_reason(&failed));
     lines.extend(open.iter().map(|a| format!("{}: not done in time, still {}", a.name, reason(a))));
     if !offline.is_empty() {
-        lines.push(format!("offline, and following when back: {}", names(&offline)));
+        lines.push(format!("offline, and following when back: {}", names(&offline, MAX_NAMES)));
     }
     if !waiting.is_empty() {
         lines.push(format!(
             "paused after {} failures, not begun: {}; go on with `taskd deploy resume {}`",
             failed.len(),
-            names(&waiting),
+            names(&waiting, MAX_NAMES),
             view.id
         ));
     }
@@ -128,7 +130,7 @@ fn by_reason(assignments: &[&AssignmentView]) -> Vec<String> {
     }
     let mut reasons: Vec<_> = reasons.into_iter().collect();
     reasons.sort_by_key(|(_, robots)| std::cmp::Reverse(robots.len()));
-    reasons.into_iter().map(|(reason, robots)| format!("{}: {reason}", names(&robots))).collect()
+    reasons.into_iter().map(|(reason, robots)| format!("{}: {reason}", names(&robots, MAX_NAMES))).collect()
 }
 
 fn reason(assignment: &AssignmentView) -> String {
@@ -137,15 +139,6 @@ fn reason(assignment: &AssignmentView) -> String {
         (None, Some(newer)) => format!("{} by {newer}", assignment.phase),
         (None, None) => assignment.phase.to_string(),
     }
-}
-
-fn names(assignments: &[&AssignmentView]) -> String {
-    const MAX_NAMES: usize = 20;
-    let mut names: Vec<_> = assignments.iter().take(MAX_NAMES).map(|a| a.name.to_string()).collect();
-    if assignments.len() > MAX_NAMES {
-        names.push(format!("and {} more", assignments.len() - MAX_NAMES));
-    }
-    names.join(", ")
 }
 
 #[cfg(test)]

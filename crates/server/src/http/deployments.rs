@@ -122,7 +122,8 @@ pub(super) async fn cancel(
 
 /// Lets a paused deployment go on.
 #[utoipa::path(post, path = "/api/v1/deployments/{deployment}/resume", tag = "deployments",
-    responses((status = 409, description = "`deployment_cancelled`: it was taken back.")))]
+    responses((status = 409, description = "`deployment_cancelled`: it was taken back; `not_paused`: \
+        nothing is to be resumed, and what it waits for.")))]
 pub(super) async fn resume(
     State(app): State<App>,
     by: Person,

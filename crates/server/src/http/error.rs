@@ -181,6 +181,7 @@ impl From<ActionError> for ApiError {
             | ActionError::EnrolledAnew(_)
             | ActionError::NotPending(_)
             | ActionError::DeploymentCancelled(_)
+            | ActionError::NotPaused { .. }
             | ActionError::NothingToRetry(_)
             | ActionError::NothingToRollBack(_)
             | ActionError::UserExists(_)

@@ -80,6 +80,42 @@ impl Write {
         deployments(superseded)
     }
 
+    /// Moves robots that wait for their batch behind all others, in their order.
+    pub async fn postpone(&mut self, deployment: &DeploymentId, robots: &[&RobotId]) -> Result<(), StoreError> {
+        let last: Option<i64> = sqlx::query_scalar("SELECT MAX(place) FROM assignments WHERE deployment_id = $1")
+            .bind(deployment.as_str())
+            .fetch_one(self.connection())
+            .await?;
+        for group in groups(robots) {
+            let sql = format!(
+                "WITH v (id) AS ({}) UPDATE assignments SET place = place + $2 FROM v
+                 WHERE deployment_id = $1 AND robot_id = v.id AND released = 0 AND ended = 0",
+                values(3, group.len(), &["TEXT"])
+            );
+            let mut query = sqlx::query(AssertSqlSafe(sql)).bind(deployment.as_str()).bind(last.unwrap_or(0) + 1);
+            for robot in group {
+                query = query.bind(robot.as_str());
+            }
+            query.execute(self.connection()).await?;
+        }
+        Ok(())
+    }
+
+    /// Lets the time of all robots run that wait for their batch, where it does not yet: nothing but them is waited for.
+    /// Says whether there were any.
+    pub async fn await_offline(&mut self, deployment: &DeploymentId, now_ms: u64) -> Result<bool, StoreError> {
+        let begun = sqlx::query(
+            "UPDATE assignments SET expires_at_ms =
+                 CAST($2 AS BIGINT) + (SELECT expires_at_ms - created_at_ms FROM deployments WHERE id = $1)
+             WHERE deployment_id = $1 AND released = 0 AND ended = 0 AND expires_at_ms IS NULL",
+        )
+        .bind(deployment.as_str())
+        .bind(stored(now_ms))
+        .execute(self.connection())
+        .await?;
+        Ok(begun.rows_affected() > 0)
+    }
+
     /// Begins the next batch of at most `count` robots: what they had of the task gives way. Their time begins now.
     pub async fn release(
         &mut self,

@@ -14,7 +14,7 @@ use super::rows::{from_json, from_optional_json, from_word, groups, id, json, nu
 use super::{Store, StoreError, Write};
 use super::{deliveries, timelines};
 use crate::deployment;
-use crate::rollout::{Rollout, Tally};
+use crate::rollout::{Rollout, Standing};
 
 /// An order to be stored.
 #[derive(Debug)]
@@ -29,6 +29,30 @@ pub struct NewDeployment<'a> {
     pub order: &'a CreateDeployment,
     /// When what is left of it expires.
     pub expires_at_ms: u64,
+}
+
+/// A deployment that has robots whose batch has not begun.
+#[derive(Debug)]
+pub struct OpenRollout {
+    /// Its pace.
+    pub rollout: Rollout,
+    /// Robots on which it has failed.
+    pub failed: u64,
+    /// Those on which it has not settled, in the order of their turns.
+    pub robots: Vec<OpenRobot>,
+}
+
+/// A robot on which a deployment has not settled.
+#[derive(Debug)]
+pub struct OpenRobot {
+    /// Its identity.
+    pub robot: RobotId,
+    /// Where it stands.
+    pub standing: Standing,
+    /// Whether the deployment's service has run there before.
+    pub has_run: bool,
+    /// Whether the robot was revoked: it does nothing any more.
+    pub is_revoked: bool,
 }
 
 /// Some of the deployments, the newest first.
@@ -123,6 +147,17 @@ impl Store {
         let query = sqlx::query_scalar("SELECT selector FROM deployments WHERE id = $1").bind(deployment.as_str());
         let selector: Option<String> = query.fetch_optional(&self.reads).await?;
         selector.map(|selector| id("deployments.selector", &selector)).transpose()
+    }
+
+    /// Batched deployments that may go on by themselves: they have robots waiting and are not paused.
+    pub async fn open_rollouts(&self) -> Result<BTreeSet<DeploymentId>, StoreError> {
+        let rows: Vec<String> = sqlx::query_scalar(
+            "SELECT id FROM deployments WHERE batch IS NOT NULL AND paused = 0 AND cancelled_at_ms IS NULL AND id IN (
+                 SELECT deployment_id FROM assignments WHERE released = 0 AND ended = 0)",
+        )
+        .fetch_all(&self.reads)
+        .await?;
+        rows.iter().map(|row| id("deployments.id", row)).collect()
     }
 
     /// The packages some robot should have, or may get (back): what must not be collected.
@@ -236,8 +271,8 @@ impl Write {
         Ok(row.map(|(cancelled_at_ms,)| cancelled_at_ms.is_some()))
     }
 
-    /// The pace and the tally of a deployment that has robots waiting; `None` for any other.
-    pub async fn rollout(&mut self, id: &DeploymentId) -> Result<Option<(Rollout, Tally)>, StoreError> {
+    /// The pace and the open robots of a deployment that has robots waiting; `None` for any other.
+    pub async fn rollout(&mut self, id: &DeploymentId) -> Result<Option<OpenRollout>, StoreError> {
         let row = sqlx::query(
             "SELECT kind, batch, max_failures, forgiven, paused FROM deployments
              WHERE id = $1 AND cancelled_at_ms IS NULL AND EXISTS (
@@ -254,30 +289,42 @@ impl Write {
             forgiven: number(row.try_get("forgiven")?),
             paused: row.try_get::<i64, _>("paused")? == 1,
         };
-        let counted: Vec<(i64, String, i64, i64, i64)> = sqlx::query_as(
-            "SELECT v.released, v.phase, v.ran, v.is_revoked, COUNT(*) FROM (
-                 SELECT a.released, a.phase, a.ran,
-                     CAST(CASE WHEN r.revoked_at_ms IS NULL THEN 0 ELSE 1 END AS BIGINT) AS is_revoked
-                 FROM assignments a JOIN robots r ON r.id = a.robot_id WHERE a.deployment_id = $1) v
-             GROUP BY v.released, v.phase, v.ran, v.is_revoked",
+        let counted: Vec<(String, i64)> =
+            sqlx::query_as("SELECT phase, COUNT(*) FROM assignments WHERE deployment_id = $1 GROUP BY phase")
+                .bind(id.as_str())
+                .fetch_all(self.connection())
+                .await?;
+        let failures = counted.iter().filter(|(phase, _)| deployment::is_failure(Phase::from_text(phase), kind));
+        let failed = failures.map(|(_, count)| number(*count)).sum();
+        Ok(Some(OpenRollout { rollout, failed, robots: self.open_robots(id, kind).await? }))
+    }
+
+    /// The robots of a deployment that have not settled, in the order of their turns.
+    async fn open_robots(&mut self, deployment: &DeploymentId, kind: TaskKind) -> Result<Vec<OpenRobot>, StoreError> {
+        let rows: Vec<(String, i64, String, i64, i64)> = sqlx::query_as(
+            "SELECT a.robot_id, a.released, a.phase, a.ran,
+                 CAST(CASE WHEN r.revoked_at_ms IS NULL THEN 0 ELSE 1 END AS BIGINT)
+             FROM assignments a JOIN robots r ON r.id = a.robot_id
+             WHERE a.deployment_id = $1 AND a.ended = 0 AND NOT (a.phase = 'running' AND $2 = 'service')
+             ORDER BY a.place",
         )
-        .bind(id.as_str())
+        .bind(deployment.as_str())
+        .bind(word(&kind))
         .fetch_all(self.connection())
         .await?;
-        let mut tally = Tally::default();
-        for (released, phase, ran, is_revoked, count) in counted {
-            let (phase, count) = (Phase::from_text(&phase), number(count));
-            // A service that ran has shown what its batch was to show, whatever is ordered of it since; who is put out shows nothing.
-            let has_had_its_turn = is_revoked == 1 || (ran == 1 && kind == TaskKind::Service);
-            if deployment::is_failure(phase, kind) {
-                tally.failed += count;
-            } else if !phase.is_settled(kind) && released == 0 {
-                tally.waiting += count;
-            } else if !phase.is_settled(kind) && !has_had_its_turn {
-                tally.busy += count;
-            }
+        let mut robots = Vec::with_capacity(rows.len());
+        for (robot, released, phase, ran, is_revoked) in rows {
+            let (robot, phase) = (self::id("assignments.robot_id", &robot)?, Phase::from_text(&phase));
+            let standing = match phase {
+                _ if released == 0 => Standing::Waiting,
+                Phase::Assigned | Phase::Deferred => Standing::Released,
+                _ => Standing::Begun,
+            };
+            // A service that ran has shown what its batch was to show, whatever is ordered of it since.
+            let has_run = ran == 1 && kind == TaskKind::Service;
+            robots.push(OpenRobot { robot, standing, has_run, is_revoked: is_revoked == 1 });
         }
-        Ok(Some((rollout, tally)))
+        Ok(robots)
     }
 
     /// The deployments that have begun on `robot` and have not ended there.

@@ -49,7 +49,7 @@ use audit::everybodys_pace;
 pub use audit::{Act, Deed};
 use connections::{Connections, Lent, Statement, Terms};
 pub use deliveries::{Decided, DeliveryOrder, RobotFacts};
-pub use deployments::{DeploymentPage, NewDeployment};
+pub use deployments::{DeploymentPage, NewDeployment, OpenRobot, OpenRollout};
 pub use earlier::{EarlierPackage, Unsuccessful};
 use first_use::FirstUses;
 pub use orders::PastOrder;

@@ -27,6 +27,8 @@ use taskd::store::TokenHolder;
 use crate::database::TestDatabase;
 
 const SEED: [u8; 32] = [7; 32];
+/// The number of every robot's MQTT session.
+const CONNECTION: u64 = 1;
 
 /// A server's inner half with a clock that stands still.
 pub struct Fleet {
@@ -60,7 +62,7 @@ impl Fleet {
     pub async fn with_delivery(database: TestDatabase, settings: &DeliverySettings) -> Self {
         let load = Arc::new(ServerLoad::default());
         let (clock, changes) = (Clock::fixed(1_000_000), Changes::new());
-        let presence = Arc::new(Presence::new(90_000));
+        let presence = Arc::new(Presence::new(90_000, clock.now_ms()));
         let chooser = Chooser::new(settings, presence.clone(), load.clone());
         let (writer, _) = ReportWriter::start(database.store.clone(), clock.clone(), changes.clone(), chooser.clone());
         let key = SigningKey::from_bytes(SEED);
@@ -108,12 +110,23 @@ impl Fleet {
         self.actions.enroll(token, &EnrollRequest { mac, name, labels: BTreeMap::new(), client_key: None }, None).await
     }
 
-    /// Registers `count` robots named `r0`, `r1`, …
+    /// The robot's MQTT session begins.
+    pub fn come_online(&self, robot: &RobotId) {
+        self.presence.connected(robot, None, CONNECTION, self.clock.now_ms());
+    }
+
+    /// The robot's MQTT session ends.
+    pub fn go_offline(&self, robot: &RobotId) {
+        self.presence.disconnected(robot, CONNECTION, self.clock.now_ms());
+    }
+
+    /// Registers `count` robots named `r0`, `r1`, … that are online.
     pub async fn enroll(&self, count: u32) -> Vec<Robot> {
         let token = self.enrolment_token(CreateEnrollmentToken { unlimited: true, ..Default::default() }).await;
         let mut robots = Vec::new();
         for number in 0..count {
             let enrolled = self.try_enroll(&token, mac(number), Some(&format!("r{number}"))).await.expect("enrols");
+            self.come_online(&enrolled.robot_id);
             robots.push(Robot::new(enrolled.robot_id));
         }
         robots

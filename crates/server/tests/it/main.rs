@@ -42,6 +42,7 @@ mod people;
 mod permissions;
 mod provider;
 mod registry;
+mod rollouts;
 mod scope;
 mod serve;
 mod settings;

@@ -22,12 +22,14 @@ export class Parts {
   /** Of robots whose part ended badly: which other deployment of the same task they have, and the server was asked about. */
   #others = new Map();
   #task;
+  #kind;
   /** Bytes that each robot has to fetch. */
   size = 0;
 
   /** Takes in what the server lists. */
-  renew({ assignments, package: { name, content } }) {
+  renew({ assignments, kind, package: { name, content } }) {
     this.#task = name;
+    this.#kind = kind;
     this.size = content.size;
     this.#summary = null;
     this.all = new Map(assignments.map((part) => [part.robot, { ...part, timeline: this.#longer(part) }]));
@@ -110,7 +112,7 @@ export class Parts {
   }
 
   #sum() {
-    const sum = { phases: new Map(), reasons: new Map(), ways: new Map(), done: 0, total: 0, awaited: 0, retried: new Set(), newer: new Set() };
+    const sum = { phases: new Map(), reasons: new Map(), ways: new Map(), done: 0, total: 0, awaited: 0, busy: [], offline: [], retried: new Set(), newer: new Set() };
     for (const part of this.all.values()) {
       const { phase, online, released, delivery } = part;
       sum.phases.set(phase, (sum.phases.get(phase) ?? 0) + 1);
@@ -120,6 +122,10 @@ export class Parts {
         sum.total += this.size;
         // Who is away does not fetch: no time can be told for them.
         if (online && released) sum.awaited += this.size - bytes;
+        if (!isSettled(phase, this.#kind)) {
+          if (!online) sum.offline.push(part);
+          else if (released) sum.busy.push(part);
+        }
       }
       if (delivery) gather(sum.ways, `${delivery.mechanism} ${delivery.rule}`, part);
       const reason = reasonOf(part);
@@ -139,6 +145,9 @@ function gather(groups, key, part) {
 
 /** What parts that ended badly are grouped by: the failure's code, or how they ended. */
 export const reasonOf = ({ phase, failure }) => (tone(phase) === 'bad' ? failure?.code ?? phase : null);
+
+/** Whether nothing more is waited for there: it has ended, or a service runs. */
+const isSettled = (phase, kind) => ENDS.has(phase) || phase === 'stopped' || ENDED_BY_ORDER.includes(phase) || (phase === 'running' && kind === 'service');
 
 /** Whether it may be ordered again: it ended badly and nothing newer took its place. */
 export const canRetry = ({ phase, superseded_by: newer }) => !newer && (tone(phase) === 'bad' || phase === 'cancelled');

@@ -1,0 +1,59 @@
+//! The robots that a deployment still waits for, by name.
+
+use std::fmt;
+
+use super::{AssignmentView, DeploymentView};
+
+/// Names listed of one group of robots.
+const MAX_NAMES: usize = 20;
+
+/// The robots on which a deployment has not settled.
+#[derive(Debug, Default)]
+pub struct Awaited<'a> {
+    /// Online, and their batch has begun: the next batch waits for them.
+    pub busy: Vec<&'a AssignmentView>,
+    /// Online, and their batch has not begun.
+    pub queued: Vec<&'a AssignmentView>,
+    /// Offline: they go on when they are back, and the others don't wait for them.
+    pub offline: Vec<&'a AssignmentView>,
+}
+
+impl DeploymentView {
+    /// The robots on which it has not settled; none where the view has no assignments.
+    pub fn awaited(&self) -> Awaited<'_> {
+        let mut awaited = Awaited::default();
+        for one in self.assignments.iter().flatten().filter(|one| !one.phase.is_settled(self.kind)) {
+            match (one.online, one.released) {
+                (false, _) => awaited.offline.push(one),
+                (true, true) => awaited.busy.push(one),
+                (true, false) => awaited.queued.push(one),
+            }
+        }
+        awaited
+    }
+}
+
+impl fmt::Display for Awaited<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let groups = [
+            ("it waits for ", &self.busy),
+            ("next: ", &self.queued),
+            ("offline, going on when they are back: ", &self.offline),
+        ];
+        let parts: Vec<String> = groups
+            .iter()
+            .filter(|(_, robots)| !robots.is_empty())
+            .map(|(title, robots)| format!("{title}{}", names(robots, MAX_NAMES)))
+            .collect();
+        if parts.is_empty() { f.write_str("it has settled on every robot") } else { f.write_str(&parts.join("; ")) }
+    }
+}
+
+/// The names of the first `most` robots, and how many more there are.
+pub fn names(robots: &[&AssignmentView], most: usize) -> String {
+    let named: Vec<&str> = robots.iter().take(most).map(|one| one.name.as_str()).collect();
+    match robots.len().saturating_sub(most) {
+        0 => named.join(", "),
+        more => format!("{} and {more} more", named.join(", ")),
+    }
+}

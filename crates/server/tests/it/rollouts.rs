@@ -1,0 +1,153 @@
+//! Batched rollouts among robots that come and go, told on every database.
+
+use task_proto::api::DeploymentState;
+use task_proto::report::Phase;
+use taskd::actions::ActionError;
+use taskd::rollout::{LOST_AFTER_MS, OFFLINE_GRACE_MS};
+
+use crate::database::{TestDatabase, on_both_databases};
+use crate::fleet::{Fleet, Robot};
+use crate::story::code;
+
+on_both_databases! {
+    an_offline_robot_is_passed_over_and_begins_when_it_is_back,
+    offline_robots_that_are_left_expire,
+    a_robot_that_goes_offline_before_it_begins_holds_its_batch_for_a_minute,
+    a_robot_that_is_lost_in_its_batch_counts_as_a_failure_until_it_is_back,
+    robots_that_come_back_together_begin_in_batches,
+    a_resume_of_what_is_not_paused_says_what_it_waits_for,
+}
+
+impl Fleet {
+    async fn has_begun(&self, robot: &Robot) -> bool {
+        self.desired(robot).await.is_ok_and(|state| !state.tasks.is_empty())
+    }
+
+    async fn advance(&self) {
+        self.actions.advance_rollouts().await.expect("moved on");
+    }
+}
+
+async fn an_offline_robot_is_passed_over_and_begins_when_it_is_back(database: TestDatabase) {
+    let fleet = Fleet::new(database).await;
+    let mut robots = fleet.enroll(4).await;
+    fleet.go_offline(&robots[0].id);
+    fleet.go_offline(&robots[2].id);
+    let id = fleet.deploy("1", |order| (order.batch, order.max_failures) = (Some(1), Some(0))).await;
+    assert!(!fleet.has_begun(&robots[0]).await && fleet.has_begun(&robots[1]).await);
+    fleet.follow(&mut robots[1], Phase::Running).await;
+    assert!(!fleet.has_begun(&robots[2]).await && fleet.has_begun(&robots[3]).await);
+    // One that comes back while another is busy waits for its turn.
+    fleet.come_online(&robots[0].id);
+    fleet.advance().await;
+    assert!(!fleet.has_begun(&robots[0]).await);
+    fleet.follow(&mut robots[3], Phase::Running).await;
+    assert!(fleet.has_begun(&robots[0]).await);
+    // What it brings is still judged by the failures that the order bears.
+    fleet.follow(&mut robots[0], Phase::Failed).await;
+    fleet.come_online(&robots[2].id);
+    fleet.advance().await;
+    assert!(!fleet.has_begun(&robots[2]).await);
+    assert_eq!(fleet.deployment(&id).await.state, DeploymentState::Paused);
+    fleet.actions.resume_deployment(&fleet.operator, &id).await.expect("resumed");
+    fleet.follow(&mut robots[2], Phase::Running).await;
+    assert_eq!(fleet.phases(&id).await, [Phase::Failed, Phase::Running, Phase::Running, Phase::Running]);
+}
+
+async fn offline_robots_that_are_left_expire(database: TestDatabase) {
+    let fleet = Fleet::new(database).await;
+    let mut robots = fleet.enroll(2).await;
+    fleet.go_offline(&robots[0].id);
+    let id = fleet.deploy("1", |order| (order.batch, order.expires_in_s) = (Some(1), Some(60))).await;
+    // Its time does not run while others have their turn.
+    fleet.clock.advance_ms(59_999);
+    fleet.actions.expire().await.expect("done");
+    fleet.follow(&mut robots[1], Phase::Running).await;
+    fleet.clock.advance_ms(59_999);
+    fleet.advance().await;
+    fleet.actions.expire().await.expect("done");
+    assert_eq!(fleet.phases(&id).await, [Phase::Assigned, Phase::Running]);
+    fleet.clock.advance_ms(1);
+    fleet.actions.expire().await.expect("done");
+    assert_eq!(fleet.phases(&id).await, [Phase::Expired, Phase::Running]);
+    assert_eq!(fleet.deployment(&id).await.state, DeploymentState::Settled);
+}
+
+async fn a_robot_that_goes_offline_before_it_begins_holds_its_batch_for_a_minute(database: TestDatabase) {
+    let fleet = Fleet::new(database).await;
+    let mut robots = fleet.enroll(2).await;
+    let id = fleet.deploy("1", |order| (order.batch, order.max_failures) = (Some(1), Some(0))).await;
+    fleet.go_offline(&robots[0].id);
+    fleet.clock.advance_ms(OFFLINE_GRACE_MS - 1);
+    fleet.advance().await;
+    assert!(!fleet.has_begun(&robots[1]).await);
+    fleet.clock.advance_ms(1);
+    fleet.advance().await;
+    assert!(fleet.has_begun(&robots[1]).await);
+    // It has begun, so it follows when it is back.
+    fleet.come_online(&robots[0].id);
+    for robot in &mut robots {
+        fleet.follow(robot, Phase::Running).await;
+    }
+    assert_eq!(fleet.deployment(&id).await.state, DeploymentState::Settled);
+}
+
+async fn a_robot_that_is_lost_in_its_batch_counts_as_a_failure_until_it_is_back(database: TestDatabase) {
+    let fleet = Fleet::new(database).await;
+    let mut robots = fleet.enroll(3).await;
+    let id = fleet.deploy("1", |order| (order.batch, order.max_failures) = (Some(1), Some(0))).await;
+    fleet.follow(&mut robots[0], Phase::Starting).await;
+    fleet.go_offline(&robots[0].id);
+    fleet.clock.advance_ms(LOST_AFTER_MS - 1);
+    fleet.advance().await;
+    assert_eq!(fleet.deployment(&id).await.state, DeploymentState::Active);
+    assert!(!fleet.has_begun(&robots[1]).await);
+    fleet.clock.advance_ms(1);
+    fleet.advance().await;
+    assert_eq!(fleet.deployment(&id).await.state, DeploymentState::Paused);
+    fleet.actions.resume_deployment(&fleet.operator, &id).await.expect("resumed");
+    assert!(fleet.has_begun(&robots[1]).await);
+    fleet.follow(&mut robots[1], Phase::Running).await;
+    // It is back and goes on: the others wait for it again.
+    fleet.come_online(&robots[0].id);
+    for robot in [0, 2] {
+        fleet.follow(&mut robots[robot], Phase::Running).await;
+    }
+    assert_eq!(fleet.deployment(&id).await.state, DeploymentState::Settled);
+}
+
+async fn robots_that_come_back_together_begin_in_batches(database: TestDatabase) {
+    let fleet = Fleet::new(database).await;
+    let robots = fleet.enroll(75).await;
+    robots.iter().for_each(|robot| fleet.go_offline(&robot.id));
+    let id = fleet.deploy("1", |order| order.batch = Some(2)).await;
+    robots.iter().skip(5).for_each(|robot| fleet.come_online(&robot.id));
+    fleet.advance().await;
+    fleet.advance().await;
+    let begun: Vec<bool> =
+        fleet.deployment(&id).await.assignments.expect("there").iter().map(|one| one.released).collect();
+    assert_eq!(begun.iter().filter(|released| **released).count(), 2);
+    assert!(fleet.has_begun(&robots[5]).await && fleet.has_begun(&robots[6]).await, "in the order of their turns");
+}
+
+async fn a_resume_of_what_is_not_paused_says_what_it_waits_for(database: TestDatabase) {
+    let fleet = Fleet::new(database).await;
+    let mut robots = fleet.enroll(4).await;
+    fleet.go_offline(&robots[3].id);
+    let id = fleet.deploy("1", |order| order.batch = Some(1)).await;
+    let refused = async || fleet.actions.resume_deployment(&fleet.operator, &id).await.expect_err("not paused");
+    let (error, expected) = (
+        refused().await.to_string(),
+        format!(
+            "deployment {id} is not paused: it waits for r0; next: r1, r2; offline, going on when they are back: r3"
+        ),
+    );
+    assert_eq!(error, expected);
+    fleet.come_online(&robots[3].id);
+    for robot in &mut robots {
+        fleet.follow(robot, Phase::Running).await;
+    }
+    assert!(matches!(refused().await, ActionError::NotPaused { .. }));
+    assert_eq!(code::<()>(Err(refused().await)), "not_paused");
+    assert!(refused().await.to_string().ends_with("it has settled on every robot"));
+}

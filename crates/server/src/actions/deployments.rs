@@ -98,7 +98,7 @@ impl Actions {
     }
 
     /// Interrupts a deployment: where it has not settled, what it replaced is desired again; a service that runs goes on.
-    /// Doing it twice is harmless.
+    /// Doing it twice is harmless; one that is over everywhere is left as it is.
     pub async fn cancel_deployment(&self, by: &Person, id: &DeploymentId) -> Result<(), ActionError> {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
@@ -108,6 +108,9 @@ impl Actions {
             return Ok(());
         }
         let robots: Vec<RobotId> = write.revocable(id).await?.into_iter().map(|row| row.robot).collect();
+        if robots.is_empty() {
+            return Err(ActionError::NothingToCancel(id.clone()));
+        }
         write.adopt_diverged(&robots, now_ms).await?;
         write.mark_cancelled(id, now_ms).await?;
         let taken = write.revocable(id).await?;

@@ -348,6 +348,11 @@ pub enum ActionError {
     /// The deployment was cancelled before.
     #[error("deployment {0} was cancelled")]
     DeploymentCancelled(DeploymentId),
+    /// It is over, and nothing of it can be put back.
+    #[error(
+        "deployment {0} is over: nothing of it is under way or has failed, so it is left as it is; stop, remove or roll back the task instead"
+    )]
+    NothingToCancel(DeploymentId),
     /// It does not wait for the operator.
     #[error("deployment {id} is not paused: {why}")]
     NotPaused {
@@ -396,6 +401,7 @@ impl ActionError {
             | Self::EnrolmentNotFound(_) => "not_found",
             Self::DeploymentCancelled(_) => "deployment_cancelled",
             Self::NotPaused { .. } => "not_paused",
+            Self::NothingToCancel(_) => "nothing_to_cancel",
             Self::NothingToRetry(_) => "nothing_to_retry",
             Self::NothingToRollBack(_) => "nothing_to_roll_back",
             Self::PackageNotFound(..) => "package_not_found",

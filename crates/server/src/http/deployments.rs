@@ -110,7 +110,8 @@ pub(super) async fn create(
 }
 
 /// Takes a deployment back.
-#[utoipa::path(post, path = "/api/v1/deployments/{deployment}/cancel", tag = "deployments")]
+#[utoipa::path(post, path = "/api/v1/deployments/{deployment}/cancel", tag = "deployments",
+    responses((status = 409, description = "`nothing_to_cancel`: it is over on all of its robots.")))]
 pub(super) async fn cancel(
     State(app): State<App>,
     by: Person,

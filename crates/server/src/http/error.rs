@@ -182,6 +182,7 @@ impl From<ActionError> for ApiError {
             | ActionError::NotPending(_)
             | ActionError::DeploymentCancelled(_)
             | ActionError::NotPaused { .. }
+            | ActionError::NothingToCancel(_)
             | ActionError::NothingToRetry(_)
             | ActionError::NothingToRollBack(_)
             | ActionError::UserExists(_)

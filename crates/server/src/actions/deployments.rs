@@ -108,7 +108,7 @@ impl Actions {
             return Ok(());
         }
         let robots: Vec<RobotId> = write.revocable(id).await?.into_iter().map(|row| row.robot).collect();
-        if robots.is_empty() {
+        if robots.is_empty() && !write.may_be_put_back(id).await? {
             return Err(ActionError::NothingToCancel(id.clone()));
         }
         write.adopt_diverged(&robots, now_ms).await?;

@@ -65,6 +65,19 @@ impl Write {
         rows.iter().map(|row| revocable(row, |phase| phase == Phase::Assigned)).collect()
     }
 
+    /// Whether the cancel of a later deployment would put this one back somewhere.
+    pub async fn may_be_put_back(&mut self, deployment: &DeploymentId) -> Result<bool, StoreError> {
+        let count: i64 = sqlx::query_scalar(
+            "SELECT COUNT(*) FROM assignments a JOIN deployments d ON d.id = a.deployment_id
+             WHERE a.previous = $1 AND a.desired = 1 AND NOT (a.phase = 'running' AND d.kind = 'service')
+               AND a.phase NOT IN ('succeeded', 'stopped')",
+        )
+        .bind(deployment.as_str())
+        .fetch_one(self.connection())
+        .await?;
+        Ok(count > 0)
+    }
+
     /// What was not done in time.
     pub async fn overdue(&mut self, now_ms: u64) -> Result<Vec<Revocable>, StoreError> {
         let rows = sqlx::query(AssertSqlSafe(format!(

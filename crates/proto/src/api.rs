@@ -164,6 +164,9 @@ pub struct EnrollmentToken {
 pub struct RobotList {
     /// Sorted by name.
     pub robots: Vec<RobotView>,
+    /// Names and ids in the selector that none of one's robots has, sorted: an order with this selector is refused.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub unknown: Vec<RobotName>,
     /// On a page that is not the last: what `after` has to be for the next one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub next: Option<RobotName>,

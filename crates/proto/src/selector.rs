@@ -8,7 +8,7 @@
 //! assert_eq!(selector.to_string(), "site=lab&base=turtlebot,spare-1,!arm");
 //! ```
 
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeSet, HashMap, HashSet};
 use std::fmt;
 use std::str::FromStr;
 
@@ -80,7 +80,22 @@ impl Selector {
     }
 }
 
+impl Selector {
+    /// The names and ids in it, also those that it takes away, sorted.
+    pub fn names(&self) -> BTreeSet<RobotName> {
+        self.0.adds.names().chain(self.0.takes_away.names()).cloned().collect()
+    }
+}
+
 impl Terms {
+    fn names(&self) -> impl Iterator<Item = &RobotName> {
+        let described = self.described.iter().flatten().filter_map(|condition| match condition {
+            Condition::NameOrId(name) => Some(name),
+            Condition::Everyone | Condition::Label(..) => None,
+        });
+        self.named.iter().chain(described)
+    }
+
     fn is_empty(&self) -> bool {
         self.named.is_empty() && self.labelled.is_empty() && self.described.is_empty()
     }
@@ -248,5 +263,12 @@ mod tests {
     fn spaces_between_the_parts_are_left_out() {
         let selector: Selector = " site=lab & arm,! cart ".parse().expect("valid");
         assert_eq!(selector.to_string(), "site=lab&arm,!cart");
+    }
+
+    #[test]
+    fn names_are_those_of_all_terms() {
+        let selector: Selector = "b,site=lab&a,!c,!base=husky&d,*".parse().expect("valid");
+        assert_eq!(selector.names().iter().map(RobotName::as_str).collect::<Vec<_>>(), ["a", "b", "c", "d"]);
+        assert!("*,!site=lab".parse::<Selector>().expect("valid").names().is_empty());
     }
 }

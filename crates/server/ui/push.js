@@ -228,14 +228,15 @@ function matched(total, some) {
 async function matchOf(selector, fleet) {
   const waiting = [...fleet.robots.values()].filter(isWaiting).map(({ id }) => `!${id}`);
   try {
-    const { robots, total = robots.length } = await get('/robots', { selector: [selector, ...waiting].join(), limit: NAMED });
+    const { robots, total = robots.length, unknown = [] } = await get('/robots', { selector: [selector, ...waiting].join(), limit: NAMED });
+    if (unknown.length) return { problem: `No robot has the name or id ${unknown.join(', ')}.` };
     return { total, some: robots.slice(0, NAMED).map(({ name }) => name) };
   } catch (error) {
     return error instanceof SignedOut ? null : { problem: error.message };
   }
 }
 
-const FIELD_OF_CODE = { no_robots_match: 'selector', out_of_scope: 'selector', package_not_found: 'manifest', package_too_large: 'delivery' };
+const FIELD_OF_CODE = { no_robots_match: 'selector', unknown_robots: 'selector', out_of_scope: 'selector', package_not_found: 'manifest', package_too_large: 'delivery' };
 const FIELD_OF_KEY = { selector: 'selector', package: 'name', manifest: 'manifest', delivery: 'delivery', batch: 'batch', max_failures: 'max_failures', priority: 'priority', expires_in_s: 'hours' };
 
 /** The field that a refusal is about. */

@@ -63,7 +63,7 @@ fn what_is_done_to_many_robots() {
 #[test]
 fn a_page_of_a_list() {
     let next = Some(parsed("atlas"));
-    check_text("robot_list.json", &RobotList { robots: vec![], next, total: Some(1_204) });
+    check_text("robot_list.json", &RobotList { robots: vec![], unknown: vec![], next, total: Some(1_204) });
     let next = Some(parsed("d00000000000000b2"));
     check_text("deployment_list.json", &DeploymentList { deployments: vec![], next });
 }

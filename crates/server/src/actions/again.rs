@@ -11,7 +11,7 @@ use task_proto::{DeploymentId, Digest, RobotId, TaskName};
 use super::deployments::Placed;
 use super::robots::matched;
 use super::tasks::meant;
-use super::{ActionError, Actions, IdempotencyKey, Remembered, check_scope};
+use super::{ActionError, Actions, IdempotencyKey, Remembered, all_known, check_scope};
 use crate::advance::advance;
 use crate::changes::Consequences;
 use crate::person::Person;
@@ -183,6 +183,7 @@ async fn to_retry(
         found.retain(|one| one.failure.as_ref().is_some_and(|failure| failure.code == *code));
     }
     if let Some(selector) = &retry.selector {
+        all_known(write.matching_robots(selector, &by.scope).await?)?;
         found.retain(|one| selector.matches(&one.robot.id, &one.robot.name, &one.robot.labels));
     }
     let robots: Vec<KnownRobot> = found.into_iter().map(|one| one.robot).collect();

@@ -5,7 +5,7 @@ use task_proto::id::Labels;
 use task_proto::selector::Selector;
 
 use super::robots::{check_labels, matched, shown_labels};
-use super::{ActionError, Actions, IdempotencyKey, check_scope, quoted};
+use super::{ActionError, Actions, IdempotencyKey, all_known, check_scope, quoted};
 use crate::advance::advance;
 use crate::changes::{Change, Consequences};
 use crate::person::Person;
@@ -127,7 +127,7 @@ pub(super) fn removal(by: &Person, robot: &KnownRobot) -> Deed {
 
 /// The robots that a selector means; an error if nobody, or if one of them is not the person's.
 async fn meant(write: &mut Write, by: &Person, selector: &Selector) -> Result<Vec<KnownRobot>, ActionError> {
-    let robots = write.matching_robots(selector).await?;
+    let robots = all_known(write.matching_robots(selector, &by.scope).await?)?;
     if robots.is_empty() {
         return Err(ActionError::NoRobotsMatch(quoted(selector)));
     }

@@ -10,7 +10,7 @@ use task_proto::{DeploymentId, RobotId, UserName};
 
 use super::approval::give_up_pending;
 use super::robots::lifetime_ms;
-use super::{ActionError, Actions, DAY_MS, IdempotencyKey, check_scope, quoted};
+use super::{ActionError, Actions, DAY_MS, IdempotencyKey, all_known, check_scope, quoted};
 use crate::advance::{advance, parts};
 use crate::changes::{Change, Consequences};
 use crate::chooser::{Chooser, travelling_bytes};
@@ -50,7 +50,7 @@ impl Actions {
             return Ok(answer);
         }
         self.check_fits(order, package)?;
-        let robots = write.matching_robots(&order.selector).await?;
+        let robots = all_known(write.matching_robots(&order.selector, &by.scope).await?)?;
         if robots.is_empty() {
             return Err(ActionError::NoRobotsMatch(quoted(&order.selector)));
         }

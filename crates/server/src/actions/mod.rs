@@ -31,7 +31,7 @@ use crate::pace::Pace;
 use crate::passwords::Passwords;
 use crate::person::Person;
 use crate::sign_ins::SignIns;
-use crate::store::{KnownRobot, PastOrder, Store, StoreError, Write};
+use crate::store::{KnownRobot, Matching, PastOrder, Store, StoreError, Write};
 
 pub use crate::store::TaskOrder;
 pub use again::Rollback;
@@ -189,6 +189,21 @@ fn check_scope(by: &Person, robots: &[KnownRobot], what: impl FnOnce() -> String
     Err(ActionError::OutOfScope { outside, meant, what, person, scope })
 }
 
+/// The robots that match. A name that no robot of the person's has is a mistake that would go unnoticed.
+fn all_known(matching: Matching) -> Result<Vec<KnownRobot>, ActionError> {
+    if matching.unknown.is_empty() { Ok(matching.robots) } else { Err(ActionError::UnknownRobots(matching.unknown)) }
+}
+
+/// The first names of a list that may be long.
+fn listed(names: &[RobotName]) -> String {
+    const MAX_NAMES: usize = 20;
+    let listed: Vec<&str> = names.iter().take(MAX_NAMES).map(RobotName::as_str).collect();
+    match names.len().saturating_sub(MAX_NAMES) {
+        0 => listed.join(", "),
+        more => format!("{} and {more} more", listed.join(", ")),
+    }
+}
+
 fn out_of_scope(outside: usize, meant: usize, what: &str, person: &UserName, scope: &str) -> String {
     if meant == 1 {
         return format!("{what} is outside of {person}'s scope {scope:?}; nothing was done");
@@ -208,6 +223,9 @@ pub enum ActionError {
     /// The selector means nobody, or nobody who has the task.
     #[error("no robots match {0}")]
     NoRobotsMatch(String),
+    /// The selector names robots that there are not, or that are none of the person's.
+    #[error("selector: no robot that takes orders has the name or id {}; nothing was done", listed(.0))]
+    UnknownRobots(Vec<RobotName>),
     /// The key came with another order before.
     #[error("the idempotency key {0:?} was used for another order")]
     IdempotencyKeyReused(String),
@@ -374,6 +392,7 @@ impl ActionError {
     pub fn code(&self) -> &'static str {
         match self {
             Self::NoRobotsMatch(_) => "no_robots_match",
+            Self::UnknownRobots(_) => "unknown_robots",
             Self::OutOfScope { .. } => "out_of_scope",
             Self::NotPermitted(_) => "forbidden",
             Self::SignInBlocked { .. }

@@ -16,7 +16,7 @@ use task_proto::{MacAddress, RobotId, RobotName, TokenId};
 
 use super::approval::check_room;
 use super::bulk::removal;
-use super::{ActionError, Actions, MAX_LIFETIME_MS, check_scope, quoted};
+use super::{ActionError, Actions, MAX_LIFETIME_MS, all_known, check_scope, quoted};
 use crate::advance::advance;
 use crate::changes::{Change, Consequences};
 use crate::pace::seconds;
@@ -259,7 +259,7 @@ impl Actions {
     /// The robots an order with this selector would mean now, sorted by name; an error if nobody, or if one of them is not
     /// the person's. `online` is left false.
     pub async fn matching_robots(&self, by: &Person, selector: &Selector) -> Result<Vec<MatchedRobot>, ActionError> {
-        let robots = self.store.matching_robots(selector).await?;
+        let robots = all_known(self.store.matching_robots(selector, &by.scope).await?)?;
         if robots.is_empty() {
             return Err(ActionError::NoRobotsMatch(quoted(selector)));
         }

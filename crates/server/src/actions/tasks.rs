@@ -7,7 +7,7 @@ use task_proto::selector::Selector;
 use task_proto::{RobotId, TaskName};
 
 use super::robots::matched;
-use super::{ActionError, Actions, IdempotencyKey, TaskOrder, check_scope, quoted};
+use super::{ActionError, Actions, IdempotencyKey, TaskOrder, all_known, check_scope, quoted};
 use crate::advance::advance;
 use crate::changes::Consequences;
 use crate::person::Person;
@@ -61,7 +61,7 @@ impl Actions {
         task: &TaskName,
         selector: &Selector,
     ) -> Result<Vec<MatchedRobot>, ActionError> {
-        let mut robots = self.store.matching_robots(selector).await?;
+        let mut robots = all_known(self.store.matching_robots(selector, &by.scope).await?)?;
         keep_those_with_task(&mut robots, self.store.robots_with_task(task).await?, selector)?;
         check_scope(by, &robots, || quoted(selector))?;
         Ok(robots.into_iter().map(matched).collect())
@@ -85,7 +85,7 @@ pub(super) async fn meant(
     selector: &Selector,
     now_ms: u64,
 ) -> Result<Vec<KnownRobot>, ActionError> {
-    let mut robots = write.matching_robots(selector).await?;
+    let mut robots = all_known(write.matching_robots(selector, &by.scope).await?)?;
     let own = robots.iter().filter(|robot| by.scope.covers(&robot.id, &robot.name, &robot.labels));
     let own: Vec<RobotId> = own.map(|robot| robot.id.clone()).collect();
     write.adopt_diverged(&own, now_ms).await?;

@@ -104,6 +104,10 @@ pub(super) async fn run(session: &Session, push: Push) -> Result<Outcome, Comman
     // Before anything is done: a key that can't be used must not leave a package without its signature on the server.
     let keys = push.keys.iter().map(|path| key_file::read(path)).collect::<Result<Vec<_>, _>>()?;
     let matched = match &push.to {
+        // An order that may have been carried out before is known to the server, also where its robots are gone.
+        Some(selector) if push.idempotency_key.is_some() && !push.dry_run => {
+            Some(robot::named(robot::matching(session, selector).await?.robots))
+        }
         // None at all is a mistake in the command, noticed before anything travels.
         Some(selector) => Some(robot::matched(session, selector).await?),
         None => None,

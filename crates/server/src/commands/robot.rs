@@ -132,6 +132,10 @@ pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, Co
         Action::List { selector } => {
             let list = matching(session, &selector).await?;
             session.output.result(&list, &COLUMNS, |list| list.robots.iter().map(row).collect())?;
+            if !list.unknown.is_empty() {
+                say(&nobody(&list.unknown));
+                return Ok(Outcome::Failed);
+            }
         }
         Action::Info { robot } => {
             let robot = one(session, &robot).await?.id;
@@ -249,14 +253,22 @@ pub(super) async fn matching(session: &Session, selector: &Selector) -> Result<R
     Ok(session.client.get("/robots", &[("selector", selector.to_string())]).await?)
 }
 
-/// The same by name; nobody is a mistake in the command.
+/// The same by name; nobody, and a name that no robot has, are mistakes in the command.
 pub(super) async fn matched(session: &Session, selector: &Selector) -> Result<MatchedRobots, CommandError> {
-    let robots = matching(session, selector).await?.robots;
+    let RobotList { robots, unknown, .. } = matching(session, selector).await?;
+    if !unknown.is_empty() {
+        return Err(CommandError::Usage(nobody(&unknown)));
+    }
     if robots.is_empty() {
         return Err(CommandError::Usage(format!("{selector}: no robot matches")));
     }
+    Ok(named(robots))
+}
+
+/// Robots as an order lists them.
+pub(super) fn named(robots: Vec<RobotView>) -> MatchedRobots {
     let matched = |robot: RobotView| MatchedRobot { id: robot.id, name: robot.name, online: robot.online };
-    Ok(MatchedRobots { robots: robots.into_iter().map(matched).collect() })
+    MatchedRobots { robots: robots.into_iter().map(matched).collect() }
 }
 
 /// These robots and no others; `None`: they are more than a selector can name one by one.
@@ -267,7 +279,13 @@ fn those(matched: &MatchedRobots) -> Option<Selector> {
 
 /// Nobody is called that: a mistake in the command.
 pub(super) fn unknown(name: &RobotName) -> CommandError {
-    CommandError::Usage(format!("no robot has the name or id {name}"))
+    CommandError::Usage(nobody(std::slice::from_ref(name)))
+}
+
+/// Says that no robot has these names.
+fn nobody(names: &[RobotName]) -> String {
+    let names: Vec<&str> = names.iter().map(RobotName::as_str).collect();
+    format!("no robot has the name or id {}", names.join(", "))
 }
 
 /// The one robot of this name or id.

@@ -92,7 +92,7 @@ pub(super) async fn roll_back(session: &Session, order: TaskOrder) -> Result<Out
     let ask = OrderTask { selector: on.clone(), dry_run: true };
     let meant: RolledBack = match session.client.order(&path, &ask, &random_key()).await {
         Err(ClientError::Refused { code, .. })
-            if ["no_robots_match", "nothing_to_roll_back"].contains(&code.as_str()) =>
+            if is_nobody(&code, may_be_repeated) || code == "nothing_to_roll_back" =>
         {
             RolledBack::default()
         }
@@ -199,6 +199,12 @@ fn has_still(robot: &RobotView, task: &TaskName) -> bool {
     robot.observed_generation < robot.generation || robot.tasks.iter().any(|known| known.task == *task)
 }
 
+/// Whether the server means that there is nobody to order something of. Of an order that may have been carried out before,
+/// robots may be gone by now.
+fn is_nobody(code: &str, may_be_repeated: bool) -> bool {
+    code == "no_robots_match" || (may_be_repeated && code == "unknown_robots")
+}
+
 /// Gives the order; the robots it was for.
 async fn give(session: &Session, verb: Verb, order: TaskOrder) -> Result<MatchedRobots, CommandError> {
     let TaskOrder { task, on, dry_run, yes, idempotency_key } = order;
@@ -209,7 +215,7 @@ async fn give(session: &Session, verb: Verb, order: TaskOrder) -> Result<Matched
     let ask = OrderTask { selector: on.clone(), dry_run: true };
     // A dry run is no order, so it gets a key of its own.
     let matched: MatchedRobots = match session.client.order(&path, &ask, &random_key()).await {
-        Err(ClientError::Refused { code, .. }) if code == "no_robots_match" => MatchedRobots::default(),
+        Err(ClientError::Refused { code, .. }) if is_nobody(&code, may_be_repeated) => MatchedRobots::default(),
         answer => answer?,
     };
     if matched.robots.is_empty() && !may_be_repeated {

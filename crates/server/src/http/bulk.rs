@@ -16,7 +16,8 @@ use crate::person::Person;
 
 /// Sets and removes labels of many robots, of all that are meant or of none.
 #[utoipa::path(post, path = "/api/v1/bulk/labels", tag = "robots", params(OrderKey),
-    responses((status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]
+    responses((status = 404, description = "`unknown_robots`: the selector names robots that there are not."),
+        (status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]
 pub(super) async fn labels(
     State(app): State<App>,
     by: Person,
@@ -28,7 +29,8 @@ pub(super) async fn labels(
 
 /// Removes many robots, all that are meant or none.
 #[utoipa::path(post, path = "/api/v1/bulk/remove", tag = "robots", params(OrderKey),
-    responses((status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]
+    responses((status = 404, description = "`unknown_robots`: the selector names robots that there are not."),
+        (status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]
 pub(super) async fn remove(
     State(app): State<App>,
     by: Person,

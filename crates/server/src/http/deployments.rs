@@ -84,7 +84,8 @@ pub(super) async fn show(
 #[utoipa::path(post, path = "/api/v1/deployments", tag = "deployments", params(OrderKey),
     responses((status = 200, description = "A dry run: the robots it would be.", body = MatchedRobots),
         (status = 201, description = "The deployment.", body = DeploymentView),
-        (status = 404, description = "`package_not_found`: nobody has pushed that."),
+        (status = 404, description = "`package_not_found`: nobody has pushed that; `unknown_robots`: the selector names \
+            robots that there are not."),
         (status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order."),
         (status = 422, description = "`package_too_large`: so much does not fit into the announcement.")))]
 pub(super) async fn create(
@@ -138,7 +139,8 @@ pub(super) async fn resume(
 #[utoipa::path(post, path = "/api/v1/deployments/{deployment}/retry", tag = "deployments", params(OrderKey),
     responses((status = 200, description = "A dry run: the robots it would be.", body = MatchedRobots),
         (status = 201, description = "The new deployment.", body = DeploymentView),
-        (status = 404, description = "There is no such deployment, or `package_not_found`: its package was deleted."),
+        (status = 404, description = "There is no such deployment, `package_not_found`: its package was deleted, or \
+            `unknown_robots`: the selector names robots that there are not."),
         (status = 409, description = "`nothing_to_retry`, or `idempotency_key_reused` for another order.")))]
 pub(super) async fn retry(
     State(app): State<App>,

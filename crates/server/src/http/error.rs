@@ -173,6 +173,7 @@ impl From<ActionError> for ApiError {
             | ActionError::UserNotFound(_)
             | ActionError::TokenNotFound(_)
             | ActionError::EnrolmentNotFound(_) => StatusCode::NOT_FOUND,
+            ActionError::UnknownRobots(_) => StatusCode::NOT_FOUND,
             ActionError::TooLargeForInline { .. } => StatusCode::UNPROCESSABLE_ENTITY,
             ActionError::NoRobotsMatch(_)
             | ActionError::IdempotencyKeyReused(_)

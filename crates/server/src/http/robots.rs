@@ -51,17 +51,20 @@ pub(super) async fn list(
     let mut list = match (page_limit(query.limit)?, after) {
         (Some(limit), after) => {
             let page = app.store.robots_page(&by.scope, selector, after, limit as usize).await?;
-            RobotList { robots: page.robots, next: page.next, total: Some(page.total) }
+            RobotList { robots: page.robots, next: page.next, total: Some(page.total), ..RobotList::default() }
         }
         (None, None) => {
             let mut robots = app.store.robots().await?;
             robots.retain(|RobotView { id, name, labels, .. }| {
                 by.scope.covers(id, name, labels) && selector.is_none_or(|selector| selector.matches(id, name, labels))
             });
-            RobotList { robots, next: None, total: None }
+            RobotList { robots, ..RobotList::default() }
         }
         (None, Some(_)) => return Err(ApiError::invalid("after: a page needs a limit as well")),
     };
+    if let Some(selector) = selector {
+        list.unknown = app.store.unknown_robots(selector, &by.scope).await?;
+    }
     let now_ms = app.clock.now_ms();
     list.robots.iter_mut().for_each(|robot| complete_robot(robot, &app.presence, &app.conduct, &app.vitals, now_ms));
     Ok(Json(list))

@@ -17,7 +17,8 @@ use crate::person::Person;
 
 /// Starts a task on robots that have it; a job runs once more.
 #[utoipa::path(post, path = "/api/v1/tasks/{task}/start", tag = "tasks", params(OrderKey),
-    responses((status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]
+    responses((status = 404, description = "`unknown_robots`: the selector names robots that there are not."),
+        (status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]
 pub(super) async fn start(
     State(app): State<App>,
     by: Person,
@@ -30,7 +31,8 @@ pub(super) async fn start(
 
 /// Runs a task anew on robots that have it: what runs is stopped before.
 #[utoipa::path(post, path = "/api/v1/tasks/{task}/restart", tag = "tasks", params(OrderKey),
-    responses((status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]
+    responses((status = 404, description = "`unknown_robots`: the selector names robots that there are not."),
+        (status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]
 pub(super) async fn restart(
     State(app): State<App>,
     by: Person,
@@ -43,7 +45,8 @@ pub(super) async fn restart(
 
 /// Brings robots back to the package of a task that ran there before the one they have.
 #[utoipa::path(post, path = "/api/v1/tasks/{task}/rollback", tag = "tasks", params(OrderKey),
-    responses((status = 409, description = "`no_robots_match`, `nothing_to_roll_back`: none of them had another package \
+    responses((status = 404, description = "`unknown_robots`: the selector names robots that there are not."),
+        (status = 409, description = "`no_robots_match`, `nothing_to_roll_back`: none of them had another package \
         before, or `idempotency_key_reused` for another order.")))]
 pub(super) async fn rollback(
     State(app): State<App>,
@@ -70,7 +73,8 @@ pub(super) async fn rollback(
 
 /// Stops a task on robots that have it; it stays installed.
 #[utoipa::path(post, path = "/api/v1/tasks/{task}/stop", tag = "tasks", params(OrderKey),
-    responses((status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]
+    responses((status = 404, description = "`unknown_robots`: the selector names robots that there are not."),
+        (status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]
 pub(super) async fn stop(
     State(app): State<App>,
     by: Person,
@@ -83,7 +87,8 @@ pub(super) async fn stop(
 
 /// Takes a task off robots.
 #[utoipa::path(post, path = "/api/v1/tasks/{task}/remove", tag = "tasks", params(OrderKey),
-    responses((status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]
+    responses((status = 404, description = "`unknown_robots`: the selector names robots that there are not."),
+        (status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]
 pub(super) async fn remove(
     State(app): State<App>,
     by: Person,

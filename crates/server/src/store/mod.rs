@@ -61,7 +61,7 @@ pub use referrers::ReferrersPage;
 pub use reports::{OpenAssignment, ReportedRobot};
 pub use robot_blobs::bytes_taken;
 pub use robot_pages::RobotPage;
-pub use robots::{BrokerCredential, DesiredTasks, FetchedBy, KnownRobot};
+pub use robots::{BrokerCredential, DesiredTasks, FetchedBy, KnownRobot, Matching};
 pub use taking_back::Revocable;
 pub use timelines::{HistoryPage, HistoryQuery};
 pub use tokens::{Admitted, EnrolmentTerms, TokenHolder};

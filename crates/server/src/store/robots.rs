@@ -30,6 +30,15 @@ pub struct KnownRobot {
     pub labels: Labels,
 }
 
+/// The robots that a selector means.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Matching {
+    /// Those that match, of all scopes, sorted by name.
+    pub robots: Vec<KnownRobot>,
+    /// Names and ids in the selector that no robot of the scope has, sorted.
+    pub unknown: Vec<RobotName>,
+}
+
 /// Which password a robot has at an external broker.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct BrokerCredential {
@@ -116,8 +125,16 @@ impl Store {
     }
 
     /// The robots that `selector` means now, sorted by name; none that waits to be approved.
-    pub async fn matching_robots(&self, selector: &Selector) -> Result<Vec<KnownRobot>, StoreError> {
-        matching(sqlx::query(ORDERABLE).fetch_all(&self.reads).await?, selector)
+    pub async fn matching_robots(&self, selector: &Selector, scope: &Scope) -> Result<Matching, StoreError> {
+        matching(sqlx::query(ORDERABLE).fetch_all(&self.reads).await?, selector, scope)
+    }
+
+    /// The names and ids in a selector that no robot of a scope has, sorted.
+    pub async fn unknown_robots(&self, selector: &Selector, scope: &Scope) -> Result<Vec<RobotName>, StoreError> {
+        if selector.names().is_empty() {
+            return Ok(Vec::new());
+        }
+        Ok(matching(sqlx::query(KNOWN).fetch_all(&self.reads).await?, selector, scope)?.unknown)
     }
 
     /// The robots in a scope.
@@ -249,8 +266,8 @@ impl Store {
 
 impl Write {
     /// The robots that `selector` means now, sorted by name; none that waits to be approved.
-    pub async fn matching_robots(&mut self, selector: &Selector) -> Result<Vec<KnownRobot>, StoreError> {
-        matching(sqlx::query(ORDERABLE).fetch_all(self.connection()).await?, selector)
+    pub async fn matching_robots(&mut self, selector: &Selector, scope: &Scope) -> Result<Matching, StoreError> {
+        matching(sqlx::query(ORDERABLE).fetch_all(self.connection()).await?, selector, scope)
     }
 
     /// The robots of a scope, and those that were when they were removed.
@@ -401,11 +418,19 @@ const TASK_ROWS: &str = "SELECT a.robot_id, a.task, a.deployment_id, a.wanted, a
      FROM assignments a JOIN deployments d ON d.id = a.deployment_id
      WHERE (a.desired = 1 OR a.ended = 0) AND (a.desired = 1 OR a.released = 1)";
 
-fn matching(rows: Vec<sqlx::any::AnyRow>, selector: &Selector) -> Result<Vec<KnownRobot>, StoreError> {
+fn matching(rows: Vec<sqlx::any::AnyRow>, selector: &Selector, scope: &Scope) -> Result<Matching, StoreError> {
     let mut robots = rows.iter().map(known_robot).collect::<Result<Vec<_>, _>>()?;
+    let mut names = selector.names();
+    if !names.is_empty() {
+        for robot in robots.iter().filter(|robot| scope.covers(&robot.id, &robot.name, &robot.labels)) {
+            names.remove(robot.name.as_str());
+            names.remove(robot.id.as_str());
+        }
+    }
+    let unknown = names.into_iter().collect();
     robots.retain(|robot| selector.matches(&robot.id, &robot.name, &robot.labels));
     robots.sort_by(|one, other| one.name.cmp(&other.name));
-    Ok(robots)
+    Ok(Matching { robots, unknown })
 }
 
 pub(super) fn known_robot(row: &sqlx::any::AnyRow) -> Result<KnownRobot, StoreError> {

@@ -86,7 +86,7 @@ async fn a_dry_run_names_the_robots_and_orders_nothing() {
     assert!(server.desired(&robot).await.tasks.is_empty());
     let body = json!({ "package": "talker", "manifest": package.manifest.digest, "selector": "nobody" });
     let nobody = refusal(server.order("/api/v1/deployments", "key-1", &body)).await;
-    assert_eq!(nobody, (409, "no_robots_match".to_owned()));
+    assert_eq!(nobody, (404, "unknown_robots".to_owned()));
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -5,6 +5,7 @@ use serde_json::{Value, json};
 use task_proto::RobotId;
 use task_proto::api::{AuditPage, CreateEnrollmentToken, EnrollResponse, EnrollmentToken, PendingRobotList, RobotView};
 use task_proto::token::Token;
+use taskd::person::Scope;
 use taskd::store::TokenHolder;
 use taskd::tls::ClientProof;
 use tempfile::TempDir;
@@ -41,7 +42,10 @@ async fn a_robot_waits_until_it_is_approved_or_turned_away_or_a_week_has_passed(
     let one = one.1;
     assert_eq!(holder(&one.token).await, Some(TokenHolder::Pending { robot: one.robot_id.clone(), key: None }));
     let two = fleet.try_enroll(&token, mac(2), Some("two")).await.expect("enrols");
-    assert_eq!(store.matching_robots(&"*".parse().expect("valid")).await.expect("reads"), []);
+    assert_eq!(
+        store.matching_robots(&"*".parse().expect("valid"), &Scope::everything()).await.expect("reads").robots,
+        []
+    );
     assert_eq!(store.broker_credentials().await.expect("reads"), []);
     assert_eq!(store.desired_tasks(std::slice::from_ref(&one.robot_id)).await.expect("reads"), []);
 
@@ -49,7 +53,10 @@ async fn a_robot_waits_until_it_is_approved_or_turned_away_or_a_week_has_passed(
         fleet.actions.approve_robot(&fleet.operator, &one.robot_id).await.expect("approved");
     }
     assert!(matches!(holder(&one.token).await, Some(TokenHolder::Robot { .. })));
-    assert_eq!(store.matching_robots(&"*".parse().expect("valid")).await.expect("reads").len(), 1);
+    assert_eq!(
+        store.matching_robots(&"*".parse().expect("valid"), &Scope::everything()).await.expect("reads").robots.len(),
+        1
+    );
     // Rejecting one that does not wait would be removing it.
     assert_eq!(code(fleet.actions.reject_robot(&fleet.operator, &one.robot_id).await), "not_pending");
 
@@ -118,9 +125,11 @@ async fn a_robot_that_waits_has_nothing_until_it_is_approved() {
     }
     assert_eq!(connack(&server, came.robot_id.as_str(), &came.token).await, 5);
     // An order does not mean it, by whatever selector.
-    for selector in ["*", "robot-1", came.robot_id.as_str()] {
+    for (selector, why) in
+        [("*", "no_robots_match"), ("robot-1", "unknown_robots"), (came.robot_id.as_str(), "unknown_robots")]
+    {
         let body = json!({ "package": "talker", "manifest": package.manifest.digest, "selector": selector });
-        assert_eq!(refusal(server.order("/api/v1/deployments", selector, &body)).await.1, "no_robots_match");
+        assert_eq!(refusal(server.order("/api/v1/deployments", selector, &body)).await.1, why);
     }
     let view: RobotView = server.get(&own).await;
     assert_eq!((view.conditions[0].code.as_str(), view.online), ("awaits_approval", false));

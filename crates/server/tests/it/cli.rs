@@ -348,7 +348,7 @@ async fn robots_and_deployments_are_shown_and_removed() {
     bench.taskd(&["deploy", "info", "d0000000000000000"]).await.expect(1, "not_found");
     bench.taskd(&["robot", "rm", "robot-7"]).await.expect(2, "give --yes");
     bench.taskd(&["robot", "rm", "robot-7", "--yes"]).await.expect(0, id);
-    bench.taskd(&["robot", "rm", "robot-7", "--yes"]).await.expect(2, "robot-7: no robot matches");
+    bench.taskd(&["robot", "rm", "robot-7", "--yes"]).await.expect(2, "no robot has the name or id robot-7");
     bench.taskd(&["robot", "info", "robot-7"]).await.expect(2, "no robot has the name or id robot-7");
 }
 

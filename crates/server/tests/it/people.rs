@@ -171,8 +171,8 @@ async fn an_order_beyond_the_scope_is_refused_as_a_whole(database: TestDatabase)
     let refused = ordered("*").await.expect_err("refused");
     let expected = "1 of the 3 robots of \"*\" are outside of alice's scope \"site=lab\"; nothing was done";
     assert_eq!((refused.code(), refused.to_string().as_str()), ("out_of_scope", expected));
-    assert_eq!(code(ordered("r2").await), "out_of_scope");
-    assert_eq!(code(ordered("r0,r2").await), "out_of_scope");
+    assert_eq!(code(ordered("r2").await), "unknown_robots");
+    assert_eq!(code(ordered("r0,r2").await), "unknown_robots");
     assert_eq!(code(fleet.actions.matching_robots(&alice, &selector("*")).await), "out_of_scope");
     assert_eq!(code(ordered("site=mars").await), "no_robots_match");
     assert_eq!(fleet.acts_since(before).await, []);

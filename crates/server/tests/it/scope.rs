@@ -157,7 +157,17 @@ async fn an_order_says_how_many_robots_are_not_ones_own() {
     let body: Value = refused.json().await.expect("json");
     let said = "1 of the 2 robots of \"*\" are outside of alice's scope \"site=lab\"; nothing was done";
     assert_eq!((&body["error"]["code"], &body["error"]["message"]), (&json!("out_of_scope"), &json!(said)));
-    assert_eq!(refusal(order("boreas", "two")).await, out_of_scope());
+    // Whether a robot of that name is another's is not hers to know.
+    for selector in ["boreas", "site=lab,boreas", "site=lab,!boreas", "nobody"] {
+        let said = format!(
+            "selector: no robot that takes orders has the name or id {}; nothing was done",
+            if selector == "nobody" { "nobody" } else { "boreas" }
+        );
+        let refused = order(selector, "two").send().await.expect("an answer");
+        assert_eq!(refused.status(), StatusCode::NOT_FOUND);
+        let body: Value = refused.json().await.expect("json");
+        assert_eq!((&body["error"]["code"], &body["error"]["message"]), (&json!("unknown_robots"), &json!(said)));
+    }
     let ordered: DeploymentView = answer(order("site=lab", "three")).await;
     assert_eq!(ordered.assignments.expect("asked for").len(), 1);
     // What she may not at all says so in other words.

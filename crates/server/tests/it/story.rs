@@ -17,6 +17,7 @@ use crate::fleet::{Fleet, Robot, mac, order_of, package, random_key};
 on_both_databases! {
     a_removed_robot_leaves_its_mac_and_name,
     an_order_reaches_all_that_match_and_settles,
+    a_name_that_no_robot_has_is_refused_by_every_order,
     an_idempotency_key_orders_once,
     racing_operators_leave_one_winner,
     a_newer_deployment_supersedes_and_a_cancel_puts_back,
@@ -92,6 +93,48 @@ async fn an_order_reaches_all_that_match_and_settles(database: TestDatabase) {
     assert_eq!((robot.tasks[0].phase, robot.tasks[0].run), (Phase::Running, 1));
     assert_eq!(store.packages_in_use().await.expect("reads").len(), 1);
     assert_eq!(fleet.deployments().await.len(), 1);
+}
+
+async fn a_name_that_no_robot_has_is_refused_by_every_order(database: TestDatabase) {
+    let fleet = Fleet::new(database).await;
+    let robots = fleet.enroll(2).await;
+    let (by, actions, task) = (&fleet.operator, &fleet.actions, "talker".parse().expect("a name"));
+    let view = package("1", TaskKind::Service);
+    let (key, named) = (random_key(), "r0,r1".parse().expect("valid"));
+    let order = task_proto::api::CreateDeployment { selector: named, ..order_of(&view) };
+    let id = actions.create_deployment(by, &key, &order, &view).await.expect("ordered");
+    actions.remove_robot(by, &robots[1].id).await.expect("removed");
+    let again = actions.create_deployment(by, &key, &order, &view).await;
+    assert_eq!(again.expect("the same order as before"), id);
+    for (text, unknown) in [("r0,r1,r7", "r1, r7"), ("!r7", "r7"), ("*&r7,r0", "r7"), (robots[1].id.as_str(), "")] {
+        let selector: task_proto::selector::Selector = text.parse().expect("valid");
+        let order = task_proto::api::CreateDeployment { selector: selector.clone(), ..order_of(&view) };
+        let retry = task_proto::api::RetryDeployment { selector: Some(selector.clone()), ..Default::default() };
+        let labels = task_proto::api::BulkLabels {
+            selector: selector.clone(),
+            set: [("site".parse().expect("valid"), "lab".parse().expect("valid"))].into(),
+            remove: Vec::new(),
+            dry_run: false,
+        };
+        let refusals = [
+            actions.create_deployment(by, &random_key(), &order, &view).await.err(),
+            actions.matching_robots(by, &selector).await.err(),
+            actions.order_task(by, &random_key(), TaskOrder::Stop, &task, &selector).await.err(),
+            actions.robots_with_task(by, &task, &selector).await.err(),
+            actions.roll_back(by, &random_key(), &task, &selector).await.err(),
+            actions.rollback(by, &task, &selector).await.err(),
+            actions.robots_to_retry(by, &id, &retry).await.err(),
+            actions.label_robots(by, None, &labels).await.err(),
+            actions.remove_robots(by, None, &selector).await.err(),
+        ];
+        for refusal in refusals {
+            let refusal = refusal.expect("refused");
+            assert_eq!(refusal.code(), "unknown_robots", "{text}");
+            assert!(refusal.to_string().contains(&format!("name or id {unknown}")), "{refusal}");
+        }
+    }
+    // Where the name is known, and nothing else is wrong, nothing has changed.
+    assert_eq!(fleet.view(&robots[0]).await.generation, Generation(1));
 }
 
 async fn an_idempotency_key_orders_once(database: TestDatabase) {

@@ -339,6 +339,10 @@ pub struct CreateDeployment {
     /// Seconds until what is not done expires; absent: the server's setting.
     #[serde(default)]
     pub expires_in_s: Option<u64>,
+    /// Run a service anew also on robots that run this package already. Otherwise it goes on there, and those robots have
+    /// settled at once.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub restart: bool,
     /// Only say which robots it would be. Stores nothing, needs no key.
     #[serde(default)]
     pub dry_run: bool,
@@ -356,6 +360,7 @@ impl CreateDeployment {
             batch: None,
             max_failures: None,
             expires_in_s: None,
+            restart: false,
             dry_run: false,
         }
     }

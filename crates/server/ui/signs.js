@@ -26,10 +26,10 @@ export const progressBar = ({ task, phase, progress }) => progress?.total && ton
   : null;
 
 /** What else is worth knowing of a task that has not failed. */
-export function remarks({ active, version, restarts, wanted, phase, degraded }) {
+export function remarks({ active, version, deployment, restarts, wanted, phase, degraded }) {
   const said = [];
   if (degraded) said.push(`▲ degraded: ${words(degraded.code)}`);
-  if (active && active.version !== version) said.push(`${active.version} still runs`);
+  if (active && active.deployment !== deployment) said.push(active.version === version ? 'what was there before still runs' : `${active.version} still runs`);
   if (restarts) said.push(`restarted ${restarts}×`);
   if (wanted === 'stopped' && phase === 'running') said.push('stop ordered');
   return said;

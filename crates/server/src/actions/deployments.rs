@@ -216,6 +216,9 @@ impl Placed<'_> {
         let new = NewDeployment { id: &id, package, kind, order, expires_at_ms };
         write.insert_deployment(&new, now_ms).await?;
         let mut touched = write.assign(&id, &package.name, robots, now_ms).await?;
+        if !order.restart {
+            write.settle_running(&id, now_ms).await?;
+        }
         touched.insert(id.clone());
         Ok((id, touched))
     }

@@ -170,7 +170,7 @@ fn row(view: &PackageView) -> Vec<String> {
 }
 
 /// Enough of a digest to tell versions apart.
-fn short(digest: &Digest) -> String {
+pub(super) fn short(digest: &Digest) -> String {
     digest.hex()[..12].to_owned()
 }
 

@@ -5,9 +5,12 @@ use std::time::Duration;
 
 use clap::{Args, ValueEnum};
 use task_proto::RepositoryName;
-use task_proto::api::{CreateDeployment, DeliveryChoice, DeploymentView, MAX_PRIORITY, MIN_PRIORITY};
+use task_proto::api::{
+    AssignmentView, CreateDeployment, DeliveryChoice, DeploymentView, MAX_PRIORITY, MIN_PRIORITY, names,
+};
 use task_proto::desired::PackageRef;
 use task_proto::envelope::SigningKey;
+use task_proto::report::Phase;
 use task_proto::publisher::{PackageStatement, SIGNATURE_ARTIFACT};
 use task_proto::selector::Selector;
 
@@ -33,6 +36,9 @@ pub struct Push {
     /// How long to wait
     #[arg(long, value_name = "TIME", value_parser = lifetime, default_value = "10m", requires = "to")]
     timeout: Duration,
+    /// Run it anew also where the same package runs already
+    #[arg(long, requires = "to")]
+    restart: bool,
     /// So many robots at a time [default: all at once]
     #[arg(long, value_name = "N", value_parser = at_least_one, requires = "to")]
     batch: Option<u64>,
@@ -135,6 +141,7 @@ pub(super) async fn run(session: &Session, push: Push) -> Result<Outcome, Comman
         batch: push.batch,
         max_failures: push.max_failures,
         expires_in_s: push.expires.map(|expires| expires.as_secs()),
+        restart: push.restart,
         dry_run: false,
     };
     let key = push.idempotency_key.unwrap_or_else(client::random_key);
@@ -144,11 +151,22 @@ pub(super) async fn run(session: &Session, push: Push) -> Result<Outcome, Comman
     for superseded in &ordered.supersedes {
         say(&format!("it supersedes {superseded}"));
     }
+    say_running(&ordered);
     if !push.wait {
         view::print(session, &ordered)?;
         return Ok(Outcome::Succeeded);
     }
     wait::until_settled(session, &ordered.id, push.timeout).await
+}
+
+/// Says on which robots a new deployment has found its package running.
+pub(super) fn say_running(ordered: &DeploymentView) {
+    const MAX_NAMES: usize = 5;
+    let assignments = ordered.assignments.as_deref().unwrap_or_default();
+    let running: Vec<&AssignmentView> = assignments.iter().filter(|one| one.phase == Phase::Running).collect();
+    if !running.is_empty() {
+        say(&format!("already running on {}; --restart runs it anew there", names(&running, MAX_NAMES)));
+    }
 }
 
 /// Puts what publishers say of the package beside it.

@@ -2,7 +2,7 @@
 
 use task_proto::api::{PendingRobot, RobotTask, RobotView};
 use task_proto::id::Labels;
-use task_proto::report::{Isolation, LinkFacts, RosFacts};
+use task_proto::report::{ActiveVersion, Isolation, LinkFacts, Phase, RosFacts};
 
 use super::output::{self, Output, bytes, time};
 use super::robot_settings::shown;
@@ -59,8 +59,18 @@ fn shown_labels(labels: &Labels) -> String {
 
 /// A task and where it stands, in a word or two.
 fn standing(task: &RobotTask) -> String {
-    let health = if task.degraded.is_some() { "/degraded" } else { "" };
+    let health = match (&task.degraded, still_running(task)) {
+        (Some(_), _) => "/degraded",
+        (None, Some(_)) => "/earlier-runs",
+        (None, None) => "",
+    };
     format!("{}:{}{health}", task.task, task.phase)
+}
+
+/// The version that goes on although a newer order has failed or can't begin.
+fn still_running(task: &RobotTask) -> Option<&ActiveVersion> {
+    let is_over = task.phase.is_final() && task.phase != Phase::RolledBack;
+    task.active.as_ref().filter(|active| is_over && active.deployment != task.deployment)
 }
 
 /// Online or offline, and the conditions an operator must know about.
@@ -173,7 +183,10 @@ fn task_row(task: &RobotTask) -> Vec<String> {
 /// Why a task failed or waits, or else why it runs not as it should.
 fn problem(task: &RobotTask) -> String {
     match (&task.failure, &task.degraded) {
-        (Some(failure), _) => failure.to_string(),
+        (Some(failure), _) => match still_running(task) {
+            Some(earlier) => format!("{failure}; {} still runs, from deployment {}", earlier.version, earlier.deployment),
+            None => failure.to_string(),
+        },
         (None, Some(degraded)) => format!("degraded: {degraded}"),
         (None, None) => "-".to_owned(),
     }

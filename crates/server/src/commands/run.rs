@@ -7,12 +7,12 @@ use std::str::FromStr;
 use std::time::Duration;
 
 use clap::Args;
-use task_proto::RobotName;
-use task_proto::api::{CreateDeployment, DeploymentView};
+use task_proto::api::{CreateDeployment, DeploymentView, RobotView};
+use task_proto::{RobotId, RobotName};
 
-use super::output::say;
-use super::package::{PackageName, find};
-use super::push::{packed, sign};
+use super::output::{printable, say};
+use super::package::{PackageName, find, short};
+use super::push::{packed, say_running, sign};
 use super::upload::{Upload, upload};
 use super::{CommandError, Outcome, Session, client, complete, logs, robot, view, wait};
 use crate::config::lifetime;
@@ -44,6 +44,9 @@ pub struct RunOrder {
     /// Order it and don't wait until it runs
     #[arg(short, long)]
     detach: bool,
+    /// Run it anew also where the same package runs already, with the same arguments
+    #[arg(long)]
+    restart: bool,
     /// How long to wait
     #[arg(long, value_name = "TIME", value_parser = lifetime, default_value = "10m")]
     timeout: Duration,
@@ -104,18 +107,43 @@ pub(super) async fn run(session: &Session, order: RunOrder) -> Result<Outcome, C
     };
     sign(session, &package, &keys).await?;
     let selector = robot.id.as_str().parse().map_err(|error| CommandError::Usage(format!("{error}")))?;
-    let create = CreateDeployment::new(package.name.clone(), package.manifest.digest, selector);
+    let create = CreateDeployment {
+        restart: order.restart,
+        ..CreateDeployment::new(package.name.clone(), package.manifest.digest, selector)
+    };
     let ordered: DeploymentView = session.client.order("/deployments", &create, &client::random_key()).await?;
     say(&format!("deployment {}: {} {} to {}", ordered.id, package.name, package.version, robot.name));
+    say_running(&ordered);
     if order.detach {
         view::print(session, &ordered)?;
         return Ok(Outcome::Succeeded);
     }
     let outcome = wait::until_settled(session, &ordered.id, order.timeout).await?;
+    if outcome != Outcome::Succeeded {
+        say_what_still_runs(session, &robot.id, &ordered).await?;
+    }
     match order.follow && outcome == Outcome::Succeeded {
         true => logs::follow_task(session, robot.name, package.name).await,
         false => Ok(outcome),
     }
+}
+
+/// Says that the version before goes on, where the new one could not take its place.
+async fn say_what_still_runs(
+    session: &Session,
+    robot: &RobotId,
+    ordered: &DeploymentView,
+) -> Result<(), CommandError> {
+    let robot: RobotView = session.client.get(&format!("/robots/{robot}"), &[]).await?;
+    let Some(task) = robot.tasks.iter().find(|task| task.task == ordered.package.name) else { return Ok(()) };
+    let Some(active) = task.active.as_ref().filter(|active| active.deployment != ordered.id) else { return Ok(()) };
+    let digest = active.manifest.map_or_else(String::new, |digest| format!(" ({})", short(&digest)));
+    let why = task.failure.as_ref().map_or_else(|| task.phase.to_string(), |failure| failure.to_string());
+    say(&printable(&format!(
+        "{} still runs {} {}{digest}, which it had before; the new one does not run: {why}",
+        robot.name, task.task, active.version
+    )));
+    Ok(())
 }
 
 #[cfg(test)]

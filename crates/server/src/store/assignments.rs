@@ -80,6 +80,29 @@ impl Write {
         deployments(superseded)
     }
 
+    /// Settles a new deployment on the robots that run its package already, as they last said: nothing begins there. What
+    /// they should have stays the earlier deployment, so that they hear of nothing.
+    pub async fn settle_running(&mut self, deployment: &DeploymentId, now_ms: u64) -> Result<(), StoreError> {
+        // The same package has the same text.
+        sqlx::query(AssertSqlSafe(format!(
+            "UPDATE assignments SET released = 1, ended = 1, ran = 1, phase = 'running', updated_at_ms = $2, timeline = {}
+             WHERE deployment_id = $1 AND released = 0 AND ended = 0 AND robot_id IN (
+                 SELECT has.robot_id FROM deployments ordered
+                 JOIN assignments has ON has.task = ordered.task AND has.desired = 1
+                 JOIN deployments present ON present.id = has.deployment_id
+                 JOIN robots r ON r.id = has.robot_id
+                 WHERE ordered.id = $1 AND ordered.kind = 'service' AND present.package = ordered.package
+                   AND has.wanted = 'running' AND has.phase = 'running'
+                   AND r.observed_generation <= r.generation)",
+            grown_by(Phase::Running, "$2")
+        )))
+        .bind(deployment.as_str())
+        .bind(stored(now_ms))
+        .execute(self.connection())
+        .await?;
+        Ok(())
+    }
+
     /// Moves robots that wait for their batch behind all others, in their order.
     pub async fn postpone(&mut self, deployment: &DeploymentId, robots: &[&RobotId]) -> Result<(), StoreError> {
         let last: Option<i64> = sqlx::query_scalar("SELECT MAX(place) FROM assignments WHERE deployment_id = $1")

@@ -15,6 +15,7 @@ use crate::fleet::{Fleet, Robot, package, random_key};
 use crate::story::code;
 
 on_both_databases! {
+    a_package_that_runs_already_is_not_started_again,
     a_restart_is_a_new_run_of_all_that_have_the_task,
     a_retry_is_for_those_that_ended_badly_and_got_nothing_since,
     a_retry_may_be_for_some_and_keeps_the_orders_ways,
@@ -92,6 +93,51 @@ impl Fleet {
 
 fn names(robots: &[task_proto::api::MatchedRobot]) -> Vec<&str> {
     robots.iter().map(|robot| robot.name.as_str()).collect()
+}
+
+async fn a_package_that_runs_already_is_not_started_again(database: TestDatabase) {
+    let fleet = Fleet::new(database).await;
+    let mut robots = fleet.enroll(4).await;
+    let first = fleet.deploy("1", |order| order.selector = selector("!r3")).await;
+    fleet.follow(&mut robots[0], Phase::Running).await;
+    fleet.follow(&mut robots[1], Phase::Failed).await;
+    fleet.follow(&mut robots[2], Phase::Running).await;
+    let stop = fleet.actions.order_task(&fleet.operator, &random_key(), TaskOrder::Stop, &task(), &selector("r2"));
+    stop.await.expect("ordered");
+    fleet.follow(&mut robots[2], Phase::Stopped).await;
+    fleet.changes.take_rings().await;
+    let before = fleet.desired(&robots[0]).await.expect("state");
+    // It failed on one, was stopped on one, and one never had it: there it begins.
+    let again = fleet.deploy("1", |order| order.batch = Some(3)).await;
+    assert_eq!(fleet.phases(&again).await, [Phase::Running, Phase::Assigned, Phase::Assigned, Phase::Assigned]);
+    assert_eq!(fleet.desired(&robots[0]).await.expect("state"), before, "the robot hears of nothing");
+    assert_eq!(before.tasks[0].deployment, first);
+    assert_eq!(fleet.changes.take_rings().await.robots.len(), 3);
+    for robot in &mut robots {
+        fleet.follow(robot, Phase::Running).await;
+    }
+    assert_eq!(fleet.deployment(&again).await.state, task_proto::api::DeploymentState::Settled);
+    // Where it runs everywhere, all is settled at once, and nothing is left to cancel.
+    let third = fleet.deploy("1", |_| ()).await;
+    assert_eq!(fleet.deployment(&third).await.state, task_proto::api::DeploymentState::Settled);
+    assert_eq!(code(fleet.actions.cancel_deployment(&fleet.operator, &third).await), "nothing_to_cancel");
+    // It can be forced, and another version is another.
+    let forced = fleet.deploy("1", |order| order.restart = true).await;
+    assert_eq!(fleet.phases(&forced).await, [Phase::Assigned; 4]);
+    for robot in &mut robots {
+        assert_eq!(fleet.desired(robot).await.expect("state").tasks[0].deployment, forced);
+        fleet.follow(robot, Phase::Running).await;
+    }
+    let newer = fleet.deploy("2", |_| ()).await;
+    assert_eq!(fleet.phases(&newer).await, [Phase::Assigned; 4]);
+    // A job runs once for each order.
+    let job = package("7", TaskKind::Job);
+    let order = crate::fleet::order_of(&job);
+    for _ in 0..2 {
+        let id = fleet.actions.create_deployment(&fleet.operator, &random_key(), &order, &job).await.expect("ordered");
+        assert_eq!(fleet.desired(&robots[0]).await.expect("state").tasks[0].deployment, id);
+        fleet.follow(&mut robots[0], Phase::Running).await;
+    }
 }
 
 async fn a_restart_is_a_new_run_of_all_that_have_the_task(database: TestDatabase) {

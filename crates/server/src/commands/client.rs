@@ -127,7 +127,9 @@ impl ClientError {
             | Self::Token { .. }
             | Self::Url { .. }
             | Self::PinInPlainText { .. } => Outcome::Usage,
-            Self::Refused { code, .. } if ["no_robots_match", "unknown_robots"].contains(&code.as_str()) => Outcome::Usage,
+            Self::Refused { code, .. } if ["no_robots_match", "unknown_robots"].contains(&code.as_str()) => {
+                Outcome::Usage
+            }
             Self::Refused { .. } | Self::Unreachable { .. } | Self::NotTheServer { .. } | Self::NotServing { .. } => {
                 Outcome::Failed
             }

@@ -217,6 +217,8 @@ pub enum Outcome {
     NotAllowed,
     /// It was not done in time.
     TimedOut,
+    /// Ctrl-C, while it waited.
+    Interrupted,
 }
 
 impl From<Outcome> for ExitCode {
@@ -228,6 +230,8 @@ impl From<Outcome> for ExitCode {
             Outcome::SomeFailed => 3,
             Outcome::NotAllowed => 4,
             Outcome::TimedOut => 5,
+            // As a shell says of a program that SIGINT has ended.
+            Outcome::Interrupted => 130,
         })
     }
 }

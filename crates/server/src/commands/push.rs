@@ -10,8 +10,8 @@ use task_proto::api::{
 };
 use task_proto::desired::PackageRef;
 use task_proto::envelope::SigningKey;
-use task_proto::report::Phase;
 use task_proto::publisher::{PackageStatement, SIGNATURE_ARTIFACT};
+use task_proto::report::Phase;
 use task_proto::selector::Selector;
 
 use super::confirm::confirm;

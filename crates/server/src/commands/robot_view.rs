@@ -184,7 +184,9 @@ fn task_row(task: &RobotTask) -> Vec<String> {
 fn problem(task: &RobotTask) -> String {
     match (&task.failure, &task.degraded) {
         (Some(failure), _) => match still_running(task) {
-            Some(earlier) => format!("{failure}; {} still runs, from deployment {}", earlier.version, earlier.deployment),
+            Some(earlier) => {
+                format!("{failure}; {} still runs, from deployment {}", earlier.version, earlier.deployment)
+            }
             None => failure.to_string(),
         },
         (None, Some(degraded)) => format!("degraded: {degraded}"),

@@ -129,11 +129,7 @@ pub(super) async fn run(session: &Session, order: RunOrder) -> Result<Outcome, C
 }
 
 /// Says that the version before goes on, where the new one could not take its place.
-async fn say_what_still_runs(
-    session: &Session,
-    robot: &RobotId,
-    ordered: &DeploymentView,
-) -> Result<(), CommandError> {
+async fn say_what_still_runs(session: &Session, robot: &RobotId, ordered: &DeploymentView) -> Result<(), CommandError> {
     let robot: RobotView = session.client.get(&format!("/robots/{robot}"), &[]).await?;
     let Some(task) = robot.tasks.iter().find(|task| task.task == ordered.package.name) else { return Ok(()) };
     let Some(active) = task.active.as_ref().filter(|active| active.deployment != ordered.id) else { return Ok(()) };

@@ -26,8 +26,35 @@ pub(super) async fn until_settled(
     id: &DeploymentId,
     timeout: Duration,
 ) -> Result<Outcome, CommandError> {
-    let deadline = Instant::now() + timeout;
     let mut progress = DeploymentProgress::new();
+    let latest = tokio::select! {
+        latest = follow(session, id, timeout, &mut progress) => latest?,
+        interrupted = tokio::signal::ctrl_c() => {
+            interrupted.map_err(|source| CommandError::Io { what: "can't wait for Ctrl-C".to_owned(), source })?;
+            progress.finish();
+            say(&format!("no longer waited for; the deployment goes on\nfollow it: taskd deploy watch {id}\ncancel it: taskd deploy cancel {id}"));
+            return Ok(Outcome::Interrupted);
+        }
+    };
+    progress.finish();
+    let Some(view) = latest else {
+        say("timed out: the server did not say how the deployment stands");
+        return Ok(Outcome::TimedOut);
+    };
+    view::print(session, &view)?;
+    let verdict = judge(&view);
+    say(&verdict.text);
+    Ok(verdict.outcome)
+}
+
+/// Looks at the deployment until it is over or the time is; how it stood last, if the server has said it.
+async fn follow(
+    session: &Session,
+    id: &DeploymentId,
+    timeout: Duration,
+    progress: &mut DeploymentProgress,
+) -> Result<Option<DeploymentView>, CommandError> {
+    let deadline = Instant::now() + timeout;
     let mut pause = MIN_PAUSE;
     let mut latest: Option<DeploymentView> = None;
     while Instant::now() < deadline {
@@ -47,15 +74,7 @@ pub(super) async fn until_settled(
         }
         sleep(pause.min(deadline.saturating_duration_since(Instant::now()))).await;
     }
-    progress.finish();
-    let Some(view) = latest else {
-        say("timed out: the server did not say how the deployment stands");
-        return Ok(Outcome::TimedOut);
-    };
-    view::print(session, &view)?;
-    let verdict = judge(&view);
-    say(&verdict.text);
-    Ok(verdict.outcome)
+    Ok(latest)
 }
 
 async fn look(session: &Session, id: &DeploymentId) -> Result<DeploymentView, ClientError> {

@@ -192,6 +192,34 @@ pub struct Robot {
     seq: std::cell::Cell<u64>,
 }
 
+/// Ctrl-C ends the wait and nothing else, and says how to go on.
+#[tokio::test(flavor = "multi_thread")]
+async fn an_interrupted_wait_says_how_to_follow_and_cancel() {
+    let bench = Bench::start().await;
+    bench.enroll(1).await;
+    let (data, package) = (bench.data().display().to_string(), bench.package("1", ""));
+    let mut command = command(&["--data", &data, "push", &package, "--to", "*", "--wait"]);
+    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let interrupted = tokio::task::spawn_blocking(move || {
+        let mut lines = BufReader::new(child.stderr.take().unwrap()).lines().map(Result::unwrap);
+        // It waits as soon as it says where the robot stands.
+        let id = lines.by_ref().find_map(|line| Some(line.strip_prefix("deployment ")?.split(':').next()?.to_owned()));
+        lines.by_ref().find(|line| line.starts_with("robot-1 assigned")).expect("it waits");
+        let pid = nix::unistd::Pid::from_raw(child.id().try_into().unwrap());
+        nix::sys::signal::kill(pid, nix::sys::signal::Signal::SIGINT).unwrap();
+        let said: Vec<String> = lines.collect();
+        (id.unwrap(), said, child.wait().unwrap())
+    });
+    let (id, said, status) = interrupted.await.unwrap();
+    assert_eq!(status.code(), Some(130), "{said:?}");
+    let expected =
+        ["no longer waited for; the deployment goes on".to_owned(), format!("follow it: taskd deploy watch {id}")];
+    assert_eq!(said[said.len() - 3..][..2], expected);
+    assert_eq!(said.last(), Some(&format!("cancel it: taskd deploy cancel {id}")));
+    let view = bench.taskd(&["deploy", "info", &id, "-o", "json"]).await.expect(0, "").json();
+    assert_eq!(view["state"], "active");
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_second_push_of_the_same_tree_transfers_no_blob() {
     let bench = Bench::start().await;

@@ -102,8 +102,8 @@ async fn a_package_that_runs_already_is_not_started_again(database: TestDatabase
     fleet.follow(&mut robots[0], Phase::Running).await;
     fleet.follow(&mut robots[1], Phase::Failed).await;
     fleet.follow(&mut robots[2], Phase::Running).await;
-    let stop = fleet.actions.order_task(&fleet.operator, &random_key(), TaskOrder::Stop, &task(), &selector("r2"));
-    stop.await.expect("ordered");
+    let (key, third, task) = (random_key(), selector("r2"), task());
+    fleet.actions.order_task(&fleet.operator, &key, TaskOrder::Stop, &task, &third).await.expect("ordered");
     fleet.follow(&mut robots[2], Phase::Stopped).await;
     fleet.changes.take_rings().await;
     let before = fleet.desired(&robots[0]).await.expect("state");

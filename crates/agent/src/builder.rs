@@ -20,7 +20,7 @@ use crate::foreign_file;
 use crate::layout::VersionDir;
 use crate::process::{self, ExitStatus};
 use crate::script;
-use crate::task_user::TaskUser;
+use crate::task_user::{self, TaskUser};
 
 /// How long the processes of a build may take to be gone.
 const KILL_TIMEOUT: Duration = Duration::from_secs(10);
@@ -175,7 +175,10 @@ pub async fn build(order: &BuildOrder, cancel: &CancellationToken) -> Result<(),
         (None, _) if cancel.is_cancelled() => return Err(BuildError::Cancelled),
         (None, _) => return Err(BuildError::TimedOut { timeout: order.limits.timeout, output }),
     }
-    if let Some(missing) = missing_package(&order.version) {
+    let version = order.version.clone();
+    let missing =
+        task_user::do_as(order.user.as_ref(), move || missing_package(&version)).await.map_err(failed(root))?;
+    if let Some(missing) = missing {
         return Err(BuildError::NotInstalled { missing, output });
     }
     let synced = root.to_owned();
@@ -259,7 +262,8 @@ fn copy_output(mut output: PipeReader, mut log: File, limit: u64) -> Vec<u8> {
     }
 }
 
-/// The package that should have been installed and was not. Build tools skip what they don't recognise and succeed.
+/// The package that should have been installed and was not. Build tools skip what they don't recognise and succeed. The build
+/// may have left links anywhere: only the account that it ran under looks.
 fn missing_package(version: &VersionDir) -> Option<String> {
     let installed = version.install();
     if let Some(name) = package_name(&version.src().join("package.xml")) {

@@ -6,6 +6,8 @@ use std::io::{self, Write};
 use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
+use nix::fcntl::OFlag;
+
 #[cfg(test)]
 pub(crate) mod own_mounts;
 mod removal;
@@ -62,15 +64,22 @@ pub fn remove_file(path: &Path) -> io::Result<()> {
     absent_is_fine(fs::remove_file(path))
 }
 
-/// Brings everything written on the file system that holds `path` to the disk. One call for a whole tree: syncing its
-/// files one by one takes many times as long.
+/// Brings everything written on the file system that holds the directory `path` to the disk. One call for a whole tree:
+/// syncing its files one by one takes many times as long. A link, pipe or device in its place is refused unopened.
 pub fn sync_file_system(path: &Path) -> io::Result<()> {
-    Ok(nix::unistd::syncfs(File::open(path)?)?)
+    Ok(nix::unistd::syncfs(open_dir(path, OFlag::O_NOFOLLOW)?)?)
 }
 
 /// Brings a directory's entries to the disk.
 pub fn sync_dir(path: &Path) -> io::Result<()> {
-    File::open(path)?.sync_all()
+    open_dir(path, OFlag::empty())?.sync_all()
+}
+
+/// Opens a directory. Anything else is refused without being opened: a pipe would keep the caller waiting, and opening a
+/// device may already change something.
+fn open_dir(path: &Path, flags: OFlag) -> io::Result<File> {
+    let flags = OFlag::O_DIRECTORY | flags;
+    OpenOptions::new().read(true).custom_flags(flags.bits()).open(path)
 }
 
 fn beside(path: &Path, suffix: &str) -> PathBuf {

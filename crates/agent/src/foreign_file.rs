@@ -1,19 +1,77 @@
-//! Reading files that lie where a task may write. What a task puts in their place — a link, a pipe, a file without end —
-//! neither leads elsewhere nor keeps the reader waiting. Directories on the way are not looked at: where that matters the
-//! reader has the task's own rights (see [`crate::task_user::TaskUser::with_its_rights`]).
+//! Reading files that lie where a task may write. A link, pipe, device or endless file that a task puts in the place of a
+//! file neither leads elsewhere nor is opened nor keeps the reader waiting. A [`Directory`] is entered one component at a
+//! time, so that no link on the way is followed either; [`open`] does not look at the directories above its file.
 
-use std::fs::{File, OpenOptions};
+use std::ffi::OsString;
+use std::fs::{self, File};
 use std::io::{self, Read as _};
-use std::os::unix::fs::OpenOptionsExt as _;
-use std::path::Path;
+use std::os::fd::{AsFd, AsRawFd as _, OwnedFd};
+use std::path::{Component, Path, PathBuf};
 
-use nix::fcntl::OFlag;
+use nix::NixPath;
+use nix::errno::Errno;
+use nix::fcntl::{AT_FDCWD, OFlag, openat};
+use nix::sys::stat::{FileStat, Mode, SFlag, fstat};
+
+/// A directory that a task may change while it is looked at.
+#[derive(Debug)]
+pub struct Directory(OwnedFd);
+
+/// What a name stands for, without following it.
+#[derive(Debug)]
+pub enum Entry {
+    /// A directory.
+    Directory(Directory),
+    /// A regular file of so many bytes.
+    File(u64),
+    /// A link, a pipe, a socket or a device.
+    Other,
+}
+
+impl Directory {
+    /// The directory at `path`. Its last component may be a task's, those above are not.
+    pub fn open(path: &Path) -> io::Result<Self> {
+        let flags = OFlag::O_PATH | OFlag::O_DIRECTORY | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
+        Ok(Self(openat(AT_FDCWD, path, flags, Mode::empty())?))
+    }
+
+    /// The names in it, in no order.
+    pub fn names(&self) -> io::Result<impl Iterator<Item = io::Result<OsString>> + use<>> {
+        Ok(fs::read_dir(by_descriptor(&self.0))?.map(|entry| entry.map(|entry| entry.file_name())))
+    }
+
+    /// What `name` is; `None` where there is nothing of that name any more.
+    pub fn entry(&self, name: &str) -> io::Result<Option<Entry>> {
+        let found = match find(&self.0, name) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+            found => found?,
+        };
+        let about = fstat(&found)?;
+        Ok(Some(match kind(&about) {
+            SFlag::S_IFDIR => Entry::Directory(Self(found)),
+            SFlag::S_IFREG => Entry::File(about.st_size.unsigned_abs()),
+            _ => Entry::Other,
+        }))
+    }
+
+    /// Opens the regular file at `path`, which leads downward from here.
+    pub fn file(&self, path: &Path) -> io::Result<File> {
+        let mut names = path.components().collect::<Vec<_>>();
+        let last = names.pop().ok_or(io::ErrorKind::InvalidInput)?;
+        let mut dir = None;
+        for name in names {
+            let Component::Normal(name) = name else { return Err(io::ErrorKind::InvalidInput.into()) };
+            let flags = OFlag::O_PATH | OFlag::O_DIRECTORY | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
+            dir = Some(openat(dir.as_ref().unwrap_or(&self.0), name, flags, Mode::empty())?);
+        }
+        let Component::Normal(last) = last else { return Err(io::ErrorKind::InvalidInput.into()) };
+        open_found(&find(dir.as_ref().unwrap_or(&self.0), last)?)
+    }
+}
 
 /// Opens a regular file for reading.
 pub fn open(path: &Path) -> io::Result<File> {
-    let flags = OFlag::O_NOFOLLOW | OFlag::O_NONBLOCK;
-    let file = OpenOptions::new().read(true).custom_flags(flags.bits()).open(path)?;
-    if file.metadata()?.is_file() { Ok(file) } else { Err(io::Error::other("it is not a regular file")) }
+    open_found(&find(AT_FDCWD, path)?)
 }
 
 /// The bytes of a regular file, which may be `max_bytes` at most.
@@ -26,9 +84,32 @@ pub fn read(path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
+/// A descriptor that only names what is there: nothing is opened by it.
+fn find(at: impl AsFd, name: &(impl NixPath + ?Sized)) -> io::Result<OwnedFd> {
+    let flags = OFlag::O_PATH | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
+    Ok(openat(at, name, flags, Mode::empty())?)
+}
+
+/// Opens what was found, if it is a regular file: the very one, whatever has its name by now.
+fn open_found(found: &OwnedFd) -> io::Result<File> {
+    match kind(&fstat(found)?) {
+        SFlag::S_IFREG => File::open(by_descriptor(found)),
+        SFlag::S_IFLNK => Err(Errno::ELOOP.into()),
+        _ => Err(io::Error::other("it is not a regular file")),
+    }
+}
+
+fn kind(about: &FileStat) -> SFlag {
+    SFlag::from_bits_truncate(about.st_mode & SFlag::S_IFMT.bits())
+}
+
+fn by_descriptor(descriptor: &OwnedFd) -> PathBuf {
+    format!("/proc/self/fd/{}", descriptor.as_raw_fd()).into()
+}
+
 #[cfg(test)]
 mod tests {
-    use nix::sys::stat::Mode;
+    use std::os::unix::fs::symlink;
 
     use super::*;
 
@@ -39,11 +120,48 @@ mod tests {
         std::fs::write(at("file"), "four").expect("written");
         assert_eq!(read(&at("file"), 4).expect("read"), b"four");
         assert!(read(&at("file"), 3).is_err());
-        std::os::unix::fs::symlink(at("file"), at("link")).expect("linked");
-        std::os::unix::fs::symlink("/dev/zero", at("zeros")).expect("linked");
+        symlink(at("file"), at("link")).expect("linked");
+        symlink("/dev/zero", at("zeros")).expect("linked");
         nix::unistd::mkfifo(&at("pipe"), Mode::S_IRWXU).expect("a pipe");
         for name in ["link", "zeros", "pipe", "."] {
             assert!(read(&at(name), 4).is_err(), "{name}");
         }
+    }
+
+    #[test]
+    fn pipe_in_place_of_a_file_is_not_opened() {
+        let temp = tempfile::tempdir().expect("temp dir");
+        let pipe = temp.path().join("pipe");
+        nix::unistd::mkfifo(&pipe, Mode::S_IRWXU).expect("a pipe");
+        // A reader, were there one for a moment only, would let the writer in.
+        let writer = std::thread::spawn({
+            let pipe = pipe.clone();
+            move || File::options().write(true).open(pipe).expect("opened")
+        });
+        for _ in 0..10_000 {
+            assert!(open(&pipe).is_err());
+        }
+        assert!(!writer.is_finished(), "the pipe was opened");
+        let _reader = File::open(&pipe).expect("opened");
+        writer.join().expect("let in");
+    }
+
+    #[test]
+    fn link_on_the_way_to_a_file_is_not_followed() {
+        let temp = tempfile::tempdir().expect("temp dir");
+        let root = temp.path().join("root");
+        std::fs::create_dir_all(root.join("inner")).expect("made");
+        std::fs::write(root.join("inner/file"), "own").expect("written");
+        std::fs::create_dir(temp.path().join("outside")).expect("made");
+        std::fs::write(temp.path().join("outside/file"), "secret").expect("written");
+        symlink("../outside", root.join("out")).expect("linked");
+        let dir = Directory::open(&root).expect("opened");
+        assert!(dir.file(Path::new("inner/file")).is_ok());
+        for path in ["out/file", "../outside/file", "/etc/passwd", "", "inner", "."] {
+            assert!(dir.file(Path::new(path)).is_err(), "{path}");
+        }
+        assert!(Directory::open(&root.join("out")).is_err());
+        assert!(matches!(dir.entry("out"), Ok(Some(Entry::Other))));
+        assert!(matches!(dir.entry("nothing"), Ok(None)));
     }
 }

@@ -5,7 +5,7 @@
 //! It has no async runtime: two threads copy the output, the main thread waits for children.
 
 use std::io::{self, PipeWriter, Write};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
@@ -70,8 +70,8 @@ struct Task {
     started: Started,
     containment: Containment,
     memory_bytes: Option<u64>,
-    /// Where files are that will be brought back.
-    kept: Option<PathBuf>,
+    /// Whether it wrote files that will be brought back.
+    has_outputs: bool,
     drained: mpsc::Receiver<()>,
 }
 
@@ -94,9 +94,10 @@ pub fn run(path: &Path) -> Result<(), ShimError> {
     let _ = task.drained.recv_timeout(DRAIN_TIMEOUT);
     let at_uptime_ms = u64::try_from(process::uptime()?.as_millis()).unwrap_or(u64::MAX);
     let out_of_memory_bytes = task.memory_bytes.filter(|_| task.containment.is_out_of_memory());
-    if let Some(directory) = &task.kept {
-        // Whoever reads that it ended brings its files back, also after a power cut.
-        let _ = durable::sync_file_system(directory);
+    if task.has_outputs {
+        // The agent brings the files back once it reads that the run ended, also after a power cut. The run directory lies
+        // on the same file system, and no task can put anything else in its place.
+        let _ = durable::sync_file_system(dir.path());
     }
     let ended = Ended { status, at_uptime_ms, out_of_memory_bytes };
     once_there_is_room(ROOM_PAUSE, || dir.write_ended(&ended))?;
@@ -145,8 +146,8 @@ fn begin(dir: &RunDir) -> Result<Task, ShimError> {
     });
     match written {
         Ok(started) => {
-            let kept = spec.has_outputs.then_some(spec.directory);
-            Ok(Task { started, containment, memory_bytes: spec.limits.memory_bytes, kept, drained })
+            let (memory_bytes, has_outputs) = (spec.limits.memory_bytes, spec.has_outputs);
+            Ok(Task { started, containment, memory_bytes, has_outputs, drained })
         }
         Err(error) => {
             // A task that nobody could find again must not run.

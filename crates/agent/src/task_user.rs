@@ -144,8 +144,8 @@ impl TaskUser {
         })
     }
 
-    /// Leaves the calling thread, and it alone, the account's rights to files. It stays root in all else, or every process of
-    /// the account could end the agent by a signal to this thread.
+    /// Leaves the calling thread, and it alone, the account's rights to files and no capability. Its user id stays root's, or
+    /// every process of the account could end the agent by a signal to this thread.
     fn take_file_rights(&self) -> io::Result<()> {
         let groups: Vec<libc::gid_t> = std::iter::once(self.gid).chain(self.groups.iter().copied()).collect();
         // SAFETY: the list outlives the call. The C library's own call would change all threads.
@@ -154,11 +154,10 @@ impl TaskUser {
         setfsgid(self.group());
         setfsuid(self.user());
         let (none, now) = (u32::MAX, (self.user(), self.group()));
-        if (setfsuid(Uid::from_raw(none)), setfsgid(Gid::from_raw(none))) == now {
-            Ok(())
-        } else {
-            Err(io::Error::from(io::ErrorKind::PermissionDenied))
+        if (setfsuid(Uid::from_raw(none)), setfsgid(Gid::from_raw(none))) != now {
+            return Err(io::Error::from(io::ErrorKind::PermissionDenied));
         }
+        give_up_capabilities()
     }
 
     fn hand_over_below(&self, dir: &OwnedFd, depth: usize) -> io::Result<()> {
@@ -207,6 +206,18 @@ pub async fn do_as<T: Send + 'static>(
     working.await.map_err(io::Error::other).flatten()
 }
 
+/// Leaves the calling thread, and it alone, without capabilities. Another user id for files takes away only those that are
+/// about the modes of files: the rest would still open what `/proc` says of other processes.
+fn give_up_capabilities() -> io::Result<()> {
+    /// What the kernel calls `_LINUX_CAPABILITY_VERSION_3`: two words for each set.
+    const VERSION: u32 = 0x2008_0522;
+    let header: [u32; 2] = [VERSION, 0];
+    let none = [0_u32; 6];
+    // SAFETY: both arrays have the kernel's layout (version and thread; three sets of two words) and outlive the call.
+    Errno::result(unsafe { libc::syscall(libc::SYS_capset, header.as_ptr(), none.as_ptr()) })?;
+    Ok(())
+}
+
 fn is_kind(stat: &FileStat, kind: SFlag) -> bool {
     stat.st_mode & SFlag::S_IFMT.bits() == kind.bits()
 }
@@ -247,10 +258,11 @@ mod tests {
         fs::write(&own, "text").expect("written");
         fs::set_permissions(&own, fs::Permissions::from_mode(0o600)).expect("for this user alone");
         let user = TaskUser { name: "4711".to_owned(), uid: 4711, gid: 4711, groups: Vec::new() };
-        let read =
-            user.with_its_rights(|| (fs::read(&own).map_err(|error| error.kind()), fs::read("/etc/passwd").is_ok()));
+        let kind = |path: &Path| fs::read(path).map(drop).map_err(|error| error.kind());
+        let read = user.with_its_rights(|| [&own, Path::new("/proc/1/environ"), Path::new("/etc/passwd")].map(kind));
         if nix::unistd::geteuid().is_root() {
-            assert_eq!(read.expect("the rights"), (Err(io::ErrorKind::PermissionDenied), true));
+            let denied = Err(io::ErrorKind::PermissionDenied);
+            assert_eq!(read.expect("the rights"), [denied, denied, Ok(())]);
         } else {
             assert!(read.is_err(), "only root may have another's rights");
         }

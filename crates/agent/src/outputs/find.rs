@@ -1,10 +1,9 @@
 //! Finds the files that `outputs.paths` names: regular files below one directory. Links are neither followed nor brought
-//! back, because a task could point them at what is not its own.
+//! back, because a task could point them at what is not its own; nor are pipes, sockets and devices, which are not opened.
 
 use std::collections::BTreeMap;
-use std::fs::{self, Metadata};
 use std::io::{self, Read as _};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use sha2::{Digest as _, Sha256};
 use task_proto::Digest;
@@ -13,7 +12,7 @@ use task_proto::id::OutputPath;
 use task_proto::output::{MAX_FILES, OutputFile};
 
 use super::{OutputError, too_many};
-use crate::foreign_file;
+use crate::foreign_file::{Directory, Entry};
 
 /// The most names looked at for one pattern.
 const MAX_LOOKED_AT: usize = 200_000;
@@ -23,19 +22,27 @@ const MAX_DEPTH: usize = 48;
 /// The files that match, sorted by path, with their digests.
 pub(super) fn files(directory: &Path, patterns: &[String], max_bytes: u64) -> Result<Vec<OutputFile>, OutputError> {
     let mut found = BTreeMap::new();
-    for pattern in patterns {
-        let parts = parts(pattern)?;
-        let mut search = Search { found: &mut found, left: MAX_LOOKED_AT };
-        search.descend(directory, "", &parts, 0)?;
+    let patterns = patterns.iter().map(|pattern| parts(pattern)).collect::<Result<Vec<_>, _>>()?;
+    let unreadable = |below: &str| {
+        let path = directory.join(below);
+        move |source| OutputError::Read { path, source }
+    };
+    let root = match Directory::open(directory) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+        opened => opened.map_err(unreadable(""))?,
+    };
+    for parts in patterns {
+        let mut search = Search { found: &mut found, left: MAX_LOOKED_AT, unreadable: &unreadable };
+        search.descend(&root, "", &parts, 0)?;
     }
-    let bytes: u64 = found.values().map(|(_, size)| size).sum();
+    let bytes: u64 = found.values().sum();
     if bytes > max_bytes {
         return Err(OutputError::TooMuch(format!(
             "the files have {bytes} bytes, {max_bytes} may be brought back (limits.output_bytes of this robot)"
         )));
     }
-    let hashed = found.into_iter().map(|(path, (file, size))| {
-        let blob = hash(&file, size).map_err(|source| OutputError::Read { path: file, source })?;
+    let hashed = found.into_iter().map(|(path, size)| {
+        let blob = hash(&root, Path::new(path.as_str()), size).map_err(unreadable(path.as_str()))?;
         Ok(OutputFile { path, blob })
     });
     hashed.collect()
@@ -53,16 +60,22 @@ fn parts(pattern: &str) -> Result<Vec<glob::Pattern>, OutputError> {
         .collect()
 }
 
-struct Search<'a> {
-    found: &'a mut BTreeMap<OutputPath, (PathBuf, u64)>,
+struct Search<'a, F> {
+    found: &'a mut BTreeMap<OutputPath, u64>,
     left: usize,
+    /// Makes an error about a path below the root.
+    unreadable: &'a F,
 }
 
-impl Search<'_> {
+impl<F, E> Search<'_, F>
+where
+    F: Fn(&str) -> E,
+    E: FnOnce(io::Error) -> OutputError,
+{
     /// Looks for `parts` in `directory`, whose path below the root is `prefix`.
     fn descend(
         &mut self,
-        directory: &Path,
+        directory: &Directory,
         prefix: &str,
         parts: &[glob::Pattern],
         depth: usize,
@@ -73,49 +86,40 @@ impl Search<'_> {
             // No directory at all in its place.
             self.descend(directory, prefix, rest, depth)?;
         }
-        let entries = match fs::read_dir(directory) {
-            Ok(entries) => entries,
-            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
-            Err(source) => return Err(OutputError::Read { path: directory.to_owned(), source }),
-        };
-        for entry in entries {
-            let entry = entry.map_err(|source| OutputError::Read { path: directory.to_owned(), source })?;
+        let unreadable = self.unreadable;
+        for name in directory.names().map_err(unreadable(prefix))? {
+            let name = name.map_err(unreadable(prefix))?;
             self.left = self.left.checked_sub(1).ok_or_else(|| {
                 OutputError::TooMuch(format!("more than {MAX_LOOKED_AT} names would have to be looked at"))
             })?;
             // What has no printable name can't be named in a manifest either.
-            let Ok(name) = entry.file_name().into_string() else { continue };
+            let Ok(name) = name.into_string() else { continue };
             if !is_any_depth && !part.matches(&name) {
                 continue;
             }
-            let path = entry.path();
-            let about = fs::symlink_metadata(&path);
-            let about = match about {
-                Ok(about) => about,
-                Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
-                Err(source) => return Err(OutputError::Read { path, source }),
-            };
-            let below = if prefix.is_empty() { name } else { format!("{prefix}/{name}") };
-            if about.is_dir() && depth < MAX_DEPTH {
-                let rest = if is_any_depth { parts } else { rest };
-                self.descend(&path, &below, rest, depth + 1)?;
-            } else if about.is_file() && rest.is_empty() {
-                self.add(path, &below, &about)?;
+            let below = if prefix.is_empty() { name.clone() } else { format!("{prefix}/{name}") };
+            match directory.entry(&name).map_err(unreadable(&below))? {
+                Some(Entry::Directory(inner)) if depth < MAX_DEPTH => {
+                    let rest = if is_any_depth { parts } else { rest };
+                    self.descend(&inner, &below, rest, depth + 1)?;
+                }
+                Some(Entry::File(size)) if rest.is_empty() => self.add(&below, size)?,
+                _ => {}
             }
         }
         Ok(())
     }
 
-    fn add(&mut self, path: PathBuf, below: &str, about: &Metadata) -> Result<(), OutputError> {
+    fn add(&mut self, below: &str, size: u64) -> Result<(), OutputError> {
         let Ok(name) = below.parse::<OutputPath>() else { return Ok(()) };
-        self.found.insert(name, (path, about.len()));
+        self.found.insert(name, size);
         if self.found.len() > MAX_FILES { Err(too_many()) } else { Ok(()) }
     }
 }
 
 /// The digest of a file as long as it was when it was found: something may still write to it, without end.
-fn hash(path: &Path, found: u64) -> io::Result<BlobRef> {
-    let mut file = foreign_file::open(path)?.take(found);
+fn hash(root: &Directory, path: &Path, found: u64) -> io::Result<BlobRef> {
+    let mut file = root.file(path)?.take(found);
     let (mut hash, mut size) = (Sha256::new(), 0);
     let mut buffer = vec![0; 256 * 1024];
     loop {
@@ -131,6 +135,8 @@ fn hash(path: &Path, found: u64) -> io::Result<BlobRef> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     fn names(directory: &Path, patterns: &[&str]) -> Vec<String> {
@@ -150,6 +156,8 @@ mod tests {
         fs::write(temp.path().join("secret.pgm"), "secret").expect("written");
         std::os::unix::fs::symlink("../../secret.pgm", root.join("maps/link.pgm")).expect("linked");
         std::os::unix::fs::symlink("..", root.join("up")).expect("linked");
+        std::os::unix::fs::symlink("/dev/zero", root.join("maps/zero.pgm")).expect("linked");
+        nix::unistd::mkfifo(&root.join("maps/pipe.pgm"), nix::sys::stat::Mode::S_IRWXU).expect("a pipe");
 
         assert_eq!(names(&root, &["maps/*.pgm", "maps/a.*"]), ["maps/a.pgm", "maps/a.yaml", "maps/b.pgm"]);
         assert_eq!(names(&root, &["**/*.pgm"]), ["maps/a.pgm", "maps/b.pgm", "maps/old/c.pgm"]);
@@ -157,7 +165,8 @@ mod tests {
         assert_eq!(names(&root, &["./log.txt", "nothing/*", "maps", "up/*.pgm"]), ["log.txt"]);
         let blob = files(&root, &["log.txt".to_owned()], 100).expect("found")[0].blob;
         assert_eq!(blob, BlobRef { digest: Digest::of(b"log.txt"), size: 7 });
-        assert_eq!(hash(&root.join("log.txt"), 3).expect("read"), BlobRef { digest: Digest::of(b"log"), size: 3 });
+        let dir = Directory::open(&root).expect("opened");
+        assert_eq!(hash(&dir, Path::new("log.txt"), 3).expect("read"), BlobRef { digest: Digest::of(b"log"), size: 3 });
         assert!(matches!(files(&root, &["../*".to_owned()], 100), Err(OutputError::Pattern { .. })));
         assert!(matches!(files(&root, &["maps/*".to_owned()], 20), Err(OutputError::TooMuch(_))));
     }

@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 use std::io::{Read as _, Seek as _, SeekFrom};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -19,9 +19,9 @@ use tokio::sync::{Semaphore, watch};
 use super::{OutputError, OutputOrder};
 use crate::credential::Credential;
 use crate::fetch::MAX_RETRY_AFTER;
+use crate::foreign_file::Directory;
 use crate::registry_words::{CONTENT_DIGEST, RegistryWords};
-use crate::task_user::{self, TaskUser};
-use crate::{durable, foreign_file};
+use crate::{durable, task_user};
 
 /// Bytes sent in one request: what a bad link loses at most.
 const CHUNK_BYTES: u64 = 1024 * 1024;
@@ -108,7 +108,7 @@ pub(super) async fn push(
         registry,
         base: format!("/v2/{repository}"),
         notes: read_notes(&order.notes, output),
-        user: order.user.as_ref(),
+        order,
         notes_path: &order.notes,
         done: 0,
         progress,
@@ -129,7 +129,7 @@ pub(super) async fn push(
         listed => return listed,
     }
     for file in &output.files {
-        push.file(&order.directory.join(file.path.as_str()), file.blob).await?;
+        push.file(file.path.as_str(), file.blob).await?;
         push.done += file.blob.size;
         progress.send_modify(|progress| progress.done = push.done);
     }
@@ -145,7 +145,7 @@ pub(super) async fn push(
 struct Push<'a> {
     registry: &'a Registry,
     base: String,
-    user: Option<&'a TaskUser>,
+    order: &'a OutputOrder,
     notes: Notes,
     notes_path: &'a Path,
     /// Bytes of the files before this one.
@@ -154,14 +154,14 @@ struct Push<'a> {
 }
 
 impl Push<'_> {
-    async fn file(&mut self, path: &Path, blob: BlobRef) -> Result<(), OutputError> {
+    async fn file(&mut self, path: &str, blob: BlobRef) -> Result<(), OutputError> {
         if self.registry.has(&self.base, blob.digest).await? {
             return Ok(());
         }
         let mut beginnings = 0;
         loop {
             let sent = match blob.size <= CHUNK_BYTES {
-                true => self.small(blob.digest, read_part(self.user, path, 0, blob.size).await?).await,
+                true => self.small(blob.digest, read_part(self.order, path, 0, blob.size).await?).await,
                 false => self.large(path, blob).await,
             };
             match sent {
@@ -174,7 +174,7 @@ impl Push<'_> {
                 Err(OutputError::Refused { code, .. }) if code == OTHER_BYTES => {
                     self.note(blob.digest, None)?;
                     let source = std::io::Error::other("it was changed while it was sent");
-                    return Err(OutputError::Read { path: path.to_owned(), source });
+                    return Err(OutputError::Read { path: self.order.directory.join(path), source });
                 }
                 done => return done,
             }
@@ -188,7 +188,7 @@ impl Push<'_> {
         self.registry.store("a file", digest, post).await
     }
 
-    async fn large(&mut self, path: &Path, blob: BlobRef) -> Result<(), OutputError> {
+    async fn large(&mut self, path: &str, blob: BlobRef) -> Result<(), OutputError> {
         let (mut location, mut offset) = match self.notes.get(&blob.digest).cloned() {
             Some(location) => {
                 let get = self.registry.request(Method::GET, &location);
@@ -203,7 +203,7 @@ impl Push<'_> {
             }
         };
         while offset < blob.size {
-            let bytes = read_part(self.user, path, offset, CHUNK_BYTES.min(blob.size - offset)).await?;
+            let bytes = read_part(self.order, path, offset, CHUNK_BYTES.min(blob.size - offset)).await?;
             let last = offset + bytes.len() as u64 - 1;
             let patch = self.registry.request(Method::PATCH, &location);
             let patch = patch.header(CONTENT_RANGE, format!("{offset}-{last}")).body(bytes);
@@ -239,20 +239,18 @@ fn read_notes(path: &Path, output: &OutputSet) -> Notes {
     notes
 }
 
-async fn read_part(user: Option<&TaskUser>, path: &Path, offset: u64, length: u64) -> Result<Vec<u8>, OutputError> {
-    let path = path.to_owned();
-    let read = {
-        let path = path.clone();
-        move || {
-            let mut file = foreign_file::open(&path)?;
-            file.seek(SeekFrom::Start(offset))?;
-            let mut bytes = Vec::new();
-            file.take(length).read_to_end(&mut bytes)?;
-            if bytes.len() as u64 == length { Ok(bytes) } else { Err(std::io::Error::other("it became shorter")) }
-        }
+async fn read_part(order: &OutputOrder, path: &str, offset: u64, length: u64) -> Result<Vec<u8>, OutputError> {
+    let (root, path) = (order.directory.clone(), PathBuf::from(path));
+    let failed_at = root.join(&path);
+    let read = move || {
+        let mut file = Directory::open(&root)?.file(&path)?;
+        file.seek(SeekFrom::Start(offset))?;
+        let mut bytes = Vec::new();
+        file.take(length).read_to_end(&mut bytes)?;
+        if bytes.len() as u64 == length { Ok(bytes) } else { Err(std::io::Error::other("it became shorter")) }
     };
-    let read = task_user::do_as(user, read).await.map_err(OutputError::User)?;
-    read.map_err(|source| OutputError::Read { path, source })
+    let read = task_user::do_as(order.user.as_ref(), read).await.map_err(OutputError::User)?;
+    read.map_err(|source| OutputError::Read { path: failed_at, source })
 }
 
 /// How many bytes an upload has. A single one can't be told from none, and then it begins anew.

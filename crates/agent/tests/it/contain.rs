@@ -269,6 +269,33 @@ async fn a_task_of_the_task_user_can_reach_nothing_of_the_agents() {
     assert_eq!(unexpected, Vec::<&str>::new());
 }
 
+/// What a task may put in the place of the directory that it runs in, which it owns the way to.
+const EXCHANGES: [&str; 4] =
+    ["mkfifo src", "mkfifo pipe; ln -s pipe src", "ln -s \"$ROOTS_PIPE\" src", "ln -s /dev/watchdog src"];
+
+#[tokio::test]
+async fn shim_of_a_task_that_exchanged_its_directory_opens_nothing_and_ends() {
+    let Some(user) = other_user() else { return };
+    for exchange in EXCHANGES {
+        let mut run = TestRun::grouped(&format!("cd ..; rm -r src; {exchange}; trap 'exit 0' INT; sleep 1000 & wait"));
+        let work = run.path("work");
+        run.run_as(&user);
+        run.spec.directory = work.join("src");
+        user.make_home(&run.spec.directory).expect("made");
+        // Only root may open it, and waits for ever if it does.
+        let pipe = run.path("roots-pipe");
+        nix::unistd::mkfifo(&pipe, nix::sys::stat::Mode::S_IRWXU).expect("a pipe");
+        run.spec.environment.insert("ROOTS_PIPE".to_owned(), pipe.display().to_string());
+        run.spec.has_outputs = true;
+        let started = within("the start", run.supervisor.start(&run.run_dir(), &run.spec)).await.expect("started");
+        let kind = || std::fs::symlink_metadata(&run.spec.directory).ok();
+        let exchanged = || kind().filter(|about| !about.is_dir()).map(drop);
+        eventually("the exchange", exchanged).await;
+        assert_eq!(stop(&run).await, Observed::Exited(ExitStatus::Code(0)), "{exchange}: {}", run.log());
+        eventually("the shim to end", || (!started.shim.is_alive()).then_some(())).await;
+    }
+}
+
 #[tokio::test]
 async fn a_start_in_a_place_the_task_user_cannot_reach_says_so() {
     let Some(user) = other_user() else { return };

@@ -111,3 +111,38 @@ async fn a_file_that_changes_while_it_is_sent_is_brought_back_later() {
     assert!(matches!(&error, OutputError::Read { .. }), "{error:?}");
     assert!(error.retry_after().is_some(), "{error}");
 }
+
+#[tokio::test]
+async fn directory_exchanged_for_a_link_while_files_are_sent_is_not_followed() {
+    let left = Left::new();
+    let root = left.dir.path().to_owned();
+    std::fs::create_dir_all(root.join("run/maps")).unwrap();
+    std::fs::create_dir(root.join("secrets")).unwrap();
+    std::fs::write(root.join("run/maps/key.pgm"), "its own").unwrap();
+    std::fs::write(root.join("secrets/key.pgm"), "a secret").unwrap();
+    let order = OutputOrder { patterns: vec!["maps/*.pgm".to_owned()], ..left.order.clone() };
+    let left = Left { order, ..left };
+    let (told, mut sent) = tokio::sync::mpsc::unbounded_channel();
+    let registry = move |request: Request| {
+        let (root, told) = (root.clone(), told.clone());
+        async move {
+            let method = request.method().clone();
+            let body = to_bytes(request.into_body(), 1 << 20).await.unwrap();
+            told.send(body.clone()).unwrap();
+            match method {
+                Method::HEAD => {
+                    std::fs::rename(root.join("run/maps"), root.join("run/moved")).unwrap();
+                    std::os::unix::fs::symlink(root.join("secrets"), root.join("run/maps")).unwrap();
+                    answer(404, &[], "")
+                }
+                Method::POST => answer(201, &[("docker-content-digest", Digest::of(&body).to_string())], ""),
+                _ => refusal(404, "MANIFEST_BLOB_UNKNOWN"),
+            }
+        }
+    };
+    let error = left.bring_to(Router::new().fallback(registry)).await.unwrap_err();
+    assert!(matches!(&error, OutputError::Read { .. }), "{error:?}");
+    while let Ok(body) = sent.try_recv() {
+        assert!(!String::from_utf8_lossy(&body).contains("a secret"));
+    }
+}

@@ -1,6 +1,7 @@
 //! How often signing in with a password may fail: for an account, and from an address. An address from which an account was
-//! signed in to lately has a count of its own for that account, so that strangers can't lock its owner out. Every attempt
-//! counts as failed until it has succeeded, so many at once count as many. Memory is bounded. It never sees a password.
+//! signed in to lately has a count of its own for that account, and no other counts there: neither strangers elsewhere nor
+//! neighbours behind the same address lock its owner out. Every attempt counts as failed until it has succeeded, so many at
+//! once count as many. Memory is bounded. It never sees a password.
 
 use std::collections::HashMap;
 use std::hash::Hash;
@@ -13,7 +14,7 @@ use task_proto::UserName;
 const WINDOW_MS: u64 = 15 * 60 * 1000;
 /// Failures for one account, from all strange addresses together, or from one that is known for it.
 const MOST_FOR_ACCOUNT: u32 = 10;
-/// Failures from one address for all accounts. A whole lab may be behind one.
+/// Failures from one address, for accounts that are not known there. A whole lab may be behind one.
 const MOST_FROM_ADDRESS: u32 = 50;
 /// The most counts of each kind.
 const MOST_COUNTS: usize = 8_192;
@@ -30,6 +31,8 @@ struct Counts {
     /// Names that nobody has: answered like others, but they must not take room from those.
     nobody: Windows<UserName>,
     addresses: Windows<IpAddr>,
+    /// Those of which only the address is known. Wrong passwords don't count here, or the other way round.
+    unnamed: Windows<IpAddr>,
     pairs: Windows<(UserName, IpAddr)>,
     familiar: HashMap<(UserName, IpAddr), u64>,
 }
@@ -48,23 +51,29 @@ impl SignIns {
     pub fn begin(&self, user: &UserName, is_known: bool, address: IpAddr, now_ms: u64) -> Result<(), Blocked> {
         let address = network(address);
         let mut counts = self.lock();
-        counts.addresses.count(address, MOST_FROM_ADDRESS, now_ms)?;
         let pair = (user.clone(), address);
         if counts.familiar.contains_key(&pair) {
             return counts.pairs.count(pair, MOST_FOR_ACCOUNT, now_ms);
         }
+        counts.addresses.count(address, MOST_FROM_ADDRESS, now_ms)?;
         let accounts = if is_known { &mut counts.accounts } else { &mut counts.nobody };
         accounts.count(user.clone(), MOST_FOR_ACCOUNT, now_ms)
     }
 
     /// An attempt is about to be made of which only the address is known.
     pub fn begin_unnamed(&self, address: IpAddr, now_ms: u64) -> Result<(), Blocked> {
-        self.lock().addresses.count(network(address), MOST_FROM_ADDRESS, now_ms)
+        self.lock().unnamed.count(network(address), MOST_FROM_ADDRESS, now_ms)
     }
 
     /// That one has succeeded.
     pub fn unnamed_succeeded(&self, address: IpAddr) {
-        self.lock().addresses.take_back(&network(address));
+        self.lock().unnamed.take_back(&network(address));
+    }
+
+    /// Until when names that are not known at the address are refused there. A wrong password for one that is known there is
+    /// told the same, so that nobody learns which names are.
+    pub fn blocked_at(&self, address: IpAddr, now_ms: u64) -> Option<Blocked> {
+        self.lock().addresses.exceeded(&network(address), MOST_FROM_ADDRESS, now_ms)
     }
 
     /// The attempt that was begun has succeeded: it counts no longer, and the address is known for the account.
@@ -92,10 +101,10 @@ impl SignIns {
 
 impl Counts {
     fn take_back(&mut self, pair: &(UserName, IpAddr), is_known: bool) {
-        self.addresses.take_back(&pair.1);
         if self.familiar.contains_key(pair) {
             self.pairs.take_back(pair);
         } else {
+            self.addresses.take_back(&pair.1);
             let accounts = if is_known { &mut self.accounts } else { &mut self.nobody };
             accounts.take_back(&pair.0);
         }
@@ -139,6 +148,13 @@ impl<K: Eq + Hash> Windows<K> {
             return Ok(());
         }
         Err(Blocked { until_ms: window.began_ms + WINDOW_MS, is_news: window.count == most + 1 })
+    }
+
+    /// Until when no more is let through; `None`: more is.
+    fn exceeded(&self, key: &K, most: u32, now_ms: u64) -> Option<Blocked> {
+        let until_ms = |window: &Window| window.began_ms + WINDOW_MS;
+        let window = self.counts.get(key).filter(|window| window.count > most && now_ms < until_ms(window))?;
+        Some(Blocked { until_ms: until_ms(window), is_news: false })
     }
 
     fn take_back(&mut self, key: &K) {
@@ -204,6 +220,25 @@ mod tests {
         assert_eq!(six("2001:db8::1"), six("2001:db8::ffff:1:2"));
         assert_ne!(six("2001:db8::1"), six("2001:db8:0:1::1"));
         assert_eq!(six("::ffff:10.0.0.1"), address(1));
+    }
+
+    #[test]
+    fn account_known_at_an_address_is_not_blocked_by_its_neighbours() {
+        let sign_ins = SignIns::default();
+        let (alice, ghost) = (user("alice"), user("ghost"));
+        sign_ins.begin(&alice, true, address(1), NOW_MS).expect("allowed");
+        sign_ins.succeeded(&alice, address(1), NOW_MS);
+        assert_eq!(sign_ins.blocked_at(address(1), NOW_MS), None);
+        for n in 0..=MOST_FROM_ADDRESS {
+            let _ = sign_ins.begin(&user(&format!("user{n}")), false, address(1), NOW_MS);
+        }
+        let blocked = sign_ins.begin(&ghost, false, address(1), NOW_MS).expect_err("blocked");
+        for _ in 0..MOST_FOR_ACCOUNT {
+            sign_ins.begin(&alice, true, address(1), NOW_MS).expect("she is known there");
+        }
+        assert_eq!(sign_ins.blocked_at(address(1), NOW_MS), Some(blocked), "her failures are told like theirs");
+        assert_eq!(sign_ins.blocked_at(address(1), NOW_MS + WINDOW_MS), None);
+        sign_ins.begin_unnamed(address(1), NOW_MS).expect("the provider's sign-ins are counted apart");
     }
 
     #[test]

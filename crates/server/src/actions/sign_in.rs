@@ -133,11 +133,18 @@ impl Actions {
         if let Err(blocked) = self.sign_ins.begin(name, hash.is_some(), address, now_ms) {
             // A name that nobody has may be a password in the wrong field.
             let whose = if user.is_some() { name.as_str() } else { "nobody" };
+            // Or the time would tell which names are known at this address.
+            self.passwords.pretend().await;
             self.blocked(whose, address, blocked, now_ms).await?;
         }
         match self.passwords.verify(password, hash).await {
             Ok(true) => self.sign_ins.succeeded(name, address, now_ms),
-            Ok(false) => return Err(ActionError::SignInRefused),
+            Ok(false) => {
+                return Err(match self.sign_ins.blocked_at(address, now_ms) {
+                    Some(blocked) => too_many_failures(blocked, now_ms),
+                    None => ActionError::SignInRefused,
+                });
+            }
             Err(error) => {
                 self.sign_ins.given_up(name, hash.is_some(), address);
                 return Err(error.into());
@@ -156,8 +163,12 @@ impl Actions {
             write.audit(&deed.with("until_ms", until_ms), now_ms).await?;
             write.commit().await?;
         }
-        Err(ActionError::SignInBlocked { seconds: until_ms.saturating_sub(now_ms).div_ceil(1000) })
+        Err(too_many_failures(blocked, now_ms))
     }
+}
+
+fn too_many_failures(blocked: Blocked, now_ms: u64) -> ActionError {
+    ActionError::SignInBlocked { seconds: blocked.until_ms.saturating_sub(now_ms).div_ceil(1000) }
 }
 
 /// Stores the token of whoever has signed in, and writes down that they have.

@@ -283,9 +283,22 @@ async fn wrong_passwords_are_counted_by_account_and_by_address(database: TestDat
     }
     fleet.add("bob", "viewer", None).await;
     assert_eq!(code(fleet.sign_in("bob", PASSWORD, stranger(99)).await), "too_many_requests");
+    neighbours_of_a_failing_address(&fleet).await;
     fleet.clock.advance_ms(15 * 60 * 1000);
     fleet.sign_in("alice", PASSWORD, stranger(10)).await.expect("the time is over");
     fleet.sign_in("bob", PASSWORD, stranger(99)).await.expect("likewise");
+}
+
+/// Who is known at an address signs in there whatever its neighbours do, and is told no more than they are if they fail.
+async fn neighbours_of_a_failing_address(fleet: &Fleet) {
+    for n in 0..51 {
+        let _ = fleet.sign_in(&format!("neighbour{n}"), "wrong", HERE).await;
+    }
+    let [known, unknown] = ["alice", "ghost"].map(|name| fleet.sign_in(name, "wrong", HERE));
+    let [known, unknown] = [known.await, unknown.await].map(|refused| refused.expect_err("refused").to_string());
+    assert_eq!(known, "too many wrong passwords; try again in 900 s");
+    assert_eq!(known, unknown);
+    fleet.sign_in("alice", PASSWORD, HERE).await.expect("she is known here");
 }
 
 async fn the_last_way_in_stays_open(database: TestDatabase) {

@@ -17,7 +17,7 @@ import { showHelp } from './help.js';
 import { listen } from './live.js';
 import { complain, hide as hideNotice, noticeView } from './notice.js';
 import { at, place } from './router.js';
-import { ofLink, problemOfProvider, signInView } from './signin.js';
+import { comeBack, ofLink, problemOfProvider, RESTARTED, signInView } from './signin.js';
 import { sign } from './signs.js';
 import { DeploymentView } from './deployment.js';
 import { DeploymentsView } from './deployments.js';
@@ -61,7 +61,7 @@ const app = {
     try {
       return await act();
     } catch (error) {
-      if (error instanceof api.SignedOut) leave();
+      if (error instanceof api.SignedOut) lose();
       else complain(error.message);
       return undefined;
     }
@@ -103,10 +103,12 @@ let live = null;
 
 async function start({ token, problem } = ofLink()) {
   try {
-    const { expires_at_ms: until, provider } = await api.session();
+    const { expires_at_ms: until, provider, ended_by_restart: isRestarted } = await api.session();
     page.provider = provider;
-    if (until) enter();
-    else leave(problem && problemOfProvider(problem));
+    if (until) {
+      comeBack();
+      enter();
+    } else leave(problem ? problemOfProvider(problem) : isRestarted ? RESTARTED : null);
     if (token) offer(token);
   } catch (error) {
     change(() => (page.problem = error.message));
@@ -151,6 +153,14 @@ function leave(problem = null) {
     Object.assign(page, { state: 'signed_out', problem, isSigningIn: false });
     forget();
   });
+}
+
+/** The session has ended without anybody's doing here. Says why, where the server knows. */
+async function lose() {
+  leave();
+  const { provider, ended_by_restart: isRestarted } = await api.session().catch(() => ({}));
+  if (page.state !== 'signed_out' || page.isSigningIn) return;
+  change(() => Object.assign(page, { provider: provider ?? page.provider, problem: page.problem ?? (isRestarted ? RESTARTED : null) }));
 }
 
 /** Nothing of one person is shown to the next. */
@@ -200,7 +210,7 @@ addEventListener('hashchange', ({ oldURL }) => {
 
 function hear({ state, events, retry_at, problem }) {
   if (!live) return;
-  if (state === 'signed_out') return leave();
+  if (state === 'signed_out') return lose();
   if (state) change(() => (page.stream = { state, retry_at, problem }));
   if (state === 'open') page.hurry ? page.hurry() : refetch();
   // Without a stream there is still what the server lists.
@@ -237,7 +247,7 @@ async function refetch() {
     page.view?.refresh?.();
   } catch (error) {
     if (!isMine()) return;
-    if (error instanceof api.SignedOut) return leave();
+    if (error instanceof api.SignedOut) return lose();
     Object.assign(page, { problem: error.message, isStale: true, failures: page.failures + 1 });
   }
   refetchedAt = performance.now();

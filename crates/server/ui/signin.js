@@ -15,6 +15,18 @@ const PROVIDER_PROBLEMS = {
 
 export const problemOfProvider = (code) => PROVIDER_PROBLEMS[code] ?? PROVIDER_PROBLEMS.failed;
 
+export const RESTARTED = 'The server was restarted, which ended your session. Sign in again to go on where you were.';
+
+/** Where in the page somebody was who has gone to the provider, in this tab: it sends them back to the page's beginning. */
+const LEFT_AT = 'taskd.left-at';
+
+/** Goes on there. */
+export function comeBack() {
+  const place = sessionStorage.getItem(LEFT_AT);
+  sessionStorage.removeItem(LEFT_AT);
+  if (place && !location.hash) history.replaceState(null, '', place);
+}
+
 /** What a link says, `/#token=…` or `/#problem=…`, which then leaves the address bar and the history: `before` takes its place. */
 export function ofLink(before = location.pathname) {
   const said = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
@@ -33,7 +45,7 @@ function whoOf(event) {
 export const signInView = ({ provider, problem, token, isSigningIn }, signIn) => html`
   <main class="sign-in">
     <h1>taskd</h1>
-    ${provider ? html`<p><a class="button by-provider" href=${provider.url}>Sign in with ${provider.title}</a></p>` : nothing}
+    ${provider ? html`<p><a class="button by-provider" href=${provider.url} @click=${() => sessionStorage.setItem(LEFT_AT, location.hash)}>Sign in with ${provider.title}</a></p>` : nothing}
     <form class="by-password" @submit=${(event) => signIn(whoOf(event))}>
       <label for="user">Name</label>
       <input id="user" name="user" required ?autofocus=${!token} autocomplete="username" autocapitalize="none" spellcheck="false">

@@ -118,6 +118,9 @@ pub struct SessionView {
     /// Another way to sign in than with a password; absent: there is none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub provider: Option<ProviderView>,
+    /// The caller was signed in until the server was restarted, which ends all sessions.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub ended_by_restart: bool,
 }
 
 /// A provider by which people may sign in.

@@ -34,8 +34,18 @@ const MOST_SESSIONS: usize = 1_024;
 const MOST_OF_ONE: usize = 32;
 
 /// Who is signed in. A session is found by the SHA-256 of its id.
-#[derive(Debug, Default)]
-pub struct Sessions(Mutex<HashMap<Digest, Entry>>);
+#[derive(Debug)]
+pub struct Sessions {
+    /// What this run of the server begins every id with, so that it knows those of earlier ones.
+    run: String,
+    entries: Mutex<HashMap<Digest, Entry>>,
+}
+
+impl Default for Sessions {
+    fn default() -> Self {
+        Self { run: format!("{:016x}", rand::random::<u64>()), entries: Mutex::default() }
+    }
+}
 
 /// A session that lives: what is streamed in it ends when this is dropped.
 #[derive(Debug)]
@@ -60,7 +70,7 @@ pub struct Session {
 impl Sessions {
     /// Begins a session and gives the cookie's value.
     fn begin(&self, token: Token, user: UserName, now_ms: u64) -> String {
-        let id = format!("{:032x}{:032x}", rand::random::<u128>(), rand::random::<u128>());
+        let id = format!("{}.{:032x}{:032x}", self.run, rand::random::<u128>(), rand::random::<u128>());
         let mut sessions = self.lock();
         sessions.retain(|_, entry| entry.session.expires_at_ms > now_ms);
         let is_own = |entry: &Entry| entry.session.user == user;
@@ -82,6 +92,13 @@ impl Sessions {
         self.lock().get(&key).map(|entry| &entry.session).filter(|session| session.expires_at_ms > now_ms).cloned()
     }
 
+    /// Whether a request's cookie is that of a session that an earlier run of the server began.
+    fn is_of_earlier_run(&self, headers: &HeaderMap) -> bool {
+        let run =
+            cookie(headers, COOKIE).filter(|id| !id.is_empty()).map(|id| id.split_once('.').unwrap_or_default().0);
+        run.is_some_and(|run| run != self.run)
+    }
+
     fn end(&self, headers: &HeaderMap) {
         if let Some(id) = cookie(headers, COOKIE) {
             self.lock().remove(&Digest::of(id.as_bytes()));
@@ -89,7 +106,7 @@ impl Sessions {
     }
 
     fn lock(&self) -> MutexGuard<'_, HashMap<Digest, Entry>> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        self.entries.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -141,7 +158,8 @@ pub(super) async fn sign_in(
         _ => return Err(ApiError::invalid("user: expected a user and a password, or else a token")),
     };
     let cookie = begin_session(&app, &headers, token, user, now_ms);
-    let view = SessionView { expires_at_ms: Some(now_ms + LIFETIME_MS), provider: None };
+    let expires_at_ms = Some(now_ms + LIFETIME_MS);
+    let view = SessionView { expires_at_ms, provider: None, ended_by_restart: false };
     Ok(([(header::SET_COOKIE, cookie)], Json(view)).into_response())
 }
 
@@ -153,15 +171,18 @@ async fn known_token(app: &App, text: &str, now_ms: u64) -> Result<(Token, UserN
     }
 }
 
-/// Tells until when the caller is signed in.
+/// Tells until when the caller is signed in, or else whether they were until the server was restarted.
 #[utoipa::path(get, path = "/api/v1/session", tag = "session")]
 pub(super) async fn show(State(app): State<App>, headers: HeaderMap) -> Result<Json<SessionView>, ApiError> {
     let now_ms = app.clock.now_ms();
+    let provider = oidc::view(&app);
     let Some(session) = app.sessions.find(&headers, now_ms) else {
-        return Ok(Json(SessionView { expires_at_ms: None, provider: oidc::view(&app) }));
+        let ended_by_restart = app.sessions.is_of_earlier_run(&headers);
+        return Ok(Json(SessionView { expires_at_ms: None, provider, ended_by_restart }));
     };
     let is_good = app.store.token_holder(&session.token, now_ms).await?.is_some();
-    Ok(Json(SessionView { expires_at_ms: is_good.then_some(session.expires_at_ms), provider: oidc::view(&app) }))
+    let expires_at_ms = is_good.then_some(session.expires_at_ms);
+    Ok(Json(SessionView { expires_at_ms, provider, ended_by_restart: false }))
 }
 
 /// Signs out, the page or whoever signed in at the command line.
@@ -203,6 +224,19 @@ mod tests {
         sessions.end(&headers);
         assert!(sessions.find(&headers, 1_001).is_none());
         assert!(found.ended.is_cancelled());
+    }
+
+    #[test]
+    fn session_of_an_earlier_run_is_known_as_such() {
+        let [before, now] = [(); 2].map(|()| Sessions::default());
+        let id = before.begin(Token::random(TokenKind::Operator), user("alice"), 1_000);
+        let headers = with_cookie(format!("{COOKIE}={id}"));
+        assert!(now.is_of_earlier_run(&headers) && !before.is_of_earlier_run(&headers));
+        before.end(&headers);
+        assert!(!before.is_of_earlier_run(&headers), "it ended otherwise");
+        assert!(
+            !now.is_of_earlier_run(&HeaderMap::new()) && !now.is_of_earlier_run(&with_cookie(format!("{COOKIE}=")))
+        );
     }
 
     #[test]

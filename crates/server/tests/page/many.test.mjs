@@ -76,6 +76,30 @@ test('a wrong token is refused in words, and a restarted server is found again',
   assert.equal(await page.evaluate(() => fetch('/api/v1/robots').then(({ status }) => status)), 401);
 });
 
+test('a restart that ended the session is said, and signing in leads back to the same place', async (t) => {
+  const server = await Server.start(t);
+  await Puppet.enroll(server, 'atlas');
+  const place = '#/robots/atlas/logs?level=warn';
+  const page = await open(t, server, { hash: place });
+  await live(page);
+  const signedOut = () => page.getByRole('alert').filter({ hasText: 'The server was restarted' }).waitFor();
+  await server.process.stop();
+  await Server.start(t, { data: server.data, http: server.http });
+  await signedOut();
+  // Also to whom the page is loaded only now.
+  await page.reload();
+  await signedOut();
+  await page.getByText('With a token').click();
+  await page.locator('form.by-token input').fill(server.token);
+  await page.getByRole('button', { name: 'Sign in with it' }).click();
+  await live(page);
+  assert.equal(page.url(), `${server.url}/${place}`);
+  await page.getByRole('heading', { name: 'atlas' }).waitFor();
+  await page.getByRole('button', { name: 'Sign out' }).click();
+  await page.getByLabel('Name', { exact: true }).waitFor();
+  assert.equal(await page.getByRole('alert').innerText(), '');
+});
+
 test('a page whose stream is refused says why, and shows what there is', async (t) => {
   const server = await Server.start(t);
   await Puppet.enroll(server, 'atlas');

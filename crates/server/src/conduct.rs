@@ -13,12 +13,8 @@ use task_proto::api::ConductTotals;
 use tokio::sync::Notify;
 use tokio::time::Instant;
 
-/// What a robot may send at once after it has been quiet, as time at its rate.
-const BURST: Duration = Duration::from_secs(10);
-/// The most that it may have sent too much, likewise: beyond that a storm of connections could put its robot off for hours.
-const MAX_DEBT: Duration = Duration::from_secs(10);
-/// How long a request may be held up; one that would wait longer is refused.
-const MAX_HELD: Duration = Duration::from_secs(2);
+use crate::rate_limit::{BURST, MAX_HELD, TokenBucket};
+
 /// How often the time that a robot has to stay away doubles.
 const MAX_DOUBLINGS: u32 = 6;
 /// How many more requests a robot may make for what it brings back: a run has up to 256 files, each of which takes some.
@@ -124,19 +120,11 @@ struct Record {
 /// What a robot may still send on one way.
 #[derive(Debug)]
 struct Allowance {
-    messages: Bucket,
-    bytes: Option<Bucket>,
+    messages: TokenBucket,
+    bytes: Option<TokenBucket>,
     /// Since when it is slowed, with no rest in between that would have filled half of what it may send at once.
     slowed_since: Option<Instant>,
     barred_until: Option<Instant>,
-}
-
-/// One limit. `next_at` is when the next one would be due if they came evenly; a quiet robot has it in the past.
-#[derive(Debug)]
-struct Bucket {
-    /// How long one takes at the rate.
-    each_ns: f64,
-    next_at: Instant,
 }
 
 /// What was seen of a robot that misbehaves.
@@ -148,24 +136,6 @@ struct Trouble {
     /// For how long the last time; zero: it was only slowed.
     away: Duration,
     last_at: Instant,
-}
-
-impl Bucket {
-    fn new(per_s: u64, now: Instant) -> Self {
-        Self { each_ns: 1e9 / per_s.max(1) as f64, next_at: now.checked_sub(BURST).unwrap_or(now) }
-    }
-
-    /// Counts `number` more, and says until when that takes.
-    fn take(&mut self, number: u64, now: Instant) -> Instant {
-        let at = self.next_at.max(now.checked_sub(BURST).unwrap_or(now));
-        self.next_at = (at + self.time_of(number)).min(now + MAX_DEBT);
-        self.next_at
-    }
-
-    fn time_of(&self, number: u64) -> Duration {
-        // What is cut off beyond 2^64 is more than any limit.
-        Duration::from_nanos((number as f64 * self.each_ns) as u64)
-    }
 }
 
 impl Allowance {
@@ -183,9 +153,9 @@ impl Allowance {
     }
 
     fn is_at_rest(&self, now: Instant) -> bool {
-        let full = |bucket: &Bucket| bucket.next_at + BURST <= now;
-        full(&self.messages)
-            && self.bytes.as_ref().is_none_or(full)
+        let has_rested = |bucket: &TokenBucket| bucket.has_rested(now);
+        has_rested(&self.messages)
+            && self.bytes.as_ref().is_none_or(has_rested)
             && self.barred_until.is_none_or(|until| until <= now)
     }
 }
@@ -193,8 +163,8 @@ impl Allowance {
 impl Record {
     fn new(limits: &ConductLimits, now: Instant) -> Self {
         let allowance = |per_s, bytes_per_s: Option<u64>| Allowance {
-            messages: Bucket::new(per_s, now),
-            bytes: bytes_per_s.map(|per_s| Bucket::new(per_s, now)),
+            messages: TokenBucket::new(per_s, now),
+            bytes: bytes_per_s.map(|per_s| TokenBucket::new(per_s, now)),
             slowed_since: None,
             barred_until: None,
         };
@@ -351,8 +321,7 @@ impl Watched {
             Verdict::Slow(until) if until > now + MAX_HELD => {
                 // It is not served, so it does not count: however many it sends at once, its next turn stays in sight.
                 let mut record = lock(&self.record);
-                let bucket = &mut record.on(self.way).messages;
-                bucket.next_at -= bucket.time_of(1);
+                record.on(self.way).messages.give_back(1);
                 drop(record);
                 self.conduct.turned_away.fetch_add(1, Ordering::Relaxed);
                 Verdict::Cut(until)

@@ -20,7 +20,7 @@ use task_proto::topic::TopicPrefix;
 
 pub use self::oidc::{OidcSettings, RoleRule, private_url};
 use self::settings::{SETTINGS, Setting};
-pub use self::tables::{SiteLimits, TransferLimits};
+pub use self::tables::{PersonRates, SiteLimits, TransferLimits};
 pub use self::tls::TlsSettings;
 use crate::broker_url::BrokerUrl;
 use crate::conduct::ConductLimits;
@@ -84,6 +84,8 @@ pub struct Config {
     pub transfers: TransferLimits,
     /// What a robot may send.
     pub robots: ConductLimits,
+    /// What a person may ask for.
+    pub people: PersonRates,
     /// Whether every new robot waits to be approved.
     pub enrolment_approval: bool,
     /// How many robots an enrolment token is good for whose maker does not say.
@@ -290,6 +292,7 @@ impl Config {
             delivery: DeliverySettings::default(),
             transfers: TransferLimits::default(),
             robots: ConductLimits::default(),
+            people: PersonRates::default(),
             enrolment_approval: false,
             enrolment_uses: 100,
             enrolment_per_minute: 3_000,

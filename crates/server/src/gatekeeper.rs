@@ -13,23 +13,29 @@ use task_proto::token::Token;
 use crate::broker::{Gatekeeper, Login, Principal, Refusal};
 use crate::changes::{Change, Changes};
 use crate::clock::Clock;
+use crate::http_connections::HttpConnections;
 use crate::presence::Presence;
 use crate::store::{Admitted, Store, StoreError, TokenHolder};
-use crate::visits::Visits;
 
 /// Answers by the tokens in the database.
 pub struct StoreGatekeeper {
     store: Store,
     clock: Clock,
     presence: Arc<Presence>,
-    visits: Arc<Visits>,
+    http_connections: Arc<HttpConnections>,
     changes: Changes,
 }
 
 impl StoreGatekeeper {
     /// One that asks this database, and tells the rest when a robot goes over to a new token.
-    pub fn new(store: Store, clock: Clock, presence: Arc<Presence>, visits: Arc<Visits>, changes: Changes) -> Self {
-        Self { store, clock, presence, visits, changes }
+    pub fn new(
+        store: Store,
+        clock: Clock,
+        presence: Arc<Presence>,
+        http_connections: Arc<HttpConnections>,
+        changes: Changes,
+    ) -> Self {
+        Self { store, clock, presence, http_connections, changes }
     }
 
     async fn decide(&self, login: Login) -> Result<Principal, Refusal> {
@@ -47,7 +53,7 @@ impl StoreGatekeeper {
         match holder {
             TokenHolder::Robot { robot, token_number, .. } => {
                 if is_first_use {
-                    ended_others(&self.presence, &self.visits, &self.changes, &robot);
+                    ended_others(&self.presence, &self.http_connections, &self.changes, &robot);
                 }
                 Ok(Principal::Robot { robot, token_number, is_first_use })
             }
@@ -70,9 +76,9 @@ impl Gatekeeper for StoreGatekeeper {
 
 /// The robot has used a token for the first time, which ended its others: its connections over HTTP are cut, nobody displaces
 /// it any more, and it is told of its state. Its MQTT session is the broker's to end.
-pub fn ended_others(presence: &Presence, visits: &Visits, changes: &Changes, robot: &RobotId) {
+pub fn ended_others(presence: &Presence, http_connections: &HttpConnections, changes: &Changes, robot: &RobotId) {
     presence.ended_others(robot);
-    visits.end(robot);
+    http_connections.end(robot);
     changes.announce(Change::Robot(robot.clone()));
     changes.ring([robot.clone()]);
 }

@@ -33,9 +33,11 @@ use crate::feed::{Feed, FeedSource};
 use crate::gatekeeper::StoreGatekeeper;
 use crate::happening::Happening;
 use crate::http::events::{EventFeed, EventSource};
+use crate::http::person_limits::PersonLimits;
 use crate::http::traffic::HttpTotals;
 use crate::http::upload::UploadSpace;
 use crate::http::{App, AppParts, listener};
+use crate::http_connections::HttpConnections;
 use crate::mqtt_access::MqttAccess;
 use crate::oidc::{OidcSetUpError, Provider};
 use crate::presence::Presence;
@@ -49,7 +51,6 @@ use crate::store::{Store, StoreError, sqlite_url};
 use crate::tls::{Tls, TlsError};
 use crate::transfers::Transfers;
 use crate::uplink::Uplink;
-use crate::visits::Visits;
 
 /// How long requests under way may take to end; the whole stop is to take less than ten seconds.
 const REQUEST_PATIENCE: Duration = Duration::from_secs(5);
@@ -139,7 +140,7 @@ impl Server {
 
         let presence = Arc::new(Presence::new(milliseconds(config.presence_timeout), clock.now_ms()));
         let changes = Changes::new();
-        let (load, visits) = (Arc::<ServerLoad>::default(), Arc::<Visits>::default());
+        let (load, http_connections) = (Arc::<ServerLoad>::default(), Arc::<HttpConnections>::default());
         let chooser = Chooser::new(&config.delivery, presence.clone(), load.clone());
         let settings = action_settings(&config, tls.as_ref());
         let actions = Actions::new(store.clone(), clock.clone(), changes.clone(), key, settings, chooser.clone());
@@ -147,7 +148,8 @@ impl Server {
         let (requests, logs, vitals) = (Requests::default(), RobotLogs::new(), RobotVitals::default());
         let (heard, said, done, told) = (requests.clone(), logs.clone(), vitals.clone(), changes.clone());
         let uplink = Uplink::new(writer.clone(), heard, said, done, presence.clone(), changes.clone(), clock.clone());
-        let gatekeeper = StoreGatekeeper::new(store.clone(), clock.clone(), presence.clone(), visits.clone(), told);
+        let gatekeeper =
+            StoreGatekeeper::new(store.clone(), clock.clone(), presence.clone(), http_connections.clone(), told);
         let conduct = Conduct::new(config.robots);
         let broker = broker_config(&config, tls.clone(), conduct.clone());
         let (broker, mqtt) =
@@ -174,7 +176,7 @@ impl Server {
             transfers,
             uploads: UploadSpace::new(data.fresh_directory("incoming")?, config.max_upload_bytes),
             sessions: Arc::default(),
-            visits,
+            http_connections: http_connections.clone(),
             conduct,
             provider,
             attempts: Arc::default(),
@@ -186,6 +188,7 @@ impl Server {
             mqtt: Arc::new(mqtt),
             trusted_proxies: config.trusted_proxies.clone().into(),
             http_traffic: http_traffic.clone(),
+            people: Arc::new(PersonLimits::new(config.people)),
             data: data.path().to_owned(),
             readiness: Readiness::default(),
             stop: stop.clone(),
@@ -196,9 +199,13 @@ impl Server {
             tasks.spawn(tls.keep_current(stop.clone()));
         }
         tasks.spawn(watch_load(app.clone(), load));
-        let router = crate::http::router(app);
-        let limits = http_limits(&config);
-        let http = listener::serve(http, router, tls.clone(), limits, http_traffic, stop.clone(), REQUEST_PATIENCE);
+        let service = listener::Service {
+            router: crate::http::router(app),
+            tls: tls.clone(),
+            connections: http_connections,
+            traffic: http_traffic,
+        };
+        let http = listener::serve(http, service, http_limits(&config), stop.clone(), REQUEST_PATIENCE);
         let mqtt_address = broker.local_addr().map(|bound| reachable(bound).to_string());
         let addresses = Addresses {
             http: reachable(http_address).to_string(),

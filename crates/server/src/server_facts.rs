@@ -50,6 +50,7 @@ fn limits(config: &Config, blobs: BlobSettings) -> Vec<LimitView> {
         limit("max_blob_bytes", shown_bytes(blobs.max_blob_bytes)),
         limit("max_http_connections", config.max_http_connections.to_string()),
         limit("max_mqtt_connections", config.max_mqtt_connections.to_string()),
+        limit("people.requests_per_s", config.people.requests_per_s.to_string()),
         limit("presence_timeout", seconds(config.presence_timeout)),
         limit("robots.bytes_per_s", speed(Some(robots.bytes_per_s))),
         limit("robots.messages_per_s", robots.messages_per_s.to_string()),

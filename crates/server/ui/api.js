@@ -15,15 +15,29 @@ class Refused extends Error {
   }
 }
 
+/** How often a request is sent that the server has no time for, and what it may ask to be waited in between. */
+const TRIES = 4;
+const LONGEST_WAIT_S = 15;
+
+/** Sends a request, again where the server says soon when: it has done nothing of it. Nobody waits for a sign-in that is refused for long. */
+async function send(url, options) {
+  for (let tried = 1; ; tried += 1) {
+    const response = await fetch(url, { ...options, signal: AbortSignal.timeout(PATIENCE_MS) });
+    const wait = Number(response.headers.get('retry-after') ?? Infinity);
+    if (response.status !== 429 || tried >= TRIES || !(wait <= LONGEST_WAIT_S)) return response;
+    // Not all at once, where many wait.
+    await new Promise((resume) => setTimeout(resume, (wait + Math.random()) * 1000));
+  }
+}
+
 /** Asks the server; answers the parsed body. Throws `SignedOut` on 401 and `Refused` on the rest. */
 async function ask(method, path, { body, query = {}, headers = {}, revive } = {}) {
   const given = Object.entries(query).filter(([, value]) => value !== undefined && value !== null && value !== '');
   const search = given.length ? `?${new URLSearchParams(given)}` : '';
-  const response = await fetch(BASE + path + search, {
+  const response = await send(BASE + path + search, {
     method,
     headers: body ? { 'content-type': 'application/json', ...headers } : headers,
     body: body && JSON.stringify(body),
-    signal: AbortSignal.timeout(PATIENCE_MS),
   });
   if (response.ok) return response.status === 204 ? null : JSON.parse(await response.text(), revive);
   const said = await response.json().catch(() => null);

@@ -26,6 +26,8 @@ use crate::data_directory::{Addresses, OPERATOR_TOKEN, is_locked};
 const TRIES: u32 = 6;
 /// The longest pause between two tries.
 const MAX_PAUSE: Duration = Duration::from_secs(2);
+/// Nobody waits at a terminal for longer because the server asks for it: the refusal is shown.
+const MAX_RETRY_AFTER: Duration = Duration::from_secs(15);
 /// How long one answer may take, uploads excepted.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(60);
 /// The largest answer that is read: the list of a large fleet.
@@ -343,6 +345,8 @@ impl Client {
                 Ok(response) if response.status().is_success() => return Ok(response),
                 Ok(response) => {
                     let (status, wait) = (response.status(), retry_after(&response));
+                    // A server in trouble may be back sooner than it thinks; one that refuses knows when it does not.
+                    let wait = if status.is_server_error() { wait.map(|wait| wait.min(MAX_PAUSE)) } else { wait };
                     let error = self.refusal(response).await;
                     if !(status.is_server_error() || status == StatusCode::TOO_MANY_REQUESTS) {
                         return Err(error);
@@ -352,7 +356,7 @@ impl Client {
                 Err(source) if source.is_builder() => return Err(self.unreachable(source)),
                 Err(source) => (self.unreachable(source), None),
             };
-            if tried >= TRIES {
+            if tried >= TRIES || wait.is_some_and(|wait| wait > MAX_RETRY_AFTER) {
                 return Err(error);
             }
             tokio::time::sleep(wait.unwrap_or_else(|| pause(tried, rand::random()))).await;
@@ -437,7 +441,7 @@ fn pause(tried: u32, random: u32) -> Duration {
 
 fn retry_after(response: &Response) -> Option<Duration> {
     let seconds: u64 = response.headers().get(RETRY_AFTER)?.to_str().ok()?.parse().ok()?;
-    Some(Duration::from_secs(seconds).min(MAX_PAUSE))
+    Some(Duration::from_secs(seconds))
 }
 
 /// URL and pin of the server that serves from the directory, as it wrote them into there. What one wrote that was killed

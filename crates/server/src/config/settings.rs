@@ -376,6 +376,13 @@ pub(super) const SETTINGS: &[Setting] = &[
         set: |config, text| size_within(text, 64 << 20, 1 << 50).map(|bytes| config.max_robot_bytes = Some(bytes)),
     },
     Setting {
+        name: "people-requests-per-s",
+        value_name: "N",
+        help: "Requests a second of one person, beyond which they wait or get 429; ten seconds' worth may come at once, orders \
+               are counted apart [default: 200]",
+        set: |config, text| count(text, 1_000_000).map(|n| config.people.requests_per_s = n),
+    },
+    Setting {
         name: "robots-patience",
         value_name: "TIME",
         help: "How long a robot is slowed before it is cut off [default: 30s]",

@@ -1,5 +1,5 @@
 //! The tables of the configuration file: `[delivery]` with the operator's rules, `[transfers]` with the limits of each
-//! site, `[robots]` with what one may send, `[oidc]`, `[tls]`. What has one value is a setting like any other; the rest is read
+//! site, `[robots]` and `[people]` with what one may send, `[oidc]`, `[tls]`. What has one value is a setting like any other; the rest is read
 //! here. Every error names the key it is about.
 
 use std::collections::BTreeMap;
@@ -26,6 +26,19 @@ pub struct TransferLimits {
     pub all: SiteLimits,
     /// Of the robots on one site, by the value of [`super::DeliverySettings::site_label`].
     pub sites: BTreeMap<LabelValue, SiteLimits>,
+}
+
+/// `[people]`: what a person may ask for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PersonRates {
+    /// Requests a second, for long; ten seconds' worth may come at once. Orders have as many again.
+    pub requests_per_s: u64,
+}
+
+impl Default for PersonRates {
+    fn default() -> Self {
+        Self { requests_per_s: 200 }
+    }
 }
 
 /// What some robots may take together; `None`: as much as there is.
@@ -56,7 +69,7 @@ pub(super) struct Wrong {
 
 /// Whether the file may have a table of this name.
 pub(super) fn is_known(name: &str) -> bool {
-    matches!(name, "delivery" | "enrolment" | "oidc" | "robots" | "tls" | "transfers")
+    matches!(name, "delivery" | "enrolment" | "oidc" | "people" | "robots" | "tls" | "transfers")
 }
 
 impl Config {

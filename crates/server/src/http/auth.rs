@@ -13,21 +13,23 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use futures_util::{StreamExt as _, stream};
 use http::request::Parts;
-use http::{HeaderMap, HeaderValue, Method, StatusCode, header};
-use task_proto::RobotId;
+use http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, header};
+use http_body::Body as _;
 use task_proto::person::Permission;
 use task_proto::token::Token;
+use task_proto::{RobotId, UserName};
 use tokio::time::{Instant, timeout_at};
 
 use super::App;
 use super::conduct::hold_up;
 use super::error::{ApiError, ROBOT_REVOKED};
+use super::person_limits::{RequestKind, UnderWay};
 use crate::conduct::Way;
 use crate::gatekeeper::ended_others;
+use crate::http_connections::{Connection, Holder};
 use crate::person::Person;
-use crate::store::{Admitted, StoreError, TokenHolder};
+use crate::store::{Admitted, StoreError, TokenHolder, with_shared_reads};
 use crate::tls::ClientProof;
-use crate::visits::Line;
 
 /// Who may call a route.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -78,6 +80,16 @@ impl Caller {
         }
     }
 
+    /// For whom the connection of such a request counts; `None`: for nobody known.
+    fn holder(&self) -> Option<Holder> {
+        match self {
+            Self::Anyone => None,
+            Self::Person(person) => Some(Holder::Person(person.name.clone())),
+            Self::Robot(robot) => Some(Holder::Robot(robot.clone())),
+            Self::Enrolment(token) => Some(Holder::Enrolment(token.id())),
+        }
+    }
+
     fn may(&self, access: Access, own: Option<&str>) -> bool {
         match access {
             Access::Anyone => true,
@@ -115,6 +127,7 @@ pub(super) struct Gate {
     pub(super) app: App,
     pub(super) access: Access,
     pub(super) deadline: Option<Duration>,
+    pub(super) waits_for_robot: bool,
 }
 
 /// Stands before every handler: finds the caller, refuses whoever may not, and ends what takes too long.
@@ -129,29 +142,61 @@ pub(super) async fn guard(
     // A path that is no text names nobody; the handler says that there is no such thing.
     let own = params.iter().flatten().find(|(name, _)| *name == "robot").map(|(_, value)| value);
     let proof = request.extensions().get::<ClientProof>().cloned().unwrap_or_default();
-    match admit(&gate, peer, own, Showing::of(&request, &proof)).await {
-        Ok((mut caller, token_number)) => {
-            if let Caller::Person(person) = &mut caller {
-                person.address = Some(peer.ip().to_canonical());
-            }
-            if let Caller::Robot(robot) = &caller
-                && let Some(way) = way_of(gate.access, request.method())
-                && let Err(error) = hold_up(&gate.app, robot, way, request.method()).await
-            {
-                return if is_oci { error.into_oci_response() } else { error.into_response() };
-            }
-            request.extensions_mut().insert(caller);
-            request.extensions_mut().insert(token_number);
-        }
+    let begun = match admit(&gate, peer, own, Showing::of(&request, &proof)).await {
+        Ok((caller, token_number)) => begin(&gate, caller, request.method()).await.map(|begun| (begun, token_number)),
+        Err(error) => Err(error),
+    };
+    let (Begun { mut caller, counted }, token_number) = match begun {
+        Ok(begun) => begun,
         Err(error) if is_oci => return error.into_oci_response(),
         Err(error) => return error.into_response(),
+    };
+    if let Caller::Person(person) = &mut caller {
+        person.address = Some(peer.ip().to_canonical());
     }
-    let answer = answered(request, next, gate.deadline);
+    request.extensions_mut().insert(caller);
+    request.extensions_mut().insert(token_number);
+    let answer = answered(request, next, gate.deadline, counted.map(|counted| (gate.app.clone(), counted)));
     let Some(deadline) = gate.deadline else { return answer.await };
     tokio::time::timeout(deadline, answer).await.unwrap_or_else(|_| {
         let message = "the request took too long to arrive or to be answered";
         ApiError::new(StatusCode::REQUEST_TIMEOUT, "timeout", message).into_response()
     })
+}
+
+/// A request whose turn it is.
+struct Begun {
+    caller: Caller,
+    counted: Option<Counted>,
+}
+
+/// A person's request, while it counts as under way.
+struct Counted {
+    person: UserName,
+    kind: RequestKind,
+    under_way: UnderWay,
+}
+
+/// Holds up or refuses a caller that sends too much.
+async fn begin(gate: &Gate, caller: Caller, method: &Method) -> Result<Begun, ApiError> {
+    let counted = match &caller {
+        Caller::Person(person) => {
+            let kind = match gate.waits_for_robot {
+                true => RequestKind::Question,
+                false => RequestKind::of(gate.access, method, gate.deadline.is_none()),
+            };
+            let under_way = gate.app.people.begin(&person.name, kind).await?;
+            Some(Counted { person: person.name.clone(), kind, under_way })
+        }
+        Caller::Robot(robot) => {
+            if let Some(way) = way_of(gate.access, method) {
+                hold_up(&gate.app, robot, way, method).await?;
+            }
+            None
+        }
+        Caller::Anyone | Caller::Enrolment(_) => None,
+    };
+    Ok(Begun { caller, counted })
 }
 
 /// By which way a robot that asks for this comes; none if it pulls a package's bytes, which has limits of its own.
@@ -165,18 +210,37 @@ fn way_of(access: Access, method: &Method) -> Option<Way> {
 
 /// The handler's answer. What changes something goes on to its end even if nobody waits for it any more: what is done after a
 /// commit, like cutting off whoever has lost their rights, belongs to it. Only its body has to have come by then.
-async fn answered(request: Request, next: Next, deadline: Option<Duration>) -> Response {
+async fn answered(
+    request: Request,
+    next: Next,
+    deadline: Option<Duration>,
+    counted: Option<(App, Counted)>,
+) -> Response {
     if request.method().is_safe() {
-        return next.run(request).await;
+        return run(request, next, counted).await;
     }
     let request = match deadline {
         Some(deadline) => request.map(|body| arriving_within(deadline, body)),
         None => request,
     };
-    match tokio::spawn(next.run(request)).await {
+    match tokio::spawn(run(request, next, counted)).await {
         Ok(response) => response,
         Err(panic) => std::panic::resume_unwind(panic.into_panic()),
     }
+}
+
+/// Runs the handler. What people only ask for leaves some of the database's connections to robots and orders.
+async fn run(request: Request, next: Next, counted: Option<(App, Counted)>) -> Response {
+    let Some((app, Counted { person, kind, under_way })) = counted else { return next.run(request).await };
+    let response = match kind {
+        RequestKind::Order => next.run(request).await,
+        _ => with_shared_reads(next.run(request)).await,
+    };
+    if kind != RequestKind::Stream {
+        app.people.answered(&person, kind, response.body().size_hint().lower());
+    }
+    drop(under_way);
+    response
 }
 
 /// A body that breaks off where it takes longer.
@@ -195,12 +259,12 @@ struct Showing<'a> {
     method: &'a Method,
     headers: &'a HeaderMap,
     proof: &'a ClientProof,
-    line: Option<&'a Line>,
+    connection: Option<&'a Connection>,
 }
 
 impl<'a> Showing<'a> {
     fn of(request: &'a Request, proof: &'a ClientProof) -> Self {
-        Self { method: request.method(), headers: request.headers(), proof, line: request.extensions().get() }
+        Self { method: request.method(), headers: request.headers(), proof, connection: request.extensions().get() }
     }
 }
 
@@ -213,7 +277,7 @@ async fn admit(
     if gate.access == Access::Anyone {
         return Ok((Caller::Anyone, TokenNumber(0)));
     }
-    match identify_on_line(&gate.app, &showing).await {
+    match identify_on_connection(&gate.app, &showing).await {
         Ok((caller, token_number)) if caller.may(gate.access, own) => Ok((caller, token_number)),
         Ok((Caller::Anyone, _)) => Err(ApiError::unauthorized("a token is needed: Authorization: Bearer …")),
         Ok((Caller::Person(person), _)) if let Access::Person(permission) = gate.access => {
@@ -240,26 +304,31 @@ pub(super) fn not_permitted(person: &Person, permission: Permission) -> ApiError
     })
 }
 
-/// Who calls. If it is a robot, its connection is cut when it is put out.
-async fn identify_on_line(app: &App, showing: &Showing<'_>) -> Result<(Caller, TokenNumber), ApiError> {
-    let arrival = app.visits.arrival();
+/// Who calls. From now on the connection counts for them, and if it is a robot, it is cut when the robot is put out. What
+/// comes without a token changes nothing: a connection stays with the last one that was shown on it.
+async fn identify_on_connection(app: &App, showing: &Showing<'_>) -> Result<(Caller, TokenNumber), ApiError> {
+    let arrival = app.http_connections.arrival();
     let identified = identify(app, showing).await?;
-    let Some(line) = showing.line else { return Ok(identified) };
-    let (Caller::Robot(robot), _) = &identified else {
-        line.leave();
-        return Ok(identified);
-    };
-    if arrival.enter(robot, line) { Ok(identified) } else { identify(app, showing).await }
+    let (Some(connection), Some(holder)) = (showing.connection, identified.0.holder()) else { return Ok(identified) };
+    let is_still_good = arrival.identified(&holder, connection);
+    if is_still_good || !matches!(holder, Holder::Robot(_)) { Ok(identified) } else { identify(app, showing).await }
 }
 
 /// Who sent this request. `Anyone` if it does not say; an error if it says it wrongly.
 async fn identify(app: &App, showing: &Showing<'_>) -> Result<(Caller, TokenNumber), ApiError> {
     let &Showing { method, headers, .. } = showing;
     let now_ms = app.clock.now_ms();
+    let is_read = matches!(*method, Method::GET | Method::HEAD);
     let token = if let Some(value) = headers.get(header::AUTHORIZATION) {
-        token_of(value)?
+        let Presented { text, is_from_browser } = presented(value)?;
+        // Browsers keep a password for a site and send it along with whatever another page makes them send. Programs send no
+        // origin.
+        if is_from_browser && !is_read && comes_from_page(headers) {
+            require_same_origin(headers)?;
+        }
+        parsed(&text)?
     } else if let Some(session) = app.sessions.find(headers, now_ms) {
-        if !matches!(*method, Method::GET | Method::HEAD) {
+        if !is_read {
             require_same_origin(headers)?;
         }
         session.token
@@ -288,23 +357,24 @@ async fn let_in(
     showing: &Showing<'_>,
     now_ms: u64,
 ) -> Result<Option<TokenHolder>, StoreError> {
-    let (app, token, proof, line) = (app.clone(), token.clone(), showing.proof.clone(), showing.line.cloned());
+    let (app, token, proof) = (app.clone(), token.clone(), showing.proof.clone());
+    let connection = showing.connection.cloned();
     let admitting = tokio::spawn(async move {
         let Some(Admitted { holder, is_first_use }) = app.store.admit(&token, &proof, now_ms).await? else {
             return Ok(None);
         };
-        if let Some(line) = line.as_ref().filter(|_| !matches!(holder, TokenHolder::Pending { .. })) {
-            line.vouch();
+        if let Some(connection) = connection.as_ref().filter(|_| !matches!(holder, TokenHolder::Pending { .. })) {
+            connection.authenticate();
         }
         if let TokenHolder::Robot { robot, .. } = &holder
             && is_first_use
         {
             // Whoever is connected came in by the token that has just ended; this request's own connection stays.
             app.broker.disconnect(robot);
-            if let Some(line) = line {
-                line.leave();
+            if let Some(connection) = connection {
+                connection.release();
             }
-            ended_others(&app.presence, &app.visits, &app.changes, robot);
+            ended_others(&app.presence, &app.http_connections, &app.changes, robot);
         }
         Ok(Some(holder))
     });
@@ -317,37 +387,57 @@ async fn let_in(
 /// The token that these headers show.
 pub(super) fn shown_token(headers: &HeaderMap) -> Result<Token, ApiError> {
     let value = headers.get(header::AUTHORIZATION);
-    token_of(value.ok_or_else(|| ApiError::unauthorized("Authorization: it is missing"))?)
+    let value = value.ok_or_else(|| ApiError::unauthorized("Authorization: it is missing"))?;
+    parsed(&presented(value)?.text)
 }
 
-fn token_of(value: &HeaderValue) -> Result<Token, ApiError> {
-    let text = value.to_str().ok().and_then(presented_token);
-    let text = text.ok_or_else(|| ApiError::unauthorized("Authorization: expected Bearer or Basic and a token"))?;
-    text.parse().map_err(|error| ApiError::unauthorized(format!("Authorization: {error}")))
+fn parsed(token: &str) -> Result<Token, ApiError> {
+    token.parse().map_err(|error| ApiError::unauthorized(format!("Authorization: {error}")))
+}
+
+/// The token in an `Authorization` header.
+#[derive(Debug, PartialEq, Eq)]
+struct Presented {
+    text: String,
+    /// It came as a password (`Basic`), which a browser adds by itself once it knows one.
+    is_from_browser: bool,
+}
+
+fn presented(value: &HeaderValue) -> Result<Presented, ApiError> {
+    let presented = value.to_str().ok().and_then(presented_token);
+    presented.ok_or_else(|| ApiError::unauthorized("Authorization: expected Bearer or Basic and a token"))
 }
 
 /// The token of `Bearer TOKEN` or `Basic base64(anything:TOKEN)`.
-fn presented_token(value: &str) -> Option<String> {
+fn presented_token(value: &str) -> Option<Presented> {
     let (scheme, rest) = value.trim().split_once(' ')?;
     if scheme.eq_ignore_ascii_case("bearer") {
-        return Some(rest.trim().to_owned());
+        return Some(Presented { text: rest.trim().to_owned(), is_from_browser: false });
     }
     if !scheme.eq_ignore_ascii_case("basic") {
         return None;
     }
     let decoded = String::from_utf8(STANDARD.decode(rest.trim()).ok()?).ok()?;
-    decoded.split_once(':').map(|(_, password)| password.to_owned())
+    let (_, password) = decoded.split_once(':')?;
+    Some(Presented { text: password.to_owned(), is_from_browser: true })
+}
+
+const SEC_FETCH_SITE: HeaderName = HeaderName::from_static("sec-fetch-site");
+
+/// Whether a browser sent this for a page.
+fn comes_from_page(headers: &HeaderMap) -> bool {
+    headers.contains_key(SEC_FETCH_SITE) || headers.contains_key(header::ORIGIN)
 }
 
 /// Refuses what a foreign page could have made a signed-in browser send.
 pub(super) fn require_same_origin(headers: &HeaderMap) -> Result<(), ApiError> {
     let text = |name| headers.get(name).and_then(|value: &http::HeaderValue| value.to_str().ok());
-    let is_same = match (text(http::HeaderName::from_static("sec-fetch-site")), text(header::ORIGIN)) {
+    let is_same = match (text(SEC_FETCH_SITE), text(header::ORIGIN)) {
         (Some(site), _) => site == "same-origin",
         (None, Some(origin)) => origin.split_once("://").map(|(_, host)| host) == text(header::HOST),
         (None, None) => false,
     };
-    if is_same { Ok(()) } else { Err(ApiError::forbidden("Origin: a signed-in page may only call its own server")) }
+    if is_same { Ok(()) } else { Err(ApiError::forbidden("Origin: a page may only call its own server")) }
 }
 
 #[cfg(test)]
@@ -356,10 +446,11 @@ mod tests {
 
     #[test]
     fn tokens_come_as_bearer_or_as_a_password() {
-        assert_eq!(presented_token("Bearer abc").as_deref(), Some("abc"));
-        assert_eq!(presented_token("bearer  abc ").as_deref(), Some("abc"));
+        let token = |text: &str, is_from_browser| Some(Presented { text: text.to_owned(), is_from_browser });
+        assert_eq!(presented_token("Bearer abc"), token("abc", false));
+        assert_eq!(presented_token("bearer  abc "), token("abc", false));
         let basic = format!("Basic {}", STANDARD.encode("anyone:a:b"));
-        assert_eq!(presented_token(&basic).as_deref(), Some("a:b"));
+        assert_eq!(presented_token(&basic), token("a:b", true));
         for bad in ["", "Bearer", "Basic !", "Digest abc", &format!("Basic {}", STANDARD.encode("abc"))] {
             assert_eq!(presented_token(bad), None, "{bad:?}");
         }

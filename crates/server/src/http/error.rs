@@ -191,7 +191,11 @@ impl From<ActionError> for ApiError {
             | ActionError::LastAdministrator(_)
             | ActionError::Diverged(_) => StatusCode::CONFLICT,
         };
-        Self::new(status, error.code(), error.to_string())
+        let retry_after_s = match &error {
+            ActionError::SignInBlocked { seconds } => *seconds,
+            _ => RETRY_AFTER_S,
+        };
+        Self { retry_after_s, ..Self::new(status, error.code(), error.to_string()) }
     }
 }
 

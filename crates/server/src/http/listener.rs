@@ -29,8 +29,8 @@ use tower::ServiceExt as _;
 
 use super::traffic::HttpTotals;
 use crate::anteroom::{Anteroom, Place};
+use crate::http_connections::{Connection, HttpConnections};
 use crate::tls::{ClientProof, Tls};
-use crate::visits::Line;
 
 /// How long a connection on which no good token was shown is left when its place is needed: enough to sign in, or to get a page.
 const GRACE: Duration = Duration::from_secs(3);
@@ -38,18 +38,24 @@ const GRACE: Duration = Duration::from_secs(3);
 const HEAD_TIMEOUT: Duration = Duration::from_secs(20);
 /// How long a client may pause within a body it sends.
 const BODY_PAUSE: Duration = Duration::from_secs(30);
+/// What has to come of a body in each [`BODY_PAUSE`] that it is waited for, less than the slowest of links brings.
+const LEAST_BODY_BYTES: usize = 16 * 1024;
 /// How long a client may leave our bytes unread.
 const WRITE_PAUSE: Duration = Duration::from_secs(60);
 /// A request's head may be no larger.
 const MOST_HEAD_BYTES: usize = 64 * 1024;
+/// This share of all connections, one in so many, is kept free of holders that have more than theirs.
+const RESERVED_SHARE: usize = 16;
+/// How long a place is waited for before the holders are looked at again.
+const LOOK_AGAIN: Duration = Duration::from_millis(250);
 /// Pause after an accept that failed because of us, for example for want of file descriptors.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
 /// How many connections there may be.
 #[derive(Debug, Clone)]
 pub struct Limits {
-    /// At a time; when there are as many, those without a request end, those without a good token in any case, and more wait
-    /// in the listener's backlog.
+    /// At a time. When nearly all are taken, the holder with the most loses its oldest. Where none has more than its share,
+    /// those without a request end, those without a good token in any case, and more wait in the listener's backlog.
     pub max_connections: usize,
     /// Those of one address on which no good token was shown yet; a further one takes the place of the oldest.
     pub max_silent_per_address: usize,
@@ -57,6 +63,18 @@ pub struct Limits {
     pub proxies: Arc<[IpAddr]>,
     /// How long a TLS handshake may take.
     pub handshake_timeout: Duration,
+}
+
+/// What is served, and what is kept of it.
+pub struct Service {
+    /// Answers requests.
+    pub router: Router,
+    /// What connections speak, if they are encrypted.
+    pub tls: Option<Tls>,
+    /// Whose connections they are.
+    pub connections: Arc<HttpConnections>,
+    /// What went over them.
+    pub traffic: Arc<HttpTotals>,
 }
 
 /// What all connections share.
@@ -80,20 +98,19 @@ struct Guest {
     proof: ClientProof,
     /// Whether its place is needed.
     crowded: watch::Receiver<bool>,
-    line: Line,
+    handle: Connection,
 }
 
 /// Serves until `stop`, then lets requests under way end, for at most `patience`.
 pub async fn serve(
     listener: TcpListener,
-    router: Router,
-    tls: Option<Tls>,
+    service: Service,
     limits: Limits,
-    traffic: Arc<HttpTotals>,
     stop: CancellationToken,
     patience: Duration,
 ) {
-    let places = Places::new(limits.max_connections);
+    let Service { router, tls, connections: registry, traffic } = service;
+    let places = Places::new(limits.max_connections, registry);
     let anteroom = Anteroom::new(limits.max_silent_per_address);
     let connections = TaskTracker::new();
     let abort = CancellationToken::new();
@@ -106,7 +123,7 @@ pub async fn serve(
         };
         let silent = anteroom.enter(peer.ip(), Instant::now());
         let proof = ClientProof::NotAsked;
-        let guest = Guest { peer, silent, proof, crowded: places.crowded.subscribe(), line: Line::default() };
+        let guest = Guest { peer, silent, proof, crowded: places.crowded.subscribe(), handle: Connection::default() };
         let site = site.clone();
         // Two kinds of task, so that a plain connection's does not need the room of an encrypted one's.
         if site.tls.is_some() {
@@ -116,7 +133,7 @@ pub async fn serve(
             });
         } else {
             connections.spawn(async move {
-                site.attend(site.patient(stream, guest.line.clone()), guest).await;
+                site.attend(site.patient(stream, guest.handle.clone()), guest).await;
                 drop(place);
             });
         }
@@ -130,18 +147,18 @@ pub async fn serve(
 }
 
 impl Site {
-    fn patient(&self, stream: TcpStream, line: Line) -> PatientStream {
+    fn patient(&self, stream: TcpStream, handle: Connection) -> PatientStream {
         // Answers are small and wanted at once; a failure here costs only latency.
         let _ = stream.set_nodelay(true);
         self.traffic.connection();
-        PatientStream { stream, stalled: None, traffic: self.traffic.clone(), line }
+        PatientStream { stream, stalled: None, traffic: self.traffic.clone(), handle }
     }
 
     /// Shakes hands, then serves the connection to its end.
     async fn attend_encrypted(&self, stream: TcpStream, guest: Guest) {
         let Some(tls) = &self.tls else { return };
         let shaken = tokio::select! {
-            shaken = timeout(self.handshake_timeout, tls.accept(self.patient(stream, guest.line.clone()))) => shaken,
+            shaken = timeout(self.handshake_timeout, tls.accept(self.patient(stream, guest.handle.clone()))) => shaken,
             () = gives_way(&guest.silent, guest.crowded.clone()) => return,
             () = self.stop.cancelled() => return,
         };
@@ -156,14 +173,14 @@ impl Site {
     where
         S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
     {
-        let Guest { peer, silent, proof, crowded, line } = guest;
+        let Guest { peer, silent, proof, crowded, handle } = guest;
         let (spoken, is_proxy) = (CancellationToken::new(), self.proxies.contains(&peer.ip().to_canonical()));
         let (router, traffic) = (self.router.clone(), self.traffic.clone());
-        let origin = Origin { peer, proof, line: line.clone() };
+        let origin = Origin { peer, proof, handle: handle.clone() };
         let mut connection = pin!(connection(stream, origin, spoken.clone(), router, traffic));
         let stranger = async {
             tokio::select! {
-                () = line.vouched() => {}
+                () = handle.authenticated() => {}
                 () = spoken.cancelled(), if is_proxy => {}
                 () = gives_way(&silent, crowded.clone()) => return,
             }
@@ -181,7 +198,7 @@ impl Site {
         tokio::select! {
             () = ended => {}
             () = stranger => {}
-            () = line.cut() => {}
+            () = handle.cut() => {}
             () = self.abort.cancelled() => {}
         }
     }
@@ -193,23 +210,36 @@ struct Places {
     most: usize,
     /// Whether all are taken, or nearly all were since they last were.
     crowded: watch::Sender<bool>,
+    /// Who has them.
+    registry: Arc<HttpConnections>,
 }
 
 impl Places {
-    fn new(most: usize) -> Self {
-        Self { free: Arc::new(Semaphore::new(most)), most, crowded: watch::Sender::new(false) }
+    fn new(most: usize, registry: Arc<HttpConnections>) -> Self {
+        Self { free: Arc::new(Semaphore::new(most)), most, crowded: watch::Sender::new(false), registry }
     }
 
-    /// Takes one. If there is none, whoever has spoken and asks for nothing now has to end.
+    /// Takes one. The last ones are not for a holder that has more than its share: it loses its oldest connection for each
+    /// newcomer. Where no holder has more and none is left, connections without a request have to end.
     async fn take(&self) -> Option<OwnedSemaphorePermit> {
         if let Ok(place) = self.free.clone().try_acquire_owned() {
-            let is_roomy = self.free.available_permits() > self.most / 8;
-            self.crowded.send_if_modified(|crowded| is_roomy && std::mem::take(crowded));
+            let left = self.free.available_permits();
+            self.crowded.send_if_modified(|crowded| left > self.most / 8 && std::mem::take(crowded));
+            if left < self.most / RESERVED_SHARE {
+                self.registry.cut_oldest_of_largest(self.most);
+            }
             return Some(place);
         }
-        self.crowded.send_replace(true);
-        // The semaphore is never closed, so there is always a permit; without one the connection would only be uncounted.
-        self.free.clone().acquire_owned().await.ok()
+        loop {
+            if !self.registry.cut_oldest_of_largest(self.most) {
+                self.crowded.send_replace(true);
+            }
+            // By the next look strangers may have shown whose they are. The semaphore is never closed, so there is always a
+            // permit; without one the connection would only be uncounted.
+            if let Ok(place) = timeout(LOOK_AGAIN, self.free.clone().acquire_owned()).await {
+                return place.ok();
+            }
+        }
     }
 }
 
@@ -270,14 +300,14 @@ fn is_the_clients_fault(error: &io::Error) -> bool {
 struct Origin {
     peer: SocketAddr,
     proof: ClientProof,
-    line: Line,
+    handle: Connection,
 }
 
 impl Origin {
     fn mark<B>(&self, request: &mut Request<B>) {
         request.extensions_mut().insert(ConnectInfo(self.peer));
         request.extensions_mut().insert(self.proof.clone());
-        request.extensions_mut().insert(self.line.clone());
+        request.extensions_mut().insert(self.handle.clone());
     }
 }
 
@@ -314,7 +344,7 @@ struct PatientStream {
     stream: TcpStream,
     stalled: Option<Pin<Box<Sleep>>>,
     traffic: Arc<HttpTotals>,
-    line: Line,
+    handle: Connection,
 }
 
 impl PatientStream {
@@ -322,7 +352,7 @@ impl PatientStream {
         if let Poll::Ready(written) = &polled {
             let bytes = *written.as_ref().unwrap_or(&0);
             self.traffic.bytes_out(bytes);
-            self.line.wrote(bytes);
+            self.handle.wrote(bytes);
             self.stalled = None;
             return polled;
         }
@@ -372,15 +402,42 @@ impl AsyncWrite for PatientStream {
     }
 }
 
-/// A request's body that fails once the client has sent nothing for [`BODY_PAUSE`] while someone waited for it.
+/// A request's body that fails once the client has sent nothing for [`BODY_PAUSE`] while it was waited for, or too little
+/// in all the time that it was waited for.
 struct PatientBody {
     body: Incoming,
-    waiting: Option<Pin<Box<Sleep>>>,
+    waiting: Option<Wait>,
+    pace: BodyPace,
+}
+
+/// That more of a body is waited for.
+struct Wait {
+    since: Instant,
+    timer: Pin<Box<Sleep>>,
+}
+
+/// How fast a body comes. Only the time in which it is waited for counts: a slow server is not the client's fault.
+#[derive(Default)]
+struct BodyPace {
+    waited: Duration,
+    bytes: usize,
+}
+
+impl BodyPace {
+    /// Counts a piece that was waited for. False if the client sends too slowly.
+    fn count(&mut self, waited: Duration, bytes: usize) -> bool {
+        self.waited += waited;
+        self.bytes = self.bytes.saturating_add(bytes);
+        if self.waited < BODY_PAUSE {
+            return true;
+        }
+        std::mem::take(self).bytes >= LEAST_BODY_BYTES
+    }
 }
 
 impl PatientBody {
     fn new(body: Incoming) -> Self {
-        Self { body, waiting: None }
+        Self { body, waiting: None, pace: BodyPace::default() }
     }
 }
 
@@ -392,13 +449,18 @@ impl http_body::Body for PatientBody {
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
     ) -> Poll<Option<Result<Frame<Bytes>, axum::BoxError>>> {
+        let too_slow = || Poll::Ready(Some(Err(io::Error::from(io::ErrorKind::TimedOut).into())));
         if let Poll::Ready(frame) = Pin::new(&mut self.body).poll_frame(context) {
-            self.waiting = None;
-            return Poll::Ready(frame.map(|frame| frame.map_err(Into::into)));
+            let waited = self.waiting.take().map_or(Duration::ZERO, |wait| wait.since.elapsed());
+            let bytes = frame.as_ref().and_then(|frame| frame.as_ref().ok()?.data_ref()).map(Bytes::len);
+            return match bytes {
+                Some(bytes) if !self.pace.count(waited, bytes) => too_slow(),
+                _ => Poll::Ready(frame.map(|frame| frame.map_err(Into::into))),
+            };
         }
-        let timer = self.waiting.get_or_insert_with(|| Box::pin(tokio::time::sleep(BODY_PAUSE)));
-        ready!(timer.poll_unpin(context));
-        Poll::Ready(Some(Err(io::Error::from(io::ErrorKind::TimedOut).into())))
+        let new = || Wait { since: Instant::now(), timer: Box::pin(tokio::time::sleep(BODY_PAUSE)) };
+        ready!(self.waiting.get_or_insert_with(new).timer.poll_unpin(context));
+        too_slow()
     }
 
     fn is_end_stream(&self) -> bool {
@@ -407,5 +469,24 @@ impl http_body::Body for PatientBody {
 
     fn size_hint(&self) -> SizeHint {
         self.body.size_hint()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn body_that_trickles_is_refused_and_a_slow_link_is_not() {
+        const SECOND: Duration = Duration::from_secs(1);
+        let refused_after = |bytes_per_s: usize| {
+            let mut pace = BodyPace::default();
+            (1..=300).find(|_| !pace.count(SECOND, bytes_per_s))
+        };
+        assert_eq!(refused_after(1), Some(30));
+        assert_eq!(refused_after(LEAST_BODY_BYTES / 30 - 1), Some(30));
+        assert_eq!(refused_after(1024), None);
+        let mut pace = BodyPace::default();
+        assert!((0..300).all(|_| pace.count(Duration::ZERO, 1)), "it is the server that is slow");
     }
 }

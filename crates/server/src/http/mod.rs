@@ -25,6 +25,7 @@ mod openapi;
 mod outputs;
 mod packages;
 mod people;
+pub mod person_limits;
 mod proxy;
 mod robots;
 pub mod session;
@@ -61,6 +62,7 @@ use crate::changes::Changes;
 use crate::clock::Clock;
 use crate::conduct::Conduct;
 use crate::feed::Feed;
+use crate::http_connections::HttpConnections;
 use crate::mqtt_access::MqttAccess;
 use crate::oidc::Provider;
 use crate::presence::Presence;
@@ -72,7 +74,6 @@ use crate::robot_vitals::RobotVitals;
 use crate::server_facts::ServerFacts;
 use crate::store::Store;
 use crate::transfers::Transfers;
-use crate::visits::Visits;
 use crate::web;
 use auth::{Access, Gate, guard};
 use error::ApiError;
@@ -113,11 +114,13 @@ pub struct AppParts {
     /// Who is signed in at the page.
     pub sessions: Arc<session::Sessions>,
     /// Robots' requests that are under way.
-    pub visits: Arc<Visits>,
+    pub http_connections: Arc<HttpConnections>,
     /// How robots behave.
     pub conduct: Arc<Conduct>,
     /// By whom people may sign in, if there is such a provider.
     pub provider: Option<Arc<Provider>>,
+    /// What people ask for.
+    pub people: Arc<person_limits::PersonLimits>,
     /// Failed authentications.
     pub attempts: Arc<attempts::FailedAttempts>,
     /// What happened last.
@@ -192,6 +195,7 @@ pub struct Route {
     pub access: Access,
     body_bytes: usize,
     deadline: Option<Duration>,
+    waits_for_robot: bool,
     handler: MethodRouter<App>,
     describe: fn(&mut Draft),
 }
@@ -206,7 +210,8 @@ impl Route {
     {
         let filter = MethodFilter::try_from(method.clone()).expect("a method that axum routes");
         let (body_bytes, deadline) = (SMALL_BODY_BYTES, Some(DEADLINE));
-        Self { method: Some(method), path, access, body_bytes, deadline, handler: on(filter, handler), describe }
+        let (waits_for_robot, handler) = (false, on(filter, handler));
+        Self { method: Some(method), path, access, body_bytes, deadline, waits_for_robot, handler, describe }
     }
 
     /// A route for every method, whose handler streams and bounds itself.
@@ -215,7 +220,8 @@ impl Route {
         H: Handler<T, App>,
         T: 'static,
     {
-        Self { method: None, path, access, body_bytes: usize::MAX, deadline: None, handler: any(handler), describe }
+        let (body_bytes, waits_for_robot, handler) = (usize::MAX, false, any(handler));
+        Self { method: None, path, access, body_bytes, deadline: None, waits_for_robot, handler, describe }
     }
 
     fn body_bytes(self, body_bytes: usize) -> Self {
@@ -225,6 +231,11 @@ impl Route {
     /// With a deadline of its own.
     fn within(self, deadline: Duration) -> Self {
         Self { deadline: Some(deadline), ..self }
+    }
+
+    /// Its answer waits for a robot's, so it does not count among what a person has under way.
+    fn waiting_for_robot(self) -> Self {
+        Self { waits_for_robot: true, ..self }
     }
 
     /// Without a deadline, for an answer that goes on.
@@ -299,7 +310,7 @@ pub fn routes() -> Vec<Route> {
         route!(POST "/api/v1/robots/{robot}/telemetry", OwnRobot, vitals::telemetry),
         route!(GET "/api/v1/robots/{robot}/tasks", Person(Read), history::tasks),
         route!(GET "/api/v1/robots/{robot}/vitals", Person(Read), vitals::show),
-        route!(POST "/api/v1/robots/{robot}/ask", Person(Read), ask::ask),
+        route!(POST "/api/v1/robots/{robot}/ask", Person(Read), ask::ask).waiting_for_robot(),
         route!(GET "/api/v1/robots/{robot}/logs", Person(Read), logs::show).streaming(),
     ];
     routes.extend(routes_of_work());
@@ -348,7 +359,8 @@ fn routes_of_work() -> Vec<Route> {
 pub fn router(app: App) -> Router {
     let (mut router, trusted) = (Router::new(), app.trusted_proxies.clone());
     for route in routes() {
-        let gate = Gate { app: app.clone(), access: route.access, deadline: route.deadline };
+        let Route { access, deadline, waits_for_robot, .. } = route;
+        let gate = Gate { app: app.clone(), access, deadline, waits_for_robot };
         let guard = middleware::from_fn_with_state(gate, guard);
         let limit = DefaultBodyLimit::max(route.body_bytes);
         let handler = match route.method {

@@ -140,7 +140,7 @@ pub(super) fn gone(app: &App, robot: &RobotId) {
 /// Ends a robot's session and its requests. To be called once its tokens have ended.
 fn put_out(app: &App, robot: &RobotId) {
     app.broker.disconnect(robot);
-    app.visits.end(robot);
+    app.http_connections.end(robot);
 }
 
 /// Gives the robot its signed desired state. Asking counts as being there.

@@ -1,9 +1,10 @@
 //! A package's directory that the page brings as an archive: unpacked beside the blobs, packed like `taskd push` does, and put
 //! into the registry. The archive is by a browser, and believed in nothing.
 
+use std::collections::HashSet;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use axum::body::Body;
@@ -12,6 +13,7 @@ use bytes::Bytes;
 use futures_util::StreamExt as _;
 use http::{HeaderMap, StatusCode, header};
 use task_archive::{Compression, Limits, Refusal, UnpackError, unpack_unannounced};
+use task_proto::UserName;
 use task_proto::api::PackageView;
 use tempfile::TempDir;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
@@ -50,6 +52,8 @@ pub struct UploadSpace {
     directory: PathBuf,
     limits: Limits,
     places: Arc<Semaphore>,
+    /// Those whose archive is being unpacked.
+    uploading: Arc<Mutex<HashSet<UserName>>>,
     /// Whose turn it is to look into a package.
     pub(super) readers: Arc<Semaphore>,
 }
@@ -60,8 +64,43 @@ impl UploadSpace {
         let limits = Limits::default();
         let limits = Limits { bytes: limits.bytes.min(most_bytes), ..limits };
         let [places, readers] = [AT_ONCE, READERS].map(|most| Arc::new(Semaphore::new(most)));
-        Self { directory, limits, places, readers }
+        Self { directory, limits, places, uploading: Arc::default(), readers }
     }
+
+    /// A place for one archive of this person, who may have one at a time.
+    fn place(&self, person: &UserName) -> Result<UploadPlace, ApiError> {
+        if !locked(&self.uploading).insert(person.clone()) {
+            return Err(ApiError::too_many(format!("{person} uploads a package already; wait until it is there")));
+        }
+        let own = OwnUpload { uploading: self.uploading.clone(), person: person.clone() };
+        let place = self.places.clone().try_acquire_owned().map_err(|_| {
+            ApiError::too_many(format!("{AT_ONCE} packages are being uploaded already; try again in a moment"))
+        })?;
+        Ok(UploadPlace { _own: own, _place: place })
+    }
+}
+
+/// The place of an archive that is unpacked and packed; given back by dropping it.
+struct UploadPlace {
+    _own: OwnUpload,
+    _place: OwnedSemaphorePermit,
+}
+
+/// That a person uploads something.
+struct OwnUpload {
+    uploading: Arc<Mutex<HashSet<UserName>>>,
+    person: UserName,
+}
+
+impl Drop for OwnUpload {
+    fn drop(&mut self) {
+        locked(&self.uploading).remove(&self.person);
+    }
+}
+
+fn locked(uploading: &Mutex<HashSet<UserName>>) -> MutexGuard<'_, HashSet<UserName>> {
+    // A set of names is sound whatever a panic left.
+    uploading.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Why an archive did not become a package.
@@ -85,6 +124,7 @@ enum UploadError {
         (status = 422, description = "`archive_refused`: there is something in it that a package can't have. \
             `package_invalid`: it can't be run; the message says all that is wrong."),
         (status = 408, description = "It took too long to arrive."),
+        (status = 429, description = "The person uploads a package already, or others do."),
         (status = 507, description = "`disk_full`: the server's disk is.")))]
 pub(super) async fn package(
     State(app): State<App>,
@@ -92,9 +132,7 @@ pub(super) async fn package(
     request: Request,
 ) -> Result<Created<PackageView>, ApiError> {
     let compression = compression(request.headers())?;
-    let place = app.uploads.places.clone().try_acquire_owned().map_err(|_| {
-        ApiError::too_many(format!("{AT_ONCE} packages are being uploaded already; try again in a moment"))
-    })?;
+    let place = app.uploads.place(&by.name)?;
     let (packed, _place) = receive(&app, place, compression, request.into_body()).await?;
     Ok(Created(oci::publish(&Registry::from_ref(&app), &by, &packed).await?))
 }
@@ -118,10 +156,10 @@ fn compression(headers: &HeaderMap) -> Result<Compression, ApiError> {
 /// Unpacks the body as it comes, and packs what was in it. The work goes on if the caller goes away, so its place must as well.
 async fn receive(
     app: &App,
-    place: OwnedSemaphorePermit,
+    place: UploadPlace,
     compression: Compression,
     body: Body,
-) -> Result<(Packed, OwnedSemaphorePermit), ApiError> {
+) -> Result<(Packed, UploadPlace), ApiError> {
     let (sender, receiver) = mpsc::channel(WAITING);
     let (directory, limits) = (app.uploads.directory.clone(), app.uploads.limits);
     // What is unpacked is packed again beside it.

@@ -22,6 +22,8 @@ pub(super) struct Terms {
     pub(super) session: String,
     /// How many there may be.
     pub(super) count: u32,
+    /// How many of them [`with_shared_reads`] may have at once.
+    pub(super) shared: u32,
     /// How long each part of a statement's answer may take.
     pub(super) answer: Duration,
     /// How long an idle connection may take to show that it is alive.
@@ -30,11 +32,23 @@ pub(super) struct Terms {
     pub(super) wait: Duration,
 }
 
+tokio::task_local! {
+    /// Set where reads are not urgent.
+    static SHARES_READS: ();
+}
+
+/// Runs what is not urgent: of each set of connections it gets only a part, so that the rest is free for what is. Tasks that it
+/// spawns are urgent again.
+pub async fn with_shared_reads<F: Future>(future: F) -> F::Output {
+    SHARES_READS.scope((), future).await
+}
+
 /// A set of connections to one database, each lent to one user at a time. Clones share them.
 #[derive(Clone)]
 pub(super) struct Connections {
     terms: Arc<Terms>,
     places: Arc<Semaphore>,
+    shared: Arc<Semaphore>,
     idle: Arc<Mutex<Vec<AnyConnection>>>,
 }
 
@@ -53,6 +67,7 @@ struct Held {
     is_sound: bool,
     idle: Arc<Mutex<Vec<AnyConnection>>>,
     _place: OwnedSemaphorePermit,
+    _shared: Option<OwnedSemaphorePermit>,
 }
 
 impl fmt::Debug for Connections {
@@ -66,7 +81,8 @@ impl Connections {
     /// The first is made now.
     pub(super) async fn open(terms: Terms) -> Result<Self, Error> {
         let places = Arc::new(Semaphore::new(terms.count as usize));
-        let connections = Self { terms: Arc::new(terms), places, idle: Arc::default() };
+        let shared = Arc::new(Semaphore::new(terms.shared as usize));
+        let connections = Self { terms: Arc::new(terms), places, shared, idle: Arc::default() };
         connections.lend().await?;
         Ok(connections)
     }
@@ -74,6 +90,11 @@ impl Connections {
     /// Lends a connection that has just answered.
     pub(super) async fn lend(&self) -> Result<Lent, Error> {
         let Terms { answer, greeting, wait, .. } = *self.terms;
+        let shared = match SHARES_READS.try_with(|()| ()) {
+            Ok(()) => Some(timeout(wait, self.shared.clone().acquire_owned()).await.map_err(|_| Error::PoolTimedOut)?),
+            Err(_) => None,
+        };
+        let shared = shared.transpose().map_err(|_| Error::PoolClosed)?;
         let place = timeout(wait, self.places.clone().acquire_owned()).await.map_err(|_| Error::PoolTimedOut)?;
         let place = place.map_err(|_| Error::PoolClosed)?;
         let connection = loop {
@@ -83,7 +104,7 @@ impl Connections {
                 Err(error) => tracing::warn!(%error, "a connection to the database is given up"),
             }
         };
-        let held = Held { connection, is_sound: true, idle: self.idle.clone(), _place: place };
+        let held = Held { connection, is_sound: true, idle: self.idle.clone(), _place: place, _shared: shared };
         Ok(Lent { held: Some(held), answer, in_transaction: false })
     }
 
@@ -248,6 +269,7 @@ fn lock(idle: &Mutex<Vec<AnyConnection>>) -> MutexGuard<'_, Vec<AnyConnection>> 
 
 #[cfg(test)]
 mod tests {
+    use futures_util::poll;
     use tokio::io::copy_bidirectional;
     use tokio::net::{TcpListener, TcpStream};
     use tokio::sync::watch;
@@ -289,7 +311,7 @@ mod tests {
             sqlx::any::install_default_drivers();
             let (few, session) = (Duration::from_secs(2), "SET idle_in_transaction_session_timeout = '60s'".to_owned());
             let wait = Duration::from_secs(60);
-            let terms = Terms { url: self.url.clone(), session, count: 1, answer: few, greeting: few, wait };
+            let terms = Terms { url: self.url.clone(), session, count: 1, shared: 1, answer: few, greeting: few, wait };
             Connections::open(terms).await.expect("opens")
         }
 
@@ -326,6 +348,23 @@ mod tests {
         // One that was idle.
         between.stall();
         assert_eq!(answers(&connections).await.expect("another answers"), 1);
+    }
+
+    #[tokio::test]
+    async fn shared_reads_leave_connections_to_urgent_ones() {
+        sqlx::any::install_default_drivers();
+        let directory = tempfile::tempdir().expect("a directory");
+        let (url, session) = (super::super::sqlite_url(&directory.path().join("database")), String::new());
+        let long = Duration::from_secs(60);
+        let terms = Terms { url, session, count: 3, shared: 1, answer: long, greeting: long, wait: long };
+        let connections = Connections::open(terms).await.expect("opens");
+        let shared = with_shared_reads(connections.lend()).await.expect("lent");
+        let mut next = Box::pin(with_shared_reads(connections.lend()));
+        assert!(poll!(next.as_mut()).is_pending());
+        let urgent = [connections.lend().await.expect("lent"), connections.lend().await.expect("lent")];
+        drop(shared);
+        next.await.expect("lent");
+        drop(urgent);
     }
 
     #[tokio::test]

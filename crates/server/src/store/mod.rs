@@ -47,6 +47,7 @@ use access::{Access, Ending};
 pub use assignments::{Released, TaskOrder};
 use audit::everybodys_pace;
 pub use audit::{Act, Deed};
+pub use connections::with_shared_reads;
 use connections::{Connections, Lent, Statement, Terms};
 pub use deliveries::{Decided, DeliveryOrder, RobotFacts};
 pub use deployments::{DeploymentPage, NewDeployment, OpenRobot, OpenRollout};
@@ -75,7 +76,9 @@ const WRITER_CACHE: &str = "PRAGMA cache_size = -16384";
 /// The same of each reader; what it lacks is in the system's memory.
 const READER_CACHE: &str = "PRAGMA cache_size = -4096";
 /// Connections that read at the same time.
-const READERS: u32 = 4;
+const READERS: u32 = 6;
+/// And those of them that people's reads may have at once: the rest is free for robots and orders.
+const SHARED_READERS: u32 = 4;
 /// How long a statement waits for a connection or for another process's write.
 const PATIENCE: Duration = Duration::from_secs(30);
 
@@ -227,8 +230,8 @@ impl Store {
         })?;
         first.close().await.map_err(open_error)?;
         // One writer: its transactions queue for this connection instead of failing each other.
-        let writes = Connections::open(terms(url, 1, WRITER_CACHE)).await.map_err(open_error)?;
-        let reads = Connections::open(terms(url, READERS, READER_CACHE)).await.map_err(open_error)?;
+        let writes = Connections::open(terms(url, 1, 1, WRITER_CACHE)).await.map_err(open_error)?;
+        let reads = Connections::open(terms(url, READERS, SHARED_READERS, READER_CACHE)).await.map_err(open_error)?;
         let is_postgres = is_postgres(url);
         let (access, first_uses, everybodys) = (Access::default(), FirstUses::default(), Arc::new(everybodys_pace()));
         Ok(Self { reads, writes, access, first_uses, everybodys, is_postgres })
@@ -312,16 +315,16 @@ const POSTGRES_SESSION: &str = "SET idle_in_transaction_session_timeout = '60s';
 const POSTGRES_STATEMENT: &str = "SET statement_timeout = '50s';";
 
 /// The terms of a store's connections.
-fn terms(url: &str, count: u32, cache: &str) -> Terms {
+fn terms(url: &str, count: u32, shared: u32, cache: &str) -> Terms {
     let url = url.to_owned();
     if is_postgres(&url) {
         let session = [POSTGRES_SESSION, POSTGRES_STATEMENT].concat();
         let (answer, greeting) = (Duration::from_secs(60), Duration::from_secs(5));
-        return Terms { url, session, count, answer, greeting, wait: PATIENCE };
+        return Terms { url, session, count, shared, answer, greeting, wait: PATIENCE };
     }
     // A file does not fall silent: it is slow.
     let session = [SQLITE_SESSION, cache].concat();
-    Terms { url, session, count, answer: Duration::MAX, greeting: Duration::MAX, wait: PATIENCE }
+    Terms { url, session, count, shared, answer: Duration::MAX, greeting: Duration::MAX, wait: PATIENCE }
 }
 
 /// A URL as it may be shown: `user:password@` and the query, which may hold a password too, cut out.

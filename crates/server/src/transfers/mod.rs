@@ -22,7 +22,7 @@ pub use queue::Claim;
 use queue::{Asking, Place, Progress, Queue, Turn, jittered};
 
 use crate::config::TransferLimits;
-use crate::visits::Line;
+use crate::http_connections::Connection;
 
 /// How long a request waits for its turn.
 const PATIENCE: Duration = Duration::from_secs(2);
@@ -60,7 +60,7 @@ struct Turns {
 /// A transfer and the connection it goes by.
 struct Carried {
     robot: RobotId,
-    line: Line,
+    connection: Connection,
     progress: Progress,
 }
 
@@ -189,10 +189,10 @@ impl Drop for Request<'_> {
 impl Shared {
     fn end_too_slow(&self, now_ms: u64) {
         let Turns { queue, carried, .. } = &mut *self.turns();
-        for Carried { robot, line, progress } in carried.values_mut() {
-            if progress.is_too_slow(line.bytes_out(), queue.others_wait(robot), now_ms) {
+        for Carried { robot, connection, progress } in carried.values_mut() {
+            if progress.is_too_slow(connection.bytes_out(), queue.others_wait(robot), now_ms) {
                 tracing::debug!(%robot, "it takes next to nothing, and others wait: its connection is cut");
-                line.end();
+                connection.end();
             }
         }
     }
@@ -229,13 +229,13 @@ impl Shared {
 
 impl Transfer {
     /// Goes by this connection, which ends if too little of it is taken while others wait.
-    pub fn by(mut self, line: Option<&Line>) -> Self {
-        let Some(line) = line.cloned() else { return self };
-        let progress = Progress::from(self.shared.now_ms(), line.bytes_out());
+    pub fn by(mut self, connection: Option<&Connection>) -> Self {
+        let Some(connection) = connection.cloned() else { return self };
+        let progress = Progress::from(self.shared.now_ms(), connection.bytes_out());
         let mut turns = self.shared.turns();
         turns.last_number += 1;
         let number = turns.last_number;
-        turns.carried.insert(number, Carried { robot: self.turn.robot.clone(), line, progress });
+        turns.carried.insert(number, Carried { robot: self.turn.robot.clone(), connection, progress });
         drop(turns);
         self.number = Some(number);
         self
@@ -283,20 +283,20 @@ mod tests {
         let limits = TransferLimits { all, ..TransferLimits::default() };
         let transfers = Transfers::new(&limits, "site".parse().expect("valid"));
         let (robot, other, claim) = (RobotId::random(), RobotId::random(), Claim::default());
-        let (blob, line) = (Digest::of(b"x"), Line::default());
-        let stalled = transfers.admit(&robot, blob, &claim).await.expect("its turn").by(Some(&line));
+        let (blob, connection) = (Digest::of(b"x"), Connection::default());
+        let stalled = transfers.admit(&robot, blob, &claim).await.expect("its turn").by(Some(&connection));
         let mut again = Box::pin(transfers.admit(&robot, Digest::of(b"y"), &claim));
         assert!(poll!(again.as_mut()).is_pending());
         transfers.shared.end_too_slow(60_000);
-        assert_eq!(line.cut().now_or_never(), None, "no other robot waits");
+        assert_eq!(connection.cut().now_or_never(), None, "no other robot waits");
         let mut waits = Box::pin(transfers.admit(&other, blob, &claim));
         assert!(poll!(waits.as_mut()).is_pending());
         transfers.shared.end_too_slow(89_999);
-        line.wrote(16 * 1024);
+        connection.wrote(16 * 1024);
         transfers.shared.end_too_slow(90_000);
-        assert_eq!(line.cut().now_or_never(), None, "it takes something");
+        assert_eq!(connection.cut().now_or_never(), None, "it takes something");
         transfers.shared.end_too_slow(120_000);
-        assert_eq!(line.cut().now_or_never(), Some(()));
+        assert_eq!(connection.cut().now_or_never(), Some(()));
         drop((again, stalled));
         waits.await.expect("its turn");
         assert!(transfers.shared.turns().carried.is_empty());

@@ -151,6 +151,31 @@ async fn every_route_lets_in_whom_it_names_and_nobody_else() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn password_that_a_browser_adds_changes_nothing_for_a_foreign_page() {
+    let server = TestServer::start().await;
+    let by_password = |method, path: &str| server.bare(method, path).basic_auth("any", Some(server.operator.reveal()));
+    let create = || by_password(Method::POST, "/api/v1/enrollment-tokens").json(&json!({}));
+    let begin_push = || by_password(Method::POST, "/v2/talker/blobs/uploads/");
+    for (header, foreign) in [
+        ("origin", "http://evil.example"),
+        ("origin", "null"),
+        ("sec-fetch-site", "cross-site"),
+        ("sec-fetch-site", "none"),
+    ] {
+        assert_eq!(refusal(create().header(header, foreign)).await.0, 403, "{header}: {foreign}");
+        let pushed = begin_push().header(header, foreign).send().await.expect("an answer");
+        assert_eq!(pushed.status(), StatusCode::FORBIDDEN, "{header}: {foreign}");
+        let read = by_password(Method::GET, "/api/v1/me").header(header, foreign).send().await.expect("an answer");
+        assert_eq!(read.status(), StatusCode::OK, "no other page can read it");
+    }
+    // Registry clients send no origin; the API's own documentation page sends the server's.
+    assert_eq!(create().send().await.expect("an answer").status(), StatusCode::CREATED);
+    assert_eq!(begin_push().send().await.expect("an answer").status(), StatusCode::ACCEPTED);
+    let own = create().header("origin", server.url("")).header("sec-fetch-site", "same-origin");
+    assert_eq!(own.send().await.expect("an answer").status(), StatusCode::CREATED);
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_session_opens_what_its_token_opens_and_only_from_its_own_page() {
     let server = TestServer::start().await;
     let origin = server.url("");

@@ -24,6 +24,7 @@ mod fleet;
 mod harness;
 mod headers;
 mod history;
+mod holders;
 mod late;
 mod lists;
 mod logs;

@@ -174,15 +174,18 @@ async fn refused_bytes(server: &TestServer, header: &str, rest: &[u8]) -> String
 #[tokio::test(flavor = "multi_thread")]
 async fn two_upload_at_a_time_and_who_goes_away_leaves_a_place() {
     let server = TestServer::start().await;
-    let upload = |body: reqwest::Body| {
-        server.request(Method::POST, "/api/v1/packages").header("content-type", "application/x-tar").body(body)
+    let publishers = [server.sign_in_as("alice", "publisher").await, server.sign_in_as("bob", "publisher").await];
+    let upload_by = |token: &str, body: reqwest::Body| {
+        let request = server.bare(Method::POST, "/api/v1/packages").bearer_auth(token);
+        request.header("content-type", "application/x-tar").body(body)
     };
+    let upload = |body| upload_by(&server.operator.reveal(), body);
     let body = || reqwest::Body::wrap_stream(futures_util::stream::pending::<Result<Vec<u8>, std::io::Error>>());
     // Whoever finds the place taken by what asks below asks again.
-    let endless = async || while refusal(upload(body())).await.0 == 429 {};
+    let endless = async |token: &str| while refusal(upload_by(token, body())).await.0 == 429 {};
     let until = async |status: u16| while refusal(upload("hello".into())).await.0 != status {};
     tokio::select! {
-        _ = async { tokio::join!(endless(), endless()) } => panic!("an upload without an end had one"),
+        _ = async { tokio::join!(endless(&publishers[0]), endless(&publishers[1])) } => panic!("an upload without an end had one"),
         refused = timeout(PATIENCE, until(429)) => refused.expect("no third place"),
     }
     timeout(PATIENCE, until(422)).await.expect("places again");

@@ -20,7 +20,7 @@ use task_proto::token::Token;
 use task_transport::{ClientKey, Duplex, Route, Trust, dial};
 use taskd::clock::Clock;
 use taskd::config::Config;
-use taskd::http::listener::{Limits, serve};
+use taskd::http::listener::{Limits, Service, serve};
 use tempfile::TempDir;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
@@ -464,7 +464,8 @@ async fn listener(limits: Limits) -> (SocketAddr, tokio_util::sync::DropGuard, T
     let address = listener.local_addr().expect("bound");
     let stop = tokio_util::sync::CancellationToken::new();
     let (router, traffic) = (axum::Router::new(), Arc::default());
-    tokio::spawn(serve(listener, router, Some(tls), limits, traffic, stop.clone(), Duration::from_secs(1)));
+    let service = Service { router, tls: Some(tls), connections: Arc::default(), traffic };
+    tokio::spawn(serve(listener, service, limits, stop.clone(), Duration::from_secs(1)));
     (address, stop.drop_guard(), directory)
 }
 

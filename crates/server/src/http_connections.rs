@@ -1,0 +1,270 @@
+//! The HTTP connections on which a good token was shown, by holder: the person, robot or enrolment token. A holder's
+//! connections can be cut all at once, when a robot is revoked, and a holder that has more than its share loses the oldest
+//! when connections run out. Connections on which no token was shown are the `Anteroom`'s.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use task_proto::{RobotId, UserName};
+use tokio_util::sync::CancellationToken;
+
+/// A holder never has too many connections with this number of them: a browser opens six, an agent fewer.
+const ALWAYS_ALLOWED: usize = 8;
+
+/// The account that a connection is counted for. Of holders with equally many connections the last in this order loses one
+/// first.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Holder {
+    /// A robot, with whichever of its tokens.
+    Robot(RobotId),
+    /// A person, with all tokens and sessions.
+    Person(UserName),
+    /// An enrolment token, by its id.
+    Enrolment(String),
+}
+
+/// All connections that have a holder. The listener bounds their number.
+#[derive(Debug, Default)]
+pub struct HttpConnections {
+    held: Mutex<Held>,
+    last_number: AtomicU64,
+    robots_ended: AtomicU64,
+}
+
+#[derive(Debug, Default)]
+struct Held {
+    /// Each holder's connections, the oldest first.
+    by_holder: HashMap<Holder, BTreeMap<u64, CancellationToken>>,
+    /// The same holders in the order of their numbers of connections.
+    by_count: BTreeSet<(usize, Holder)>,
+}
+
+/// A connection, as its requests carry it along. Clones are the same.
+#[derive(Debug, Clone, Default)]
+pub struct Connection {
+    cut: CancellationToken,
+    authenticated: CancellationToken,
+    bytes_out: Arc<AtomicU64>,
+    /// The holder of the last token that was shown on it.
+    registration: Arc<Mutex<Option<Registration>>>,
+}
+
+/// That a connection counts for a holder; dropping it ends that.
+#[derive(Debug)]
+struct Registration {
+    connections: Arc<HttpConnections>,
+    holder: Holder,
+    number: u64,
+}
+
+/// A request whose token is being looked up.
+#[derive(Debug)]
+pub struct Arrival<'a> {
+    connections: &'a Arc<HttpConnections>,
+    robots_ended: u64,
+}
+
+impl HttpConnections {
+    /// A request has come. To be called before its token is looked up.
+    pub fn arrival(self: &Arc<Self>) -> Arrival<'_> {
+        Arrival { connections: self, robots_ended: self.robots_ended.load(Ordering::SeqCst) }
+    }
+
+    fn register(self: &Arc<Self>, holder: &Holder, connection: &Connection) {
+        let mut registration = connection.registration.lock().unwrap_or_else(PoisonError::into_inner);
+        if registration.as_ref().is_some_and(|registration| registration.holder == *holder) {
+            return;
+        }
+        let number = self.last_number.fetch_add(1, Ordering::Relaxed);
+        self.held().change(holder, |connections| {
+            connections.insert(number, connection.cut.clone());
+        });
+        *registration = Some(Registration { connections: self.clone(), holder: holder.clone(), number });
+    }
+
+    /// Cuts all connections of the robot.
+    pub fn end(&self, robot: &RobotId) {
+        self.robots_ended.fetch_add(1, Ordering::SeqCst);
+        let ended = self.held().change(&Holder::Robot(robot.clone()), std::mem::take);
+        ended.values().for_each(CancellationToken::cancel);
+    }
+
+    /// Cuts the oldest connection of the holder with the most, if that is more than its fair share of `limit` connections.
+    /// False if no holder has more.
+    pub fn cut_oldest_of_largest(&self, limit: usize) -> bool {
+        let mut held = self.held();
+        let share = held.fair_share(limit);
+        let largest = held.by_count.last().filter(|(count, _)| *count > share).map(|(_, holder)| holder.clone());
+        let Some(holder) = largest else { return false };
+        let oldest = held.change(&holder, BTreeMap::pop_first);
+        drop(held);
+        tracing::debug!(?holder, share, "connections run out: the oldest of the holder with the most is cut");
+        oldest.inspect(|(_, cut)| cut.cancel()).is_some()
+    }
+
+    fn held(&self) -> MutexGuard<'_, Held> {
+        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing half-done.
+        self.held.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Held {
+    /// What each holder may have of `limit` connections if one more holder comes.
+    fn fair_share(&self, limit: usize) -> usize {
+        (limit / (self.by_holder.len() + 1)).max(ALWAYS_ALLOWED.min(limit / 2)).max(1)
+    }
+
+    /// Changes a holder's connections, and keeps the order by number in step.
+    fn change<T>(&mut self, holder: &Holder, change: impl FnOnce(&mut BTreeMap<u64, CancellationToken>) -> T) -> T {
+        let connections = self.by_holder.entry(holder.clone()).or_default();
+        let before = connections.len();
+        let changed = change(connections);
+        let after = connections.len();
+        if after == 0 {
+            self.by_holder.remove(holder);
+        }
+        if before != after {
+            self.by_count.remove(&(before, holder.clone()));
+            if after > 0 {
+                self.by_count.insert((after, holder.clone()));
+            }
+        }
+        changed
+    }
+}
+
+impl Arrival<'_> {
+    /// The request on `connection` is this holder's. False if a robot's tokens ended since the request came: as this
+    /// connection was not registered yet, it was not cut, and the token has to be looked up again.
+    pub fn identified(self, holder: &Holder, connection: &Connection) -> bool {
+        self.connections.register(holder, connection);
+        self.connections.robots_ended.load(Ordering::SeqCst) == self.robots_ended
+    }
+}
+
+impl Connection {
+    /// Counts for no holder until the next token is shown.
+    pub fn release(&self) {
+        *self.registration.lock().unwrap_or_else(PoisonError::into_inner) = None;
+    }
+
+    /// The other side took this many bytes, as far as the system can tell.
+    pub fn wrote(&self, bytes: usize) {
+        self.bytes_out.fetch_add(bytes as u64, Ordering::Relaxed);
+    }
+
+    /// Bytes that it took so far.
+    pub fn bytes_out(&self) -> u64 {
+        self.bytes_out.load(Ordering::Relaxed)
+    }
+
+    /// Cuts it, in the middle of whatever it carries.
+    pub fn end(&self) {
+        self.cut.cancel();
+    }
+
+    /// A good token was shown on it.
+    pub fn authenticate(&self) {
+        self.authenticated.cancel();
+    }
+
+    /// Resolves when one was.
+    pub async fn authenticated(&self) {
+        self.authenticated.cancelled().await;
+    }
+
+    /// Resolves when the connection has to end.
+    pub async fn cut(&self) {
+        self.cut.cancelled().await;
+    }
+}
+
+impl Drop for Registration {
+    fn drop(&mut self) {
+        self.connections.held().change(&self.holder, |connections| connections.remove(&self.number));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn person(name: &str) -> Holder {
+        Holder::Person(name.parse().expect("a name"))
+    }
+
+    fn connected(all: &Arc<HttpConnections>, holder: &Holder, count: usize) -> Vec<Connection> {
+        let new = |_| {
+            let connection = Connection::default();
+            assert!(all.arrival().identified(holder, &connection));
+            connection
+        };
+        (0..count).map(new).collect()
+    }
+
+    fn cut(connections: &[Connection]) -> Vec<bool> {
+        connections.iter().map(|connection| connection.cut.is_cancelled()).collect()
+    }
+
+    #[test]
+    fn only_the_robots_own_connections_are_cut_and_nothing_is_kept() {
+        let all = Arc::new(HttpConnections::default());
+        let [one, other] = [(); 2].map(|()| RobotId::random());
+        let own = connected(&all, &Holder::Robot(one.clone()), 2);
+        assert!(all.arrival().identified(&Holder::Robot(one.clone()), &own[0]), "its next request");
+        let strangers = connected(&all, &Holder::Robot(other.clone()), 1);
+        all.end(&one);
+        assert_eq!((cut(&own), cut(&strangers)), (vec![true; 2], vec![false]));
+        // A connection that another robot's requests come by, behind a proxy, is that one's; or nobody's.
+        all.arrival().identified(&Holder::Robot(one.clone()), &strangers[0]);
+        all.end(&other);
+        strangers[0].release();
+        all.end(&one);
+        assert_eq!(cut(&strangers), [false]);
+        drop((own, strangers));
+        let held = all.held();
+        assert!(held.by_holder.is_empty() && held.by_count.is_empty());
+    }
+
+    #[test]
+    fn robot_put_out_while_its_token_is_looked_up_is_looked_up_again() {
+        let (all, robot) = (Arc::new(HttpConnections::default()), RobotId::random());
+        assert!(all.arrival().identified(&Holder::Robot(robot.clone()), &Connection::default()));
+        let arrival = all.arrival();
+        all.end(&robot);
+        assert!(!arrival.identified(&Holder::Robot(robot), &Connection::default()));
+    }
+
+    #[test]
+    fn holder_with_the_most_loses_its_oldest_until_it_has_its_share() {
+        let all = Arc::new(HttpConnections::default());
+        let viewer = connected(&all, &person("viewer"), 60);
+        let robots: Vec<_> = (0..5).map(|_| connected(&all, &Holder::Robot(RobotId::random()), 4)).collect();
+        let operator = connected(&all, &person("operator"), 1);
+        let cuts = (0..100).filter(|_| all.cut_oldest_of_largest(80)).count();
+        assert_eq!(cuts, 50, "80 connections for eight holders: ten each");
+        assert_eq!(cut(&viewer), [vec![true; 50], vec![false; 10]].concat());
+        assert!(!robots.iter().flatten().chain(&operator).any(|connection| connection.cut.is_cancelled()));
+    }
+
+    #[test]
+    fn a_robot_is_a_holder_like_any_other() {
+        let all = Arc::new(HttpConnections::default());
+        let flood = connected(&all, &Holder::Robot(RobotId::random()), 30);
+        let _operator = connected(&all, &person("operator"), 2);
+        assert!(all.cut_oldest_of_largest(32));
+        assert!(flood[0].cut.is_cancelled() && !flood[1].cut.is_cancelled());
+    }
+
+    #[test]
+    fn few_connections_are_never_too_many() {
+        let all = Arc::new(HttpConnections::default());
+        let _fleet: Vec<_> = (0..50).map(|_| connected(&all, &Holder::Robot(RobotId::random()), 2)).collect();
+        assert!(!all.cut_oldest_of_largest(100), "each has its share");
+        let small = Arc::new(HttpConnections::default());
+        let flood = connected(&small, &person("viewer"), 4);
+        assert!(small.cut_oldest_of_largest(4), "all places of a small server");
+        assert_eq!(cut(&flood), [true, false, false, false]);
+    }
+}

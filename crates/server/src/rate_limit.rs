@@ -1,0 +1,144 @@
+//! Token buckets: how often something may be done for long, and how much of it at once after a rest. They read no clock and
+//! keep nobody waiting: they say when it is somebody's turn.
+
+use std::collections::HashMap;
+use std::hash::Hash;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use tokio::time::Instant;
+
+/// What may be done at once after a rest, as time at the rate.
+pub const BURST: Duration = Duration::from_secs(10);
+/// The most that may have been done too much, as time at the rate: beyond that a storm would lock its sender out for hours.
+const MAX_DEBT: Duration = Duration::from_secs(10);
+/// How long a request may be held up; one that would wait longer is refused.
+pub const MAX_HELD: Duration = Duration::from_secs(2);
+/// Above this number of keys those are forgotten that have rested.
+const SWEEP_ABOVE: usize = 1_024;
+
+/// One limit. `next_at` is when the next one would be due if they came evenly; after a rest it is in the past.
+#[derive(Debug)]
+pub struct TokenBucket {
+    /// How long one takes at the rate.
+    each_ns: f64,
+    next_at: Instant,
+}
+
+impl TokenBucket {
+    /// A rested one.
+    pub fn new(per_s: u64, now: Instant) -> Self {
+        Self { each_ns: 1e9 / per_s.max(1) as f64, next_at: now.checked_sub(BURST).unwrap_or(now) }
+    }
+
+    /// Counts `number` more, and says until when that takes.
+    pub fn take(&mut self, number: u64, now: Instant) -> Instant {
+        let at = self.next_at.max(now.checked_sub(BURST).unwrap_or(now));
+        self.next_at = (at + self.time_of(number)).min(now + MAX_DEBT);
+        self.next_at
+    }
+
+    /// What was taken last was not used.
+    pub fn give_back(&mut self, number: u64) {
+        self.next_at -= self.time_of(number);
+    }
+
+    /// Whether all that may come at once may come now.
+    pub fn has_rested(&self, now: Instant) -> bool {
+        self.next_at + BURST <= now
+    }
+
+    fn time_of(&self, number: u64) -> Duration {
+        // What is cut off beyond 2^64 is more than any limit.
+        Duration::from_nanos((number as f64 * self.each_ns) as u64)
+    }
+}
+
+/// When a request's turn is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Turn {
+    /// It may go on, at once or then.
+    At(Instant),
+    /// That would take too long: it is refused, and may come again then.
+    Refused(Instant),
+}
+
+/// A bucket for each key. A key that has rested takes no memory for long.
+#[derive(Debug)]
+pub struct RateLimiter<K> {
+    per_s: u64,
+    buckets: Mutex<HashMap<K, TokenBucket>>,
+}
+
+impl<K: Eq + Hash> RateLimiter<K> {
+    /// One that lets `per_s` through for each key.
+    pub fn new(per_s: u64) -> Self {
+        Self { per_s, buckets: Mutex::default() }
+    }
+
+    /// One more comes. What is refused does not count, so however many come at once, the next turn stays in sight.
+    pub fn ask(&self, key: K, now: Instant) -> Turn {
+        self.with(key, now, |bucket| match bucket.take(1, now) {
+            until if until > now + MAX_HELD => {
+                bucket.give_back(1);
+                Turn::Refused(until)
+            }
+            until => Turn::At(until),
+        })
+    }
+
+    /// One that came has cost `number` more than was known when it came.
+    pub fn charge(&self, key: K, number: u64, now: Instant) {
+        self.with(key, now, |bucket| bucket.take(number, now));
+    }
+
+    fn with<T>(&self, key: K, now: Instant, change: impl FnOnce(&mut TokenBucket) -> T) -> T {
+        let mut buckets = self.buckets();
+        if buckets.len() >= SWEEP_ABOVE && !buckets.contains_key(&key) {
+            buckets.retain(|_, bucket| !bucket.has_rested(now));
+        }
+        change(buckets.entry(key).or_insert_with(|| TokenBucket::new(self.per_s, now)))
+    }
+
+    fn buckets(&self) -> MutexGuard<'_, HashMap<K, TokenBucket>> {
+        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing half-done.
+        self.buckets.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SECOND: Duration = Duration::from_secs(1);
+
+    #[test]
+    fn burst_passes_then_the_rate_and_the_rest_is_refused_for_its_key_alone() {
+        let (limiter, start) = (RateLimiter::new(10), Instant::now());
+        let served_in_second = |second: u32| {
+            let now = start + SECOND * second;
+            (0..500).filter(|_| matches!(limiter.ask("one", now), Turn::At(_))).count()
+        };
+        assert_eq!(served_in_second(0), 120, "ten seconds' worth at once, two more are held up");
+        assert_eq!((1..=10).map(served_in_second).sum::<usize>(), 100);
+        assert_eq!(limiter.ask("other", start), Turn::At(start - BURST + SECOND / 10));
+    }
+
+    #[test]
+    fn what_cost_more_than_was_known_delays_the_next() {
+        let (limiter, now) = (RateLimiter::new(10), Instant::now());
+        limiter.charge("one", 1_000_000, now);
+        assert!(matches!(limiter.ask("one", now), Turn::Refused(_)));
+        assert!(matches!(limiter.ask("one", now + MAX_DEBT), Turn::At(_)), "the debt is bounded");
+    }
+
+    #[test]
+    fn keys_that_have_rested_are_forgotten() {
+        let (limiter, start) = (RateLimiter::new(10), Instant::now());
+        for key in 0..SWEEP_ABOVE {
+            limiter.ask(key, start);
+        }
+        limiter.ask(SWEEP_ABOVE, start + BURST + SECOND);
+        assert_eq!(limiter.buckets().len(), 1);
+    }
+}

@@ -187,7 +187,14 @@ mod tests {
             server_key: task_proto::envelope::SigningKey::random().public_key(),
             ca_pin: None,
             client_key: None,
-            mqtt: MqttEndpoint { host: None, port: 1883, prefix: Default::default(), tls: false, external: None },
+            mqtt: MqttEndpoint {
+                host: None,
+                port: 1883,
+                prefix: Default::default(),
+                tls: false,
+                external: None,
+                alternatives: Vec::new(),
+            },
             mac: "02:00:00:00:00:01".parse().expect("valid"),
             awaits_approval: false,
         };

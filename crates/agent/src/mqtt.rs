@@ -18,13 +18,13 @@ use rumqttc::{
     Publish, QoS, StateError, Transport,
 };
 use task_proto::RobotId;
-use task_proto::api::{ExternalBroker, MqttEndpoint};
+use task_proto::api::{ExternalBroker, MqttEndpoint, MqttPlace};
 use task_proto::desired::{Doorbell, MAX_DOORBELL_BYTES};
 use task_proto::report::{MAX_REPORT_BYTES, Status};
 use task_proto::request::Request;
 use task_proto::topic::{RobotTopic, Topic, TopicPrefix};
 use task_transport::{Line, LineError, Route};
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 use tokio::time::Instant;
 
 use self::room::MessageRoom;
@@ -72,7 +72,7 @@ pub struct MqttAccess {
     pub port: u16,
     /// What all topics start with.
     pub prefix: TopicPrefix,
-    /// Client id and user name.
+    /// User name, and the client id unless the endpoint names another one.
     pub robot: RobotId,
     /// The password at the server's own broker.
     pub token: Credential,
@@ -106,23 +106,30 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
     // Whether the server has been seen to send packages as messages larger than usual.
     let mut sends_large = false;
     let mut endpoint = shared.endpoint.subscribe();
+    let (mut told, mut place) = (None, 0);
     loop {
         access.status.connection += 1;
         let begun = Instant::now();
         let room = MessageRoom::of(&access, &shared, sends_large);
-        let (there, external, is_encrypted) = access.at(endpoint.borrow_and_update().as_ref());
-        let way = access.ways.next(&there.host, there.port, is_encrypted, external.as_ref());
-        let session = session(&there, external.as_ref(), way, &shared, &heard, &mut talk, room);
+        let newest = endpoint.borrow_and_update().clone();
+        if newest != told {
+            (told, place) = (newest, 0);
+        }
+        let (there, places) = (access.destination(told.as_ref(), place), place_count(told.as_ref()));
+        let (at, external) = (access.at(&there), there.external.as_ref());
+        let way = access.ways.next(&there.host, there.port, there.is_encrypted, external);
+        let session = session(&at, external, way, &shared, &heard, &mut talk, room);
         let ended = tokio::select! {
             // Cancel-safe: nothing follows. The broker notices that the session is gone.
             ended = session => ended,
-            Ok(()) = endpoint.changed() => Ended::Moved,
+            () = moved(&mut endpoint, &access, &there) => Ended::Moved,
         };
         let was_up = shared.mqtt_up.send_replace(false);
         shared.mqtt_stores.send_replace(false);
         shared.mqtt_tried.send_replace(true);
         if !was_up {
             shared.find.notify_one();
+            place = (place + 1) % places;
             if matches!(ended, Ended::Lost(_) | Ended::Unreachable(_)) {
                 access.ways.turn();
             }
@@ -159,7 +166,9 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
                 (0, MAX_BACKOFF_MS)
             }
         };
-        let wait = Duration::from_millis(backoff_ms(failures, max_ms, rand::random()).max(min_ms));
+        // The wait grows with each round of all places.
+        let rounds = failures.div_ceil(places as u32);
+        let wait = Duration::from_millis(backoff_ms(rounds, max_ms, rand::random()).max(min_ms));
         tokio::select! {
             // Cancel-safe: a timer that is made anew each time.
             () = tokio::time::sleep(wait) => {}
@@ -171,15 +180,52 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
     }
 }
 
+/// Where one session goes, and as whom.
+#[derive(Clone, PartialEq, Eq)]
+struct Destination {
+    host: String,
+    port: u16,
+    prefix: TopicPrefix,
+    /// Whether the port speaks TLS.
+    is_encrypted: bool,
+    /// What is otherwise there than at the server's own broker.
+    external: Option<ExternalBroker>,
+}
+
 impl MqttAccess {
-    /// What holds at `endpoint`, what is otherwise there than at the server's own broker, and whether it speaks TLS.
-    fn at(&self, endpoint: Option<&MqttEndpoint>) -> (Self, Option<ExternalBroker>, bool) {
-        let Some(MqttEndpoint { host, port, prefix, tls, external }) = endpoint.cloned() else {
-            return (self.clone(), None, false);
+    /// The place with this number among those that the server names, beginning with 0.
+    fn destination(&self, endpoint: Option<&MqttEndpoint>, number: usize) -> Destination {
+        let Some(MqttEndpoint { host, port, prefix, tls, external, alternatives }) = endpoint.cloned() else {
+            let (host, prefix) = (self.host.clone(), self.prefix.clone());
+            return Destination { host, port: self.port, prefix, is_encrypted: false, external: None };
         };
+        let other = number.checked_sub(1).and_then(|at| alternatives.into_iter().nth(at));
+        let MqttPlace { host, port, tls } = other.unwrap_or(MqttPlace { host, port, tls });
         let host = host.unwrap_or_else(|| self.host.clone());
-        (Self { host, port, prefix, ..self.clone() }, external, tls)
+        Destination { host, port, prefix, is_encrypted: tls, external }
     }
+
+    /// The same access at this destination.
+    fn at(&self, there: &Destination) -> Self {
+        let Destination { host, port, prefix, .. } = there.clone();
+        Self { host, port, prefix, ..self.clone() }
+    }
+}
+
+/// How many places the server names.
+fn place_count(endpoint: Option<&MqttEndpoint>) -> usize {
+    1 + endpoint.map_or(0, |endpoint| endpoint.alternatives.len())
+}
+
+/// Waits until the server names another place first than `there`, where a session is or is tried.
+async fn moved(endpoint: &mut watch::Receiver<Option<MqttEndpoint>>, access: &MqttAccess, there: &Destination) {
+    // Cancel-safe: a watch remembers that it changed.
+    while endpoint.changed().await.is_ok() {
+        if access.destination(endpoint.borrow_and_update().as_ref(), 0) != *there {
+            return;
+        }
+    }
+    std::future::pending().await
 }
 
 /// What was published and is not acknowledged, the first one first.
@@ -497,7 +543,8 @@ impl Session<'_> {
 }
 
 fn options(access: &MqttAccess, external: Option<&ExternalBroker>, line: &Line, room: MessageRoom) -> MqttOptions {
-    let mut options = MqttOptions::new(access.robot.as_str(), line.name(), access.port);
+    let client_id = external.and_then(|external| external.client_id.as_deref()).unwrap_or(access.robot.as_str());
+    let mut options = MqttOptions::new(client_id, line.name(), access.port);
     options.set_transport(Transport::Unix);
     let password = external.map_or_else(|| access.token.current(), |external| external.password.clone());
     options.set_credentials(access.robot.as_str(), password);

@@ -26,7 +26,7 @@ pub use self::enrolment::{AWAITS_APPROVAL, EnrollmentTokenList, EnrollmentTokenV
 pub use self::feed::{FeedEntry, FeedKind, FeedPage, MAX_FEED_ENTRIES};
 pub use self::history::{MAX_TIMELINE, PastAssignment, TaskHistory, TimelineEntry, VitalsView};
 pub use self::logs::{LogEvent, LogsFrom, LogsQuery, LogsView};
-pub use self::mqtt::{BrokerFiles, ExternalBroker, MqttEndpoint};
+pub use self::mqtt::{BrokerCheck, BrokerChecks, BrokerFiles, ExternalBroker, MqttEndpoint, MqttPlace, NatsFile};
 pub use self::orders::{RetryDeployment, RolledBack};
 pub use self::packages::{
     ChangedFile, PackageDiff, PackageFile, PackageFileKind, PackageFiles, PackageList, PackageUse, PackageVersions,

@@ -11,6 +11,48 @@ use task_proto::RobotId;
 const SCHEMES: [(&str, u16, bool); 2] = [("mqtt://", 1883, false), ("mqtts://", 8883, true)];
 /// More than any name or password needs; MQTT itself allows 64 KiB.
 const MAX_BYTES: usize = 512;
+/// The most brokers in one list. A robot tries them one after another.
+const MAX_BROKERS: usize = 8;
+
+/// One URL or several, separated by commas: brokers with the same accounts, in the order in which they are tried.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct BrokerUrls(Vec<BrokerUrl>);
+
+impl BrokerUrls {
+    /// The brokers; at least one.
+    pub fn all(&self) -> &[BrokerUrl] {
+        &self.0
+    }
+
+    /// The first one, whose user and password all have.
+    pub fn first(&self) -> &BrokerUrl {
+        &self.0[0]
+    }
+}
+
+impl FromStr for BrokerUrls {
+    type Err = InvalidBrokerUrl;
+
+    fn from_str(text: &str) -> Result<Self, InvalidBrokerUrl> {
+        let begins = |text: &str| SCHEMES.iter().any(|(scheme, ..)| text.trim_start().starts_with(scheme));
+        // A password may hold a comma: only one that a URL follows separates.
+        let mut ends: Vec<usize> =
+            text.match_indices(',').map(|(at, _)| at).filter(|at| begins(&text[at + 1..])).collect();
+        ends.push(text.len());
+        let mut begin = 0;
+        let mut urls: Vec<BrokerUrl> = Vec::with_capacity(ends.len());
+        for end in ends {
+            urls.push(text[begin..end].trim().parse()?);
+            begin = end + 1;
+        }
+        let account = |url: &BrokerUrl| (url.user_name.clone(), url.password.clone());
+        match urls.iter().any(|url| account(url) != account(&urls[0])) {
+            true => Err(InvalidBrokerUrl::Accounts),
+            false if urls.len() > MAX_BROKERS => Err(InvalidBrokerUrl::TooMany),
+            false => Ok(Self(urls)),
+        }
+    }
+}
 
 /// `mqtt://user:password@host:port`, or `mqtts://…`.
 #[derive(Clone, PartialEq, Eq)]
@@ -45,6 +87,12 @@ pub enum InvalidBrokerUrl {
     /// No host, or one that no machine can have.
     #[error("its host is none: expected a name, an IPv4 address or an IPv6 address in brackets")]
     Host,
+    /// Several URLs with different users or passwords.
+    #[error("its URLs name different users or passwords: the brokers of a list share one password file")]
+    Accounts,
+    /// More URLs than a robot would try.
+    #[error("it names more than 8 brokers")]
+    TooMany,
     /// No port from 1 to 65535.
     #[error("its port is not a number from 1 to 65535")]
     Port,
@@ -152,6 +200,20 @@ mod tests {
         assert_eq!((url.address().as_str(), url.is_loopback(), url.tls), ("[::1]:1883", true, false));
         let url: BrokerUrl = "mqtts://taskd:x@broker.lab".parse().expect("valid");
         assert_eq!((url.address().as_str(), url.tls), ("broker.lab:8883", true));
+    }
+
+    #[test]
+    fn list_of_urls_is_split_at_commas_before_a_url() {
+        let urls: BrokerUrls = "mqtt://taskd:a,b@one.lab, mqtts://taskd:a,b@two.lab:1".parse().expect("valid");
+        let addresses: Vec<_> = urls.all().iter().map(|url| (url.address(), url.tls)).collect();
+        assert_eq!(addresses, [("one.lab:1883".to_owned(), false), ("two.lab:1".to_owned(), true)]);
+        assert_eq!(urls.first().password, "a,b");
+        let refused = |text: &str| text.parse::<BrokerUrls>().expect_err(text);
+        assert_eq!(refused("mqtt://taskd:a@one,mqtt://other:a@two"), InvalidBrokerUrl::Accounts);
+        assert_eq!(refused("mqtt://taskd:a@one,mqtt://taskd:b@two"), InvalidBrokerUrl::Accounts);
+        assert_eq!(refused("mqtt://taskd:a@one,mqtt://taskd@two"), InvalidBrokerUrl::NoCredentials);
+        assert_eq!(refused("mqtt://taskd:a@one,two"), InvalidBrokerUrl::Host);
+        assert_eq!(refused(&["mqtt://taskd:a@one"; 9].join(",")), InvalidBrokerUrl::TooMany);
     }
 
     #[test]

@@ -22,7 +22,7 @@ pub use self::oidc::{OidcSettings, RoleRule, private_url};
 use self::settings::{SETTINGS, Setting};
 pub use self::tables::{PersonRates, SiteLimits, TransferLimits};
 pub use self::tls::TlsSettings;
-use crate::broker_url::BrokerUrl;
+use crate::broker_url::{BrokerUrl, BrokerUrls};
 use crate::conduct::ConductLimits;
 use crate::delivery::{Rule, Rules};
 
@@ -35,8 +35,8 @@ pub struct Config {
     pub http: SocketAddr,
     /// Where MQTT listens; port 0 takes a free one.
     pub mqtt: SocketAddr,
-    /// The MQTT broker to be a client of; absent: the server's own, which listens at `mqtt`.
-    pub broker: Option<BrokerUrl>,
+    /// The MQTT brokers to be a client of, one at a time; absent: the server's own, which listens at `mqtt`.
+    pub broker: Option<BrokerUrls>,
     /// The authority behind its certificate; absent: the system's roots vouch for it.
     pub broker_pin: Option<CaPin>,
     /// The database's URL; absent: SQLite in the data directory.
@@ -212,6 +212,12 @@ pub enum ConfigError {
         /// Which setting.
         name: &'static str,
     },
+    /// One public place, where robots are told several brokers.
+    #[error(
+        "public_mqtt_host and public_mqtt_port name one place, and broker names several; robots are told the hosts and \
+         ports in broker"
+    )]
+    OnePlaceForSeveralBrokers,
     /// The broker's password would cross the network readable.
     #[error(
         "broker = {address}: an unencrypted connection to another machine is refused; use mqtts://, a broker on this machine or \
@@ -331,8 +337,12 @@ impl Config {
     fn check(&self) -> Result<(), ConfigError> {
         self.oidc.check()?;
         let is_exposed = |broker: &&BrokerUrl| !broker.tls && !broker.is_loopback() && !self.allow_plaintext;
-        if let Some(broker) = self.broker.as_ref().filter(is_exposed) {
+        let brokers = self.broker.as_ref().map(BrokerUrls::all).unwrap_or_default();
+        if let Some(broker) = brokers.iter().find(is_exposed) {
             return Err(ConfigError::PlaintextBroker { address: broker.address() });
+        }
+        if brokers.len() > 1 && (self.public_mqtt_host.is_some() || self.public_mqtt_port.is_some()) {
+            return Err(ConfigError::OnePlaceForSeveralBrokers);
         }
         match (&self.tls.certificate, &self.tls.key) {
             (Some(_), None) => Err(ConfigError::HalfACertificate { given: "tls.certificate", missing: "tls.key" }),
@@ -632,7 +642,7 @@ mod tests {
         let url = "mqtt://taskd:swordfish@localhost:1884";
         let config = load(&[], &[("TASKD_BROKER", url), ("TASKD_MQTT", "0.0.0.0:1883")], None).expect("loads");
         assert!(!format!("{config:?}").contains("swordfish"));
-        assert_eq!(config.broker.expect("external").address(), "localhost:1884");
+        assert_eq!(config.broker.expect("external").first().address(), "localhost:1884");
         let back = load(&[("broker", "embedded")], &[("TASKD_BROKER", url)], None).expect("loads");
         assert_eq!(back.broker, None);
         let elsewhere = Some("broker = \"mqtt://taskd:swordfish@broker.lab\"");
@@ -645,6 +655,18 @@ mod tests {
             assert!(!message.contains("swordfish"), "{message}");
         }
         assert!(load(&[("allow-plaintext", "true")], &[], elsewhere).is_ok());
+    }
+
+    #[test]
+    fn list_of_brokers_is_checked_as_a_whole() {
+        let both = "mqtt://taskd:swordfish@localhost:1884,mqtts://taskd:swordfish@broker.lab";
+        let config = load(&[], &[("TASKD_BROKER", both)], None).expect("loads");
+        assert_eq!(config.broker.expect("external").all().len(), 2);
+        let one_place = load(&[("public-mqtt-host", "wifi.lab")], &[("TASKD_BROKER", both)], None);
+        assert!(one_place.expect_err("one host for two").contains("public_mqtt_host"));
+        let plain = both.replace("mqtts", "mqtt");
+        let refused = load(&[], &[("TASKD_BROKER", &plain)], None).expect_err("readable on the way");
+        assert!(refused.contains("broker.lab:1883"), "{refused}");
     }
 
     #[test]

@@ -3,10 +3,10 @@
 
 use std::net::SocketAddr;
 use std::sync::Arc;
+use std::sync::atomic::AtomicUsize;
 use std::time::Duration;
 
 use task_proto::api::{FeedKind, ListenerView};
-use task_proto::envelope::PublicKey;
 use tokio::sync::broadcast::{
     self,
     error::{RecvError, TryRecvError},
@@ -38,7 +38,7 @@ use crate::http::traffic::HttpTotals;
 use crate::http::upload::UploadSpace;
 use crate::http::{App, AppParts, listener};
 use crate::http_connections::HttpConnections;
-use crate::mqtt_access::MqttAccess;
+use crate::mqtt_access::{MqttAccess, server_client_id};
 use crate::oidc::{OidcSetUpError, Provider};
 use crate::presence::Presence;
 use crate::readiness::{DiskProbe, Readiness, ReadinessCheck};
@@ -152,8 +152,7 @@ impl Server {
             StoreGatekeeper::new(store.clone(), clock.clone(), presence.clone(), http_connections.clone(), told);
         let conduct = Conduct::new(config.robots);
         let broker = broker_config(&config, tls.clone(), conduct.clone());
-        let (broker, mqtt) =
-            start_broker(&config, broker, &data, &public_key, Arc::new(gatekeeper), Arc::new(uplink)).await?;
+        let (broker, mqtt) = start_broker(&config, broker, &data, Arc::new(gatekeeper), Arc::new(uplink)).await?;
 
         let has_provider = !config.oidc.issuer.is_empty();
         let provider = has_provider.then(|| Provider::new(config.oidc.clone())).transpose()?.map(Arc::new);
@@ -492,29 +491,30 @@ async fn start_broker(
     config: &Config,
     embedded: BrokerConfig,
     data: &DataDirectory,
-    key: &PublicKey,
     gatekeeper: Arc<dyn Gatekeeper>,
     inbox: Arc<dyn Inbox>,
 ) -> Result<(Broker, MqttAccess), ServeError> {
     let (host, prefix) = (config.public_mqtt_host.clone(), config.topic_prefix.clone());
-    let Some(url) = &config.broker else {
+    let Some(brokers) = &config.broker else {
         let encrypts = embedded.tls.is_some();
         let broker = Broker::start(embedded, gatekeeper, inbox).await?;
         let bound = broker.local_addr().map_or(0, |bound| bound.port());
         let port = config.public_mqtt_port.unwrap_or(bound);
         return Ok((broker, MqttAccess::embedded(host, port, prefix, encrypts)));
     };
+    let (secret, pin, current) = (data.broker_secret()?, config.broker_pin, Arc::<AtomicUsize>::default());
     let access = MqttAccess::external(
-        url,
-        config.broker_pin,
+        brokers.clone(),
+        current.clone(),
+        pin,
         host,
         config.public_mqtt_port,
         prefix.clone(),
-        data.broker_secret()?,
+        secret,
     );
-    // The same over restarts, so that a session which the network forgot ends when the next begins.
-    let client_id = format!("taskd-{}", key.id());
-    Ok((Broker::connect(ExternalConfig { url: url.clone(), pin: config.broker_pin, client_id, prefix }, inbox), access))
+    let client_id = server_client_id(&secret);
+    let external = ExternalConfig { brokers: brokers.clone(), current, pin, client_id, prefix };
+    Ok((Broker::connect(external, inbox), access))
 }
 
 /// Where the server listens, as bound.

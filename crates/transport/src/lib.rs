@@ -11,5 +11,5 @@ pub mod websocket;
 pub use client_key::{CertificateError, ClientKey, InvalidKey, key_in};
 pub use dial::{DialError, Duplex, Route, dial};
 pub use line::{Line, LineError};
-pub use probe::{Probed, certificate_end_ms, greet_mqtt};
+pub use probe::{DisplaceError, MqttLogin, Probed, certificate_end_ms, displaces, greet_mqtt};
 pub use trust::{BUILT_MS, Clock, Trust, WrongServer, pin_of};

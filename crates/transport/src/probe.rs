@@ -1,19 +1,30 @@
-//! Looks whether somebody answers as it should, for those who search for what is wrong. Nothing is proven by it and nobody
-//! is let in: no password travels, and no failed attempt is counted.
+//! Looks whether somebody answers as it should, for those who search for what is wrong. Greetings let nobody in: no password
+//! travels, and no failed attempt is counted. Only [`displaces`] signs in, with accounts that are there for nothing else.
 
 use std::io;
 use std::sync::Arc;
+use std::time::Duration;
 
 use rustls::CertificateError;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::time::timeout;
 
-use crate::dial::{DialError, Route, dial};
+use crate::dial::{DialError, Duplex, Route, dial};
 use crate::trust::{Clock, Trust};
 
 /// A CONNECT of a protocol that there is not: whoever speaks MQTT refuses it by that reason, before asking who it is.
 const GREETING: [u8; 14] = [0x10, 12, 0, 4, b'M', b'Q', b'T', b'T', 0x7f, 0x02, 0, 10, 0, 0];
 /// The first byte of a CONNACK.
 const CONNACK: u8 = 0x20;
+/// PINGREQ and PINGRESP.
+const PING: [u8; 2] = [0xc0, 0];
+const PONG: [u8; 2] = [0xd0, 0];
+/// CONNECT's flags for a clean session, a user name and a password.
+const CONNECT_FLAGS: u8 = 0b1100_0010;
+/// The keepalive of a session that is over within seconds.
+const KEEP_ALIVE_S: u16 = 30;
+/// How long a broker may take to close the session that it replaces.
+const CLOSING: Duration = Duration::from_millis(500);
 /// 2200-01-01: no certificate of today is good then.
 const FAR_FUTURE_MS: u64 = 7_258_118_400_000;
 
@@ -37,6 +48,95 @@ pub async fn greet_mqtt(route: &Route) -> Result<Probed, DialError> {
     }
     .await;
     Ok(if greeted.is_ok() && answer[0] == CONNACK { Probed::Mqtt } else { Probed::SomethingElse })
+}
+
+/// An account at an MQTT broker.
+#[derive(Clone, Copy)]
+pub struct MqttLogin<'a> {
+    /// The user name.
+    pub user_name: &'a str,
+    /// The password.
+    pub password: &'a str,
+}
+
+/// Why it can't be said whether one account displaces another.
+#[derive(Debug, thiserror::Error)]
+pub enum DisplaceError {
+    /// There is no connection.
+    #[error(transparent)]
+    Dial(#[from] DialError),
+    /// The broker does not let the account in.
+    #[error("the broker refuses the user {user_name} (CONNACK {code})")]
+    Refused {
+        /// The account.
+        user_name: String,
+        /// The return code.
+        code: u8,
+    },
+    /// The connection ended before the broker had let the account in.
+    #[error("the broker closes the connection of the user {user_name}")]
+    Closed {
+        /// The account.
+        user_name: String,
+        /// The error of the connection.
+        source: io::Error,
+    },
+}
+
+/// Whether an MQTT 3.1.1 broker ends the session of the first account when the second one connects with the same client id.
+/// Waits for as long as the broker takes to answer.
+pub async fn displaces(route: &Route, client_id: &str, logins: [MqttLogin<'_>; 2]) -> Result<bool, DisplaceError> {
+    let mut first = sign_in(route, client_id, logins[0]).await?;
+    let _second = sign_in(route, client_id, logins[1]).await?;
+    let mut answer = [0; 2];
+    let is_alive = async {
+        first.write_all(&PING).await?;
+        first.flush().await?;
+        first.read_exact(&mut answer).await
+    };
+    if is_alive.await.is_err() || answer != PONG {
+        return Ok(true);
+    }
+    // Some brokers close the older session a moment later.
+    Ok(timeout(CLOSING, first.read_exact(&mut answer)).await.is_ok())
+}
+
+async fn sign_in(route: &Route, client_id: &str, login: MqttLogin<'_>) -> Result<Box<dyn Duplex>, DisplaceError> {
+    let mut stream = dial(route).await?;
+    let mut answer = [0; 4];
+    let answered: io::Result<()> = async {
+        stream.write_all(&connect_packet(client_id, login)).await?;
+        stream.flush().await?;
+        stream.read_exact(&mut answer).await.map(drop)
+    }
+    .await;
+    let user_name = || login.user_name.to_owned();
+    answered.map_err(|source| DisplaceError::Closed { user_name: user_name(), source })?;
+    match answer {
+        [CONNACK, 2, _, 0] => Ok(stream),
+        [.., code] => Err(DisplaceError::Refused { user_name: user_name(), code }),
+    }
+}
+
+/// A CONNECT of MQTT 3.1.1 with a clean session.
+fn connect_packet(client_id: &str, login: MqttLogin<'_>) -> Vec<u8> {
+    let mut body = vec![0, 4, b'M', b'Q', b'T', b'T', 4, CONNECT_FLAGS];
+    body.extend(KEEP_ALIVE_S.to_be_bytes());
+    for text in [client_id, login.user_name, login.password] {
+        // Longer ones than MQTT allows are cut, and refused by the broker.
+        let bytes = &text.as_bytes()[..text.len().min(usize::from(u16::MAX))];
+        body.extend((bytes.len() as u16).to_be_bytes());
+        body.extend(bytes);
+    }
+    let mut packet = vec![0x10];
+    let mut length = body.len();
+    while length > 0x7f {
+        packet.push(0x80 | (length & 0x7f) as u8);
+        length >>= 7;
+    }
+    packet.push(length as u8);
+    packet.extend(body);
+    packet
 }
 
 /// When the certificate ends that is shown there, in milliseconds since the Unix epoch: what TLS complains of when its clock

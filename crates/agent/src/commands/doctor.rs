@@ -10,7 +10,7 @@ use nix::sys::resource::{Resource, getrlimit};
 use nix::unistd::{AccessFlags, access};
 use reqwest::Url;
 use rustls::ClientConfig;
-use task_proto::api::MqttEndpoint;
+use task_proto::api::{MqttEndpoint, MqttPlace};
 use task_proto::checkup::{Checkup, Verdict};
 use task_proto::time::{parse_timestamp, span};
 use task_transport::{Probed, Route, Trust, certificate_end_ms, greet_mqtt};
@@ -214,24 +214,28 @@ async fn mqtt(
     let has_websocket = mqtt.external.is_none() && transport != MqttTransport::Tcp;
     // A broker that is not the server's own has nothing but its port.
     let has_port = mqtt.external.is_some() || transport != MqttTransport::Websocket;
-    let mqtt_tls = match (&mqtt.external, mqtt.tls) {
+    let mqtt_tls = |is_encrypted| match (&mqtt.external, is_encrypted) {
         (_, false) => None,
         (None, true) => Some(tls.clone()),
         (Some(broker), true) => Some(Arc::new(Trust::by(broker.ca_pin).client_config(clock::for_certificates()))),
     };
-    let by_port = Route {
-        host: mqtt.host.clone().unwrap_or_else(|| host.clone()),
-        port: mqtt.port,
-        tls: mqtt_tls,
+    let by_port = |place: &MqttPlace| Route {
+        host: place.host.clone().unwrap_or_else(|| base.host_str().unwrap_or_default().to_owned()),
+        port: place.port,
+        tls: mqtt_tls(place.tls),
         websocket: None,
     };
+    let first = MqttPlace { host: mqtt.host.clone(), port: mqtt.port, tls: mqtt.tls };
     let by_http = Route {
         host,
         port: base.port_or_known_default().unwrap_or_default(),
-        tls: (base.scheme() == "https").then_some(tls),
+        tls: (base.scheme() == "https").then(|| tls.clone()),
         websocket: Some(format!("{}/mqtt", base.path().trim_end_matches('/'))),
     };
-    let is_reached = has_port && greet(checkup, "mqtt", &by_port, has_websocket).await;
+    let mut is_reached = has_port && greet(checkup, "mqtt", &by_port(&first), has_websocket).await;
+    for place in &mqtt.alternatives {
+        is_reached |= greet(checkup, "mqtt", &by_port(place), is_reached).await;
+    }
     if has_websocket {
         greet(checkup, "websocket", &by_http, is_reached).await;
     }

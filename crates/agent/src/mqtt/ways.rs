@@ -87,7 +87,7 @@ mod tests {
         assert_eq!(direct(&ways), own_port);
         ways.turn();
         assert_eq!(direct(&ways), websocket);
-        let broker = ExternalBroker { password: "secret".to_owned(), ca_pin: None };
+        let broker = ExternalBroker { password: "secret".to_owned(), client_id: None, ca_pin: None };
         assert_eq!(
             shown(ways.next("broker.lab", 1883, false, Some(&broker))),
             ("broker.lab".to_owned(), 1883, None, false),

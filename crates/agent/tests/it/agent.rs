@@ -131,6 +131,7 @@ async fn a_new_token_is_on_the_disk_before_it_is_used_and_the_old_one_until_it_w
             prefix: Default::default(),
             tls: false,
             external: None,
+            alternatives: Vec::new(),
         },
         mac: "02:00:00:00:00:01".parse().unwrap(),
         awaits_approval: false,

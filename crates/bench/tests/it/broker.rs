@@ -19,26 +19,31 @@ use tokio::net::TcpStream;
 use crate::harness::{PATIENCE, Process, Robot, Server, add_ballast, eventually, write_package};
 use crate::proxy::Proxy;
 
-const PASSWORD: &str = "the-servers-password";
+pub const PASSWORD: &str = "the-servers-password";
 
 /// A mosquitto without any state of its own, on one port as long as the test lasts.
-struct Mosquitto {
+pub struct Mosquitto {
     process: Option<Process>,
     dir: PathBuf,
-    address: SocketAddr,
+    pub address: SocketAddr,
     scheme: &'static str,
 }
 
 impl Mosquitto {
-    async fn start(dir: &Path) -> Self {
+    pub async fn start(dir: &Path) -> Self {
         let mut mosquitto = Self::new(dir);
         mosquitto.launch().await;
         mosquitto
     }
 
     /// Known, and not started yet.
-    fn new(dir: &Path) -> Self {
-        let dir = dir.join("mosquitto");
+    pub fn new(dir: &Path) -> Self {
+        Self::named(dir, "mosquitto")
+    }
+
+    /// One of several.
+    pub fn named(dir: &Path, name: &str) -> Self {
+        let dir = dir.join(name);
         std::fs::create_dir(&dir).expect("directory");
         // Nothing else is likely to take the port until mosquitto does: it can't be given one that is bound.
         let free = TcpListener::bind("127.0.0.1:0").expect("port");
@@ -70,7 +75,7 @@ impl Mosquitto {
         certificate.pin
     }
 
-    async fn launch(&mut self) {
+    pub async fn launch(&mut self) {
         // Not on every user's path.
         let mut command = ["/usr/sbin/mosquitto", "/usr/local/sbin/mosquitto"]
             .iter()
@@ -81,17 +86,32 @@ impl Mosquitto {
     }
 
     /// `kill -9`: all that it knew is gone.
-    fn kill(&mut self) {
+    pub fn kill(&mut self) {
         self.process.take().expect("it runs").kill();
     }
 
     /// What the server's setting says.
-    fn url(&self) -> String {
+    pub fn url(&self) -> String {
         format!("{}://taskd:{PASSWORD}@{}", self.scheme, self.address)
     }
 
+    /// Its configuration from its next start on: that of `taskd broker conf`, with this directory and on loopback only.
+    pub async fn configure(&self, server: &Server) {
+        let conf = server.operate(["broker", "conf"]).await;
+        let (port, path) = (self.address.port(), self.dir.display().to_string());
+        let conf = conf.replace(&format!("listener {port}\n"), &format!("listener {port} 127.0.0.1\n"));
+        let conf = conf.replace("/etc/mosquitto/taskd.", &format!("{path}/"));
+        let user = if nix::unistd::geteuid().is_root() { "user root\n" } else { "" };
+        std::fs::write(self.dir.join("conf"), format!("{conf}{user}log_dest file {path}/log\n")).expect("written");
+    }
+
+    /// What it has logged.
+    pub fn log(&self) -> String {
+        std::fs::read_to_string(self.dir.join("log")).expect("a log")
+    }
+
     /// What an operator does after robots were enrolled: new files, then SIGHUP.
-    async fn learn(&self, server: &Server) {
+    pub async fn learn(&self, server: &Server) {
         for file in ["acl", "passwd"] {
             let text = server.operate(["broker", file]).await;
             assert!(!text.contains(PASSWORD));
@@ -109,12 +129,12 @@ async fn connected(server: &Server) -> Option<u64> {
     Some(info.traffic.robots_connected)
 }
 
-async fn wait_connected(server: &Server, robots: u64) {
+pub async fn wait_connected(server: &Server, robots: u64) {
     eventually(&format!("{robots} robots at the broker"), async || (connected(server).await? == robots).then_some(()))
         .await;
 }
 
-async fn says(server: &Server, what: &str) {
+pub async fn says(server: &Server, what: &str) {
     eventually(&format!("/readyz to say {what:?}"), async || {
         let said = server.readiness().await?;
         (said["status"] == "not_ready" && said["broker"].as_str()?.contains(what)).then_some(())
@@ -123,14 +143,14 @@ async fn says(server: &Server, what: &str) {
 }
 
 /// A service that says something on both streams.
-fn worker(dir: &Path, version: &str) -> PathBuf {
+pub fn worker(dir: &Path, version: &str) -> PathBuf {
     let package = dir.join(format!("worker-{version}"));
     let script = format!("echo hello {version}; echo oops {version} >&2; exec sleep 1000\n");
     write_package(&package, "worker", version, "service", &script);
     package
 }
 
-async fn runs(server: &Server, robot: &str, version: &str) {
+pub async fn runs(server: &Server, robot: &str, version: &str) {
     eventually(&format!("{robot} to run {version}"), async || {
         let view = server.robot(robot).await?;
         let task = view.tasks.into_iter().find(|task| task.task.as_str() == "worker")?;
@@ -139,7 +159,7 @@ async fn runs(server: &Server, robot: &str, version: &str) {
     .await;
 }
 
-async fn logs(server: &Server, robot: &str) -> LogsView {
+pub async fn logs(server: &Server, robot: &str) -> LogsView {
     let out = server.operate(["logs", robot, "-o", "json"]).await;
     serde_json::from_str(&out).unwrap_or_else(|error| panic!("{error}: {out}"))
 }
@@ -257,7 +277,7 @@ async fn an_encrypted_mosquitto_is_known_by_its_pin_on_both_sides() {
 }
 
 /// A client with a robot's own name and password at the broker.
-async fn spy(mosquitto: &Mosquitto, robot: &Robot, id: &str) -> (AsyncClient, EventLoop) {
+pub async fn spy(mosquitto: &Mosquitto, robot: &Robot, id: &str) -> (AsyncClient, EventLoop) {
     let identity: Value =
         serde_json::from_slice(&std::fs::read(robot.data().join("identity.json")).expect("identity")).expect("json");
     let password = identity["mqtt"]["external"]["password"].as_str().expect("a password from the enrolment");
@@ -267,7 +287,7 @@ async fn spy(mosquitto: &Mosquitto, robot: &Robot, id: &str) -> (AsyncClient, Ev
     AsyncClient::new(options, 16)
 }
 
-async fn next(events: &mut EventLoop) -> Packet {
+pub async fn next(events: &mut EventLoop) -> Packet {
     loop {
         if let Event::Incoming(packet) =
             tokio::time::timeout(PATIENCE, events.poll()).await.expect("in time").expect("a session")
@@ -326,6 +346,48 @@ async fn a_robots_password_at_mosquitto_opens_its_own_topics_only() {
     }
     publish(&client, &mut events, own, "status", status(false)).await;
     wait_connected(&server, 0).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn server_and_robots_fail_over_to_the_next_broker_of_the_list() {
+    let dir = TempDir::new().expect("temp dir");
+    let mut brokers = [Mosquitto::named(dir.path(), "first"), Mosquitto::named(dir.path(), "second")];
+    let list = format!("{}, {}", brokers[0].url(), brokers[1].url());
+    let server = Server::start_unready(&dir.path().join("server"), &[("TASKD_BROKER", &list)]).await;
+    let robot = Robot::start(&server, dir.path(), "robot-1", 1).await;
+    for broker in &mut brokers {
+        broker.learn(&server).await;
+        broker.launch().await;
+    }
+    server.wait_ready().await;
+    wait_connected(&server, 1).await;
+    let is_at = async |broker: &Mosquitto| {
+        let info: ServerInfo = serde_json::from_value(server.get("/api/v1/server").await.expect("it answers"));
+        info.expect("its facts").mqtt == broker.address.to_string()
+    };
+    // It is at the one that was up first when it tried.
+    let (at, other) = if is_at(&brokers[0]).await { (0, 1) } else { (1, 0) };
+    server.push(&worker(dir.path(), "1.0.0"), "*").await;
+    runs(&server, "robot-1", "1.0.0").await;
+
+    brokers[at].kill();
+    eventually("the server to be at the other broker", async || is_at(&brokers[other]).await.then_some(())).await;
+    server.wait_ready().await;
+    wait_connected(&server, 1).await;
+    server.push(&worker(dir.path(), "2.0.0"), "*").await;
+    runs(&server, "robot-1", "2.0.0").await;
+    let view = logs(&server, "robot-1").await;
+    assert_eq!(view.from, LogsFrom::Robot, "asked over the second broker");
+
+    // An agent that knows one address is told the broker at which the server is.
+    let token: Value = serde_json::from_slice(&std::fs::read(robot.data().join("identity.json")).expect("identity"))
+        .expect("json");
+    let url = server.url(&format!("/api/v1/robots/{}/mqtt", robot.id));
+    let token = token["token"].as_str().expect("a token");
+    let told = reqwest::Client::new().get(url).bearer_auth(token).send().await.expect("an answer");
+    let told: Value = told.json().await.expect("an endpoint");
+    assert_eq!(told["port"], brokers[other].address.port(), "{told}");
+    assert_eq!(told["alternatives"][0]["port"], brokers[at].address.port(), "{told}");
 }
 
 #[tokio::test(flavor = "multi_thread")]

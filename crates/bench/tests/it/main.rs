@@ -2,6 +2,7 @@
 
 mod approval;
 mod broker;
+mod client_ids;
 mod confinement;
 mod corridor;
 mod crash;

@@ -10,8 +10,8 @@ use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 use task_proto::api::{
     ConductTotals, CreateDeployment, DeliveryChoice, DeliveryDecision, EnrollRequest, EnrollResponse, ErrorBody, Event,
-    ExternalBroker, HttpTraffic, LogEvent, LogsFrom, LogsView, MqttConnection, MqttEndpoint, MqttTraffic, OutputList,
-    OutputView, ReportReply, RobotToken, ServerInfo, Traffic,
+    ExternalBroker, HttpTraffic, LogEvent, LogsFrom, LogsView, MqttConnection, MqttEndpoint, MqttPlace, MqttTraffic,
+    OutputList, OutputView, ReportReply, RobotToken, ServerInfo, Traffic,
 };
 use task_proto::desired::{
     BlobRef, Delivery, DesiredState, DesiredTask, Doorbell, Evidence, Inline, PackageRef, SignatureRef, Wanted,
@@ -393,12 +393,22 @@ fn documents_of_the_api() {
             robot_id: robot(),
             name: parsed("atlas"),
             token: "tskr_…".to_owned(),
-            mqtt: MqttEndpoint { host: None, port: 1883, prefix: TopicPrefix::default(), tls: true, external: None },
+            mqtt: MqttEndpoint {
+                host: None,
+                port: 1883,
+                prefix: TopicPrefix::default(),
+                tls: true,
+                external: None,
+                alternatives: Vec::new(),
+            },
             awaits_approval: false,
         },
     );
-    let external =
-        Some(ExternalBroker { password: "…".to_owned(), ca_pin: Some(task_proto::CaPin::of(b"authority")) });
+    let external = Some(ExternalBroker {
+        password: "…".to_owned(),
+        client_id: Some("r00000000000000a1-…".to_owned()),
+        ca_pin: Some(task_proto::CaPin::of(b"authority")),
+    });
     check(
         "mqtt_endpoint.json",
         &MqttEndpoint {
@@ -407,6 +417,7 @@ fn documents_of_the_api() {
             prefix: TopicPrefix::default(),
             tls: true,
             external,
+            alternatives: vec![MqttPlace { host: Some("broker2.lab".to_owned()), port: 8883, tls: true }],
         },
     );
     check_text("robot_token.json", &RobotToken { token: "tskr_…".to_owned() });

@@ -26,7 +26,7 @@ use tokio::sync::watch;
 
 use crate::conduct::Conduct;
 use crate::tls::{ClientProof, Tls};
-pub use external::{CANARY_LEVEL, ExternalConfig};
+pub use external::{CANARY_LEVEL, ExternalConfig, external_route};
 use external::{Crowd, External};
 pub use fan_out::{FanOut, FanOutError, FanOutSettings, MAX_PART_BYTES, Part, PartQos};
 use front::Front;
@@ -411,7 +411,7 @@ impl Broker {
         }
     }
 
-    /// Where the broker is, `host:port`.
+    /// Where the broker is, `host:port`; of several external ones that which the server was connected to last.
     pub fn address(&self) -> String {
         match &self.kind {
             Kind::Embedded(front) => front.local_addr().to_string(),

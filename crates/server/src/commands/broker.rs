@@ -1,7 +1,7 @@
 //! `taskd broker`: what an external broker has to know, for its own files.
 
 use clap::Subcommand;
-use task_proto::api::BrokerFiles;
+use task_proto::api::{BrokerFiles, NatsFile};
 
 use super::output::stream_text;
 use super::{CommandError, Outcome, Session};
@@ -13,14 +13,21 @@ pub enum Action {
     Acl,
     /// Print the password file of the server and all robots, as mosquitto reads it (password_file)
     Passwd,
+    /// Print the configuration of mosquitto's listener
+    Conf,
+    /// Print users, password hashes and permissions, as nats-server reads them (authorization)
+    Nats,
 }
 
 pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, CommandError> {
-    let files: BrokerFiles = session.client.get("/broker", &[]).await?;
+    let files = async || session.client.get::<BrokerFiles>("/broker", &[]).await;
+    let text = match action {
+        Action::Acl => files().await?.acl,
+        Action::Passwd => files().await?.passwd,
+        Action::Conf => files().await?.conf,
+        Action::Nats => session.client.get::<NatsFile>("/broker/nats", &[]).await?.authorization,
+    };
     // The broker reads it, so it is the same in every format.
-    stream_text(match action {
-        Action::Acl => &files.acl,
-        Action::Passwd => &files.passwd,
-    })?;
+    stream_text(&text)?;
     Ok(Outcome::Succeeded)
 }

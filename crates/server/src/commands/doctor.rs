@@ -5,9 +5,10 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
+use http::StatusCode;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
-use task_proto::api::{Me, RobotList, ServerInfo, ServerStatus, TokenList};
+use task_proto::api::{BrokerCheck, BrokerChecks, Me, RobotList, ServerInfo, ServerStatus, TokenList};
 use task_proto::checkup::{Checkup, Verdict};
 use task_proto::person::Permission;
 use task_proto::time::span;
@@ -283,10 +284,11 @@ async fn mqtt(checkup: &mut Checkup, client: &Client, info: &ServerInfo) {
         Err(problem) => return checkup.notice("mqtt", problem, "look at the server's log"),
     };
     if broker.kind == "external" {
-        return match broker.healthy {
+        match broker.healthy {
             true => checkup.good("mqtt", format!("the external broker at {} serves", info.mqtt)),
             false => checkup.bad("mqtt", broker.detail, "the broker must run, and know the server (taskd broker acl)"),
-        };
+        }
+        return external_brokers(checkup, client).await;
     }
     let Some((bound, port)) = info.mqtt.rsplit_once(':').and_then(|(host, port)| Some((host, port.parse().ok()?)))
     else {
@@ -319,6 +321,38 @@ async fn mqtt(checkup: &mut Checkup, client: &Client, info: &ServerInfo) {
         }
         Ok(Err(error)) => checkup.notice("websocket", error.to_string(), mend),
         Err(_) => checkup.notice("websocket", "MQTT over the HTTP port does not answer within 5 s", mend),
+    }
+}
+
+/// Whether one account at an external broker can end the session of another. The server tests that: it has the accounts.
+async fn external_brokers(checkup: &mut Checkup, client: &Client) {
+    let answer = timeout(3 * PATIENCE, client.get::<BrokerChecks>("/broker/check", &[])).await;
+    let checks = match answer {
+        Ok(Ok(checks)) => checks,
+        // That takes an administrator, and a server that knows the test.
+        Ok(Err(ClientError::Refused { status: StatusCode::FORBIDDEN | StatusCode::NOT_FOUND, .. })) => return,
+        Ok(Err(error)) => return checkup.notice("client-ids", error.to_string(), "look at the server's log"),
+        Err(_) => {
+            return checkup.notice("client-ids", "the server's test of the broker takes long", "look at the broker");
+        }
+    };
+    for BrokerCheck { address, displaces, problem } in checks.brokers {
+        match displaces {
+            Some(false) => {
+                checkup.good("client-ids", format!("at {address} no user can end another's session by its client id"));
+            }
+            Some(true) => checkup.notice(
+                "client-ids",
+                format!("at {address} a user who knows another's client id can end its session, and keep it off"),
+                "mosquitto: use_username_as_clientid true (taskd broker conf), then restart it; NATS has no such setting: \
+                 there agents of this version are safe, since nobody else knows their client ids (docs/broker.md)",
+            ),
+            None => checkup.notice(
+                "client-ids",
+                format!("the broker at {address} could not be tested: {}", problem.unwrap_or_default()),
+                "give it the newest files (taskd broker passwd, or nats): they have the two accounts for this test",
+            ),
+        }
     }
 }
 

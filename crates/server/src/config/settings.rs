@@ -52,8 +52,9 @@ pub(super) const SETTINGS: &[Setting] = &[
     Setting {
         name: "broker",
         value_name: "URL",
-        help: "mqtt(s)://USER:PASSWORD@HOST[:PORT] of a broker to use instead of the server's own; in the file or TASKD_BROKER \
-               only, since everybody on the machine can read this command line [default: embedded]",
+        help: "mqtt(s)://USER:PASSWORD@HOST[:PORT] of a broker to use instead of the server's own, or several separated by \
+               commas, which are tried in this order; in the file or TASKD_BROKER only, since everybody on the machine \
+               can read this command line [default: embedded]",
         set: |config, text| {
             config.broker = if text == "embedded" { None } else { Some(parsed(text)?) };
             Ok(())

@@ -272,6 +272,8 @@ pub fn routes() -> Vec<Route> {
         route!(GET "/api/v1/server/sessions", Person(Read), status::sessions),
         route!(GET "/api/v1/server/rules", Person(Read), status::rules),
         route!(GET "/api/v1/broker", Person(Administer), broker::files),
+        route!(GET "/api/v1/broker/nats", Person(Administer), broker::nats_file),
+        route!(GET "/api/v1/broker/check", Person(Administer), broker::check),
         route!(GET "/api/v1/session", Anyone, session::show),
         route!(POST "/api/v1/session", Anyone, session::sign_in),
         route!(DELETE "/api/v1/session", Person(Read), session::sign_out),

@@ -1,5 +1,5 @@
-//! A broker that is not ours: the server is a client of it, with one session that is begun anew, with jitter, whenever it
-//! ends. What MQTT 3.1.1 does not tell a client is not known here: who listens, who was let in, from where. Who is there
+//! Brokers that are not ours: the server is a client of one of them, with one session that is begun anew, with jitter,
+//! whenever it ends, there or at the next. What MQTT 3.1.1 does not tell a client is not known here: who listens, who was let in, from where. Who is there
 //! follows from what robots say; nobody can be put out. Messages prove only what the broker's access control list does:
 //! the robot that a topic names. Reports never come this way (see docs/decisions).
 
@@ -8,6 +8,7 @@ mod outbox;
 mod present;
 mod session;
 
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -21,7 +22,7 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use super::{Health, Inbox, NotAsked, NotConnected, PartQos};
-use crate::broker_url::BrokerUrl;
+use crate::broker_url::{BrokerUrl, BrokerUrls};
 use crate::clock::Clock;
 pub(super) use crowd::Crowd;
 use outbox::{Letter, Outbox};
@@ -42,12 +43,14 @@ const FIRST_PAUSE: Duration = Duration::from_millis(500);
 /// A session that lasted this long shows that the way is good: the pauses begin anew.
 const GOOD_SESSION: Duration = Duration::from_secs(30);
 
-/// Which broker, and as whom.
+/// Which brokers, and as whom.
 #[derive(Debug, Clone)]
 pub struct ExternalConfig {
-    /// Where it is, with the server's user and password there.
-    pub url: BrokerUrl,
-    /// The authority behind its certificate; absent: the system's roots vouch for it.
+    /// Where they are, with the server's user and password there. One at a time is used; the next one when it fails.
+    pub brokers: BrokerUrls,
+    /// Which one a session was up at last, for those who tell robots.
+    pub current: Arc<AtomicUsize>,
+    /// The authority behind their certificates; absent: the system's roots vouch for them.
     pub pin: Option<CaPin>,
     /// The MQTT client id; the broker ends an older session of the same id.
     pub client_id: String,
@@ -55,19 +58,24 @@ pub struct ExternalConfig {
     pub prefix: TopicPrefix,
 }
 
-impl ExternalConfig {
-    fn route(&self) -> Route {
-        let tls = || Arc::new(Trust::by(self.pin).client_config(Clock::for_certificates()));
-        let tls = self.url.tls.then(tls);
-        Route { host: self.url.host.clone(), port: self.url.port, tls, websocket: None }
-    }
+/// How the broker at `url` is reached.
+pub fn external_route(url: &BrokerUrl, pin: Option<CaPin>) -> Route {
+    let tls = || Arc::new(Trust::by(pin).client_config(Clock::for_certificates()));
+    Route { host: url.host.clone(), port: url.port, tls: url.tls.then(tls), websocket: None }
+}
+
+/// One of the brokers.
+pub(super) struct Place {
+    /// Its number in the list.
+    number: usize,
+    url: BrokerUrl,
+    /// How it is reached.
+    route: Route,
 }
 
 /// The connection to the broker, for as long as the server runs.
 pub(super) struct External {
     config: ExternalConfig,
-    /// How it is reached.
-    route: Route,
     inbox: Arc<dyn Inbox>,
     outbox: Mutex<Outbox>,
     /// Something was put into the outbox.
@@ -88,10 +96,9 @@ impl External {
     pub(super) fn start(config: ExternalConfig, inbox: Arc<dyn Inbox>) -> (Arc<Self>, watch::Receiver<Health>) {
         let (sender, health) = watch::channel(Health::Recovering(format!(
             "the server has not connected to the broker at {} yet",
-            config.url.address()
+            config.brokers.first().address()
         )));
         let external = Arc::new(Self {
-            route: config.route(),
             config,
             inbox,
             outbox: Mutex::default(),
@@ -110,37 +117,62 @@ impl External {
 
     /// One session after another.
     async fn run(self: Arc<Self>, health: watch::Sender<Health>) {
-        let mut failures = 0u32;
+        let places = self.places();
+        let (mut failures, mut number) = (0u32, 0);
+        // What was wrong with each when it was tried last: the same is not said again.
+        let mut said = vec![None; places.len()];
         loop {
-            let begun = tokio::time::Instant::now();
-            let ended = session::run(&self, &health).await;
-            self.leave();
+            let (place, begun) = (&places[number], tokio::time::Instant::now());
+            let ended = session::run(&self, place, &health).await;
+            let was_up = self.leave();
             let Some(ended) = ended else { return };
             lock(&self.traffic).connections_refused += u64::from(ended.is_refusal());
             failures = if begun.elapsed() >= GOOD_SESSION { 0 } else { failures.saturating_add(1) };
-            let seen = ended.text(&self.config.url);
-            let is_news = health.send_if_modified(|health| {
-                let finding = Health::Recovering(seen.clone());
-                std::mem::replace(health, finding.clone()) != finding
-            });
-            if is_news {
+            let seen = ended.text(&place.url);
+            if was_up {
+                said.fill(None);
+            }
+            if said[number].as_ref() != Some(&seen) {
                 tracing::warn!("{seen}; robots poll until it is back");
             }
+            let finding = Health::Recovering(seen.clone());
+            health.send_if_modified(|health| std::mem::replace(health, finding.clone()) != finding);
+            said[number] = Some(seen);
+            if !was_up {
+                number = (number + 1) % places.len();
+            }
+            // The wait grows with each round of all brokers.
+            let rounds = failures / places.len() as u32;
             tokio::select! {
-                () = tokio::time::sleep(pause(failures, rand::random())) => {}
+                () = tokio::time::sleep(pause(rounds, rand::random())) => {}
                 () = self.stop.cancelled() => return,
             }
         }
     }
 
-    /// No session: nobody can be reached, and who is there is found out anew in the next one.
-    fn leave(&self) {
-        lock(&self.outbox).close();
+    fn places(&self) -> Vec<Place> {
+        let place = |(number, url): (usize, &BrokerUrl)| Place {
+            number,
+            url: url.clone(),
+            route: external_route(url, self.config.pin),
+        };
+        self.config.brokers.all().iter().enumerate().map(place).collect()
+    }
+
+    /// No session: nobody can be reached, and who is there is found out anew in the next one. Whether there was one.
+    fn leave(&self) -> bool {
+        let was_up = {
+            let mut outbox = lock(&self.outbox);
+            let was_up = outbox.is_open();
+            outbox.close();
+            was_up
+        };
         self.taken.notify_waiters();
         let gone = lock(&self.present).clear();
         for (robot, number) in gone {
             self.inbox.disconnected(&robot, number);
         }
+        was_up
     }
 
     pub(super) fn ring(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotConnected> {
@@ -217,7 +249,9 @@ impl External {
     }
 
     pub(super) fn address(&self) -> String {
-        self.config.url.address()
+        let brokers = self.config.brokers.all();
+        let current = self.config.current.load(Ordering::Relaxed).min(brokers.len() - 1);
+        brokers[current].address()
     }
 
     pub(super) async fn shutdown(&self, patience: Duration) {

@@ -4,6 +4,7 @@
 use std::collections::VecDeque;
 use std::error::Error;
 use std::net::SocketAddr;
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use rumqttc::{
@@ -20,7 +21,7 @@ use tokio::time::Instant;
 use super::super::{Health, MAX_PART_BYTES, PartQos, RobotMessage};
 use super::outbox::Letter;
 use super::present::Turn;
-use super::{CANARY_LEVEL, External, lock};
+use super::{CANARY_LEVEL, External, Place, lock};
 use crate::broker_url::BrokerUrl;
 
 const KEEP_ALIVE: Duration = Duration::from_secs(20);
@@ -83,16 +84,16 @@ impl Ended {
 }
 
 /// Runs one session to its end; `None`: the server stops.
-pub(super) async fn run(external: &External, health: &watch::Sender<Health>) -> Option<Ended> {
+pub(super) async fn run(external: &External, place: &Place, health: &watch::Sender<Health>) -> Option<Ended> {
     let line = tokio::select! {
-        line = Line::open(&external.route, NETWORK_TIMEOUT) => line,
+        line = Line::open(&place.route, NETWORK_TIMEOUT) => line,
         () = external.stop.cancelled() => return None,
     };
     let line = match line {
         Ok(line) => line,
         Err(error) => return Some(Ended::Unreachable(error)),
     };
-    let (client, mut event_loop) = AsyncClient::new(options(external, &line), QUEUED);
+    let (client, mut event_loop) = AsyncClient::new(options(external, place, &line), QUEUED);
     event_loop.network_options.set_connection_timeout(NETWORK_TIMEOUT.as_secs());
     let (events_in, mut events) = mpsc::channel(QUEUED);
     // rumqttc's poll must not be dropped half way, so it runs in one future that lives as long as the session.
@@ -108,7 +109,7 @@ pub(super) async fn run(external: &External, health: &watch::Sender<Health>) -> 
     };
     let carrying = line.carry();
     tokio::pin!(pump, carrying);
-    let mut session = Session::new(external, client);
+    let mut session = Session::new(external, place, client);
     let deadline = Instant::now() + NETWORK_TIMEOUT + CANARY_PATIENCE;
     let ended = loop {
         tokio::select! {
@@ -155,8 +156,8 @@ fn with_causes(error: &dyn Error) -> String {
     text
 }
 
-fn options(external: &External, line: &Line) -> MqttOptions {
-    let url = &external.config.url;
+fn options(external: &External, place: &Place, line: &Line) -> MqttOptions {
+    let url = &place.url;
     let mut options = MqttOptions::new(&external.config.client_id, line.name(), url.port);
     options.set_transport(Transport::Unix);
     options.set_credentials(&url.user_name, &url.password);
@@ -169,6 +170,7 @@ fn options(external: &External, line: &Line) -> MqttOptions {
 
 struct Session<'a> {
     external: &'a External,
+    place: &'a Place,
     client: AsyncClient,
     canary: String,
     is_up: bool,
@@ -179,9 +181,9 @@ struct Session<'a> {
 }
 
 impl<'a> Session<'a> {
-    fn new(external: &'a External, client: AsyncClient) -> Self {
+    fn new(external: &'a External, place: &'a Place, client: AsyncClient) -> Self {
         let canary = format!("{}/{CANARY_LEVEL}", external.config.prefix);
-        Self { external, client, canary, is_up: false, unsent: VecDeque::new(), sent: VecDeque::new() }
+        Self { external, place, client, canary, is_up: false, unsent: VecDeque::new(), sent: VecDeque::new() }
     }
 
     /// Takes in what happened; whether the session has come up by that.
@@ -227,7 +229,8 @@ impl<'a> Session<'a> {
             return false;
         }
         self.is_up = true;
-        tracing::info!(broker = %self.external.address(), "connected to the MQTT broker");
+        self.external.config.current.store(self.place.number, Ordering::Relaxed);
+        tracing::info!(broker = %self.place.url.address(), "connected to the MQTT broker");
         lock(&self.external.traffic).connections_accepted += 1;
         lock(&self.external.outbox).open();
         self.external.inbox.everyone_may_be_there();

@@ -1,0 +1,96 @@
+//! The `authorization` block of a NATS server: each account with a bcrypt hash of its password and the subjects that MQTT
+//! maps its topics to. All else is denied, NATS' own subjects (`$MQTT.>`, `$JS.>`, `$SYS.>`) by name, and so is every
+//! protocol but MQTT: a NATS client with a robot's password could read other robots' sessions there.
+
+use std::fmt::Write as _;
+
+use task_proto::topic::{RobotTopic, TopicPrefix};
+
+use super::{Account, External, Role};
+use crate::broker::CANARY_LEVEL;
+
+/// The least that bcrypt knows: nobody guesses 256 bits.
+const DERIVED_COST: u32 = 4;
+/// The server's own password was thought up by a person.
+const SERVER_COST: u32 = 11;
+/// Subjects that NATS keeps sessions, streams and its own messages under.
+const DENIED: &str = r#""$MQTT.>", "$JS.>", "$SYS.>", "_INBOX.>""#;
+
+/// The whole block.
+pub(super) fn authorization(
+    external: &External,
+    accounts: &[Account],
+    prefix: &TopicPrefix,
+) -> Result<String, bcrypt::BcryptError> {
+    let mut text =
+        "# Written by `taskd broker nats`. Holds hashes, and no password.\nauthorization {\n  users = [\n".to_owned();
+    for account in accounts {
+        let hash = hash(external, account)?;
+        let (publish, subscribe) = subjects(account, prefix);
+        // Names are letters, digits and a few signs, and so are subjects: nothing needs to be escaped.
+        let _ = writeln!(
+            text,
+            "    {{ user: \"{}\", password: \"{hash}\", allowed_connection_types: [\"MQTT\"], permissions: {{\n      \
+             publish: {{ allow: [{publish}], deny: [{DENIED}] }}, subscribe: {{ allow: [{subscribe}], deny: [{DENIED}] }} }} }}",
+            account.user_name
+        );
+    }
+    text.push_str("  ]\n}\n");
+    Ok(text)
+}
+
+/// The salt follows from user and password, so that the same robots make the same file.
+fn hash(external: &External, account: &Account) -> Result<String, bcrypt::BcryptError> {
+    let Account { user_name, password, .. } = account;
+    let cost = if account.is_derived() { DERIVED_COST } else { SERVER_COST };
+    let mut salt = [0; 16];
+    salt.copy_from_slice(&external.derived(&format!("bcrypt salt {user_name} {password}"))[..16]);
+    Ok(bcrypt::hash_with_salt(password, cost, salt)?.format_for_version(bcrypt::Version::TwoA))
+}
+
+/// What the account may publish and subscribe to, as lists of quoted subjects.
+fn subjects(account: &Account, prefix: &TopicPrefix) -> (String, String) {
+    let prefix = subject(prefix.as_str());
+    let list =
+        |subjects: Vec<String>| subjects.iter().map(|subject| format!("\"{subject}\"")).collect::<Vec<_>>().join(", ");
+    let of_robot = |robot: &str, topics: &[RobotTopic]| -> Vec<String> {
+        topics.iter().map(|topic| format!("{prefix}.r.{robot}.{}", topic.as_str())).collect()
+    };
+    let to_robots = [RobotTopic::Desired, RobotTopic::Request];
+    let from_robots = [RobotTopic::Status, RobotTopic::Reply, RobotTopic::Log, RobotTopic::Telemetry];
+    let (parts, canary) = (format!("{prefix}.p.*"), format!("{prefix}.{CANARY_LEVEL}"));
+    match account.role {
+        Role::Server => {
+            let (mut publish, mut subscribe) = (of_robot("*", &to_robots), of_robot("*", &from_robots));
+            publish.extend([parts, canary.clone()]);
+            subscribe.push(canary);
+            (list(publish), list(subscribe))
+        }
+        Role::Robot => {
+            let mut subscribe = of_robot(&account.user_name, &to_robots);
+            subscribe.push(parts);
+            (list(of_robot(&account.user_name, &from_robots)), list(subscribe))
+        }
+        // Without a list of what is allowed, all that is not denied would be.
+        Role::Probe => {
+            let own = format!("{prefix}.probe.{}", account.user_name);
+            (list(vec![own.clone()]), list(vec![own]))
+        }
+    }
+}
+
+/// A topic as NATS maps it: a level is a token, and a dot in a level is written `//`.
+fn subject(topic: &str) -> String {
+    topic.replace('.', "//").replace('/', ".").replace("..", "//")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn topic_becomes_the_subject_that_nats_maps_it_to() {
+        assert_eq!(subject("taskd/v1"), "taskd.v1");
+        assert_eq!(subject("fleet/v1.2/x"), "fleet.v1//2.x");
+    }
+}

@@ -2,21 +2,27 @@
 //! and says why, whatever a packer would not write: the bytes may come from anyone until their digest is known.
 //!
 //! Invariants: nothing is created outside the given directory, no symbolic link is ever followed, and no byte is
-//! written beyond what the task manifest announced, or the limits allow. It never hashes and never renames.
+//! written beyond what the task manifest announced, or the limits allow. [`check`] reads an archive by the same rules and
+//! writes nothing, so that a server that takes a package and a robot that unpacks it come to the same verdict. It never
+//! hashes the compressed bytes and never renames.
 
 mod entry;
+mod names;
 mod stream;
 mod tree;
 
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 
+use task_proto::Digest;
+use task_proto::digest::Algorithm;
 use task_proto::manifest::{
     CONTENT_RATIO_FREE_BYTES, ContentFacts, MAX_CONTENT_DEPTH, MAX_CONTENT_ENTRIES, MAX_CONTENT_RATIO,
     MAX_CONTENT_TAR_BYTES,
 };
 
 pub use self::entry::{Entry, Kind};
+use self::names::Names;
 use self::stream::{Blocks, Bound};
 use self::tree::Tree;
 
@@ -88,6 +94,19 @@ pub enum Refusal {
         /// How many were announced.
         announced: u64,
     },
+    /// The uncompressed archive is not the one its manifest describes.
+    #[error(
+        "the uncompressed archive hashes to {found}, where the task manifest says {announced} (content.tar_digest)"
+    )]
+    OtherDigest {
+        /// Its digest.
+        found: Digest,
+        /// The announced one.
+        announced: Digest,
+    },
+    /// The manifest describes the uncompressed archive by a digest that nobody compares.
+    #[error("content.tar_digest: {0} is no SHA-256 digest")]
+    DigestAlgorithm(Digest),
     /// An entry is something a package must not hold.
     #[error("entry {name}: {reason}")]
     Entry {
@@ -118,7 +137,7 @@ impl Refusal {
 pub enum Compression {
     /// As it is.
     None,
-    /// In one zstd frame.
+    /// In zstd frames: one or more, and skippable ones between them.
     Zstd,
 }
 
@@ -146,20 +165,25 @@ pub fn unpack_unannounced(
 
 fn unpack_all<R: Read>(mut entries: Entries<R>, limits: &Limits, staging: &Path) -> Result<(), UnpackError> {
     let mut tree = Tree::create(staging, limits)?;
-    while let Some(Entry { path, kind }) = entries.next()? {
-        match kind {
-            Kind::Directory => tree.directory(&path)?,
-            Kind::Symlink { target } => tree.symlink(&path, target)?,
-            Kind::HardLink { target } => tree.hard_link(&path, &target)?,
-            Kind::File { executable, .. } => {
-                let mut file = tree.file(&path, executable)?;
-                entries.content(|bytes| {
-                    file.write_all(bytes).map_err(|source| UnpackError::Disk { path: staging.join(&path), source })
-                })?;
-            }
+    while let Some(entry) = entries.next()? {
+        if let Some(mut file) = tree.add(&entry)? {
+            entries.content(|bytes| {
+                file.write_all(bytes).map_err(|source| UnpackError::Disk { path: staging.join(&entry.path), source })
+            })?;
         }
     }
     tree.finish()
+}
+
+/// Reads `content` as [`unpack`] does, to the same verdict, and writes nothing.
+pub fn check(content: impl Read, content_size: u64, facts: &ContentFacts, limits: &Limits) -> Result<(), UnpackError> {
+    let mut entries = Entries::announced(content, content_size, facts, limits)?;
+    let mut names = Names::new(limits);
+    while let Some(entry) = entries.next()? {
+        names.add(&entry)?;
+    }
+    names.symlinks()?;
+    Ok(())
 }
 
 /// An archive's entries, one after the other. What is between them is checked as they are read; whether a name comes twice, or
@@ -184,7 +208,7 @@ impl<R: Read> Entries<R> {
     ) -> Result<Self, UnpackError> {
         admit(content_size, facts, limits)?;
         let blocks = Blocks::new(content, Compression::Zstd, Bound::Exactly(facts.tar_size), u64::MAX)?;
-        Ok(Self::new(blocks, limits, Bound::Exactly(facts.entries)))
+        Ok(Self::new(blocks.with_digest(facts.tar_digest), limits, Bound::Exactly(facts.entries)))
     }
 
     /// Of an archive of which nothing is known.
@@ -234,7 +258,10 @@ fn admit(content_size: u64, facts: &ContentFacts, limits: &Limits) -> Result<(),
             return Err(Refusal::Limit { what, found, limit });
         }
     }
-    Ok(())
+    match facts.tar_digest.algorithm() {
+        Algorithm::Sha256 => Ok(()),
+        Algorithm::Sha512 => Err(Refusal::DigestAlgorithm(facts.tar_digest)),
+    }
 }
 
 /// A name for people: escaped, and cut to a length that fits a line.

@@ -2,6 +2,8 @@
 
 use std::io::{self, BufRead as _, BufReader, Read};
 
+use sha2::{Digest as _, Sha256};
+use task_proto::Digest;
 use task_proto::manifest::CONTENT_RATIO_FREE_BYTES;
 use zstd::stream::read::Decoder;
 
@@ -52,6 +54,8 @@ pub(super) struct Blocks<R: Read> {
     size: Bound,
     /// Uncompressed bytes for one compressed byte.
     ratio: u64,
+    /// What the uncompressed bytes hash to so far, and are to hash to in all, if that was announced.
+    digest: Option<(Sha256, Digest)>,
 }
 
 enum Bytes<R: Read> {
@@ -104,13 +108,20 @@ impl<R: Read> Blocks<R> {
         let source = Source { content, taken: 0, failed: false };
         let bytes = match compression {
             Compression::None => Bytes::Plain(BufReader::with_capacity(COPY_BUFFER_BYTES, source)),
-            // One frame only: each further one could announce a window and a size of its own.
+            // RFC 8878 allows several frames, and skippable ones. The window's limit holds for each of them, since only one
+            // window is held at a time; all other limits are about the bytes of all frames together.
             Compression::Zstd => Decoder::new(source)
-                .and_then(|mut decoder| decoder.window_log_max(WINDOW_LOG_MAX).map(|()| decoder.single_frame()))
+                .and_then(|mut decoder| decoder.window_log_max(WINDOW_LOG_MAX).map(|()| decoder))
                 .map(Bytes::Zstd)
                 .map_err(UnpackError::Source)?,
         };
-        Ok(Self { bytes, position: 0, size, ratio })
+        Ok(Self { bytes, position: 0, size, ratio, digest: None })
+    }
+
+    /// The same with the digest that the uncompressed bytes must have in the end.
+    pub(super) fn with_digest(mut self, digest: Digest) -> Self {
+        self.digest = Some((Sha256::new(), digest));
+        self
     }
 
     /// Whether an entry may be so large; if not, why.
@@ -144,6 +155,9 @@ impl<R: Read> Blocks<R> {
         let limit = self.bytes.source().taken.saturating_mul(self.ratio).max(CONTENT_RATIO_FREE_BYTES);
         Bound::AtMost(limit).check("uncompressed bytes for so few compressed ones", found)?;
         self.position = found;
+        if let Some((hasher, _)) = &mut self.digest {
+            hasher.update(&buffer[..count]);
+        }
         Ok(count)
     }
 
@@ -192,7 +206,8 @@ impl<R: Read> Blocks<R> {
         Ok(bytes)
     }
 
-    /// After the end marker there is nothing but zeros, in the announced number, and nothing behind the frame.
+    /// After the end marker there is nothing but zeros, in the announced number, and nothing behind them; and the whole has
+    /// the announced digest.
     pub(super) fn finish(&mut self, buffer: &mut [u8]) -> Result<(), UnpackError> {
         loop {
             match self.read(buffer)? {
@@ -203,7 +218,13 @@ impl<R: Read> Blocks<R> {
         }
         self.size.check_end("uncompressed bytes", self.position)?;
         if self.bytes.goes_on().map_err(UnpackError::Source)? {
-            return Err(self.damaged("there are bytes after its zstd frame"));
+            return Err(self.damaged("there are bytes after its end"));
+        }
+        if let Some((hasher, announced)) = self.digest.take() {
+            let found = Digest::from_sha256(hasher.finalize().into());
+            if found != announced {
+                return Err(Refusal::OtherDigest { found, announced }.into());
+            }
         }
         Ok(())
     }

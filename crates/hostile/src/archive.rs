@@ -4,7 +4,7 @@ use std::fs;
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Component, Path};
 
-use task_archive::{Compression, Entries, Kind, Limits, Refusal, UnpackError, unpack, unpack_unannounced};
+use task_archive::{Compression, Entries, Kind, Limits, Refusal, UnpackError, check, unpack, unpack_unannounced};
 use task_proto::Digest;
 use task_proto::manifest::ContentFacts;
 use taskd::package::contents::list;
@@ -20,19 +20,19 @@ const MAGIC: std::ops::Range<usize> = 257..262;
 /// compressed gets the checksums that its headers need, and compressed.
 pub fn archive(bytes: &[u8]) {
     let plain = zstd::decode_all(bytes).ok().filter(|_| bytes.len() < 64 * 1024);
-    let (content, tar_size) = match plain {
-        Some(plain) => (bytes.to_vec(), plain.len()),
+    let (content, tar) = match plain {
+        Some(plain) => (bytes.to_vec(), plain),
         None => {
             let tar = with_checksums(bytes);
             unannounced(&tar, Compression::None);
-            (zstd::encode_all(&*tar, 1).expect("compressed"), bytes.len())
+            (zstd::encode_all(&*tar, 1).expect("compressed"), tar)
         }
     };
+    let mut facts = ContentFacts { tar_digest: Digest::of(&tar), tar_size: tar.len() as u64, entries: 0 };
     unannounced(&content, Compression::Zstd);
     // How many entries there are is found out by announcing too few.
-    let mut entries = 0;
-    while let Some(found) = unpacked(&content, tar_size as u64, entries) {
-        entries = entries.max(found);
+    while let Some(found) = unpacked(&content, &facts) {
+        facts.entries = facts.entries.max(found);
     }
 }
 
@@ -64,13 +64,19 @@ fn unannounced(content: &[u8], compression: Compression) {
     assert!(listed <= LIMITS.entries + 1 && (whole || unpacked.is_err()), "{listed} files, {unpacked:?}");
 }
 
-/// Unpacks as announced; the number of entries found, if more were than announced.
-fn unpacked(content: &[u8], tar_size: u64, entries: u64) -> Option<u64> {
-    let facts = ContentFacts { tar_digest: Digest::of(b""), tar_size, entries };
+/// Unpacks as announced; the number of entries found, if more were than announced. Who only checks the archive comes to the
+/// same verdict.
+fn unpacked(content: &[u8], facts: &ContentFacts) -> Option<u64> {
     let size = content.len() as u64;
-    match in_staging(tar_size, |staging| unpack(content, size, &facts, &LIMITS, staging)) {
+    let unpacked = in_staging(facts.tar_size, |staging| unpack(content, size, facts, &LIMITS, staging));
+    match check(content, size, facts, &LIMITS) {
+        Ok(()) => assert_eq!(unpacked, Ok(())),
+        Err(UnpackError::Refused(refusal)) => assert_eq!(unpacked, Err(refusal)),
+        Err(error) => panic!("the source does not fail: {error}"),
+    }
+    match unpacked {
         Ok(()) => {
-            let listed = list(content, size, &facts).expect("what can be unpacked can be listed");
+            let listed = list(content, size, facts).expect("what can be unpacked can be listed");
             assert!(listed.is_sorted_by(|one, next| one.path < next.path), "{listed:?}");
             None
         }

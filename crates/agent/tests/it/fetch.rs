@@ -6,11 +6,13 @@ use std::time::Duration;
 use axum::body::Bytes;
 use task_agent::fetch::{FetchError, FetchSettings, Fetcher};
 use task_agent::link_meter::LinkMeter;
+use task_proto::Digest;
+use task_proto::manifest::ContentFacts;
 use task_proto::report::{FailureCode, Progress};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
-use crate::archive::{Tar, noise, tar};
+use crate::archive::{Tar, compress, noise, tar};
 use crate::site::{Answer, Site, TOKEN, client, settings};
 
 #[tokio::test]
@@ -30,6 +32,28 @@ async fn a_package_gets_its_place_once() {
     assert_eq!(site.asked(), [0; 0], "what is there is not pulled again");
     fs::write(site.version().manifest(), "{}").unwrap();
     assert_eq!(site.fetcher.manifest(&site.package, &CancellationToken::new()).await.unwrap(), manifest);
+}
+
+#[tokio::test]
+async fn package_in_several_frames_gets_its_place() {
+    let tar = tar();
+    let (head, tail) = tar.bytes.split_at(tar.bytes.len() / 2 + 1);
+    let skippable = [&0x184D_2A50_u32.to_le_bytes()[..], &3_u32.to_le_bytes(), b"any"].concat();
+    let content = [compress(head), skippable, compress(tail)].concat();
+    let site = Site::with_content(content, tar.facts(), settings()).await;
+    site.pull().await.unwrap();
+    site.assert_in_place();
+}
+
+#[tokio::test]
+async fn archive_with_another_tar_digest_is_refused_and_leaves_nothing() {
+    let tar = tar();
+    let facts = ContentFacts { tar_digest: Digest::of(b"another archive"), ..tar.facts() };
+    let site = Site::with_content(tar.compressed(), facts, settings()).await;
+    let Err(FetchError::ArchiveRefused(refusal)) = site.pull().await else { panic!("it is in place") };
+    assert!(refusal.to_string().contains("content.tar_digest"), "{refusal}");
+    site.assert_nothing_staged();
+    assert!(!site.version().src().exists() && !site.part().exists());
 }
 
 #[tokio::test]

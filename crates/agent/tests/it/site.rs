@@ -87,8 +87,11 @@ impl Site {
     }
 
     pub async fn with(tar: &Tar, settings: FetchSettings) -> Self {
-        let content = tar.compressed();
-        let manifest = manifest(tar.facts());
+        Self::with_content(tar.compressed(), tar.facts(), settings).await
+    }
+
+    pub async fn with_content(content: Vec<u8>, facts: ContentFacts, settings: FetchSettings) -> Self {
+        let manifest = manifest(facts);
         let config = serde_json::to_vec(&manifest).unwrap();
         let blob = |bytes: &[u8]| BlobRef { digest: Digest::of(bytes), size: bytes.len() as u64 };
         let package = PackageRef {

@@ -20,6 +20,8 @@ use crate::package::Packed;
 
 /// How often a blob's upload is begun.
 const UPLOAD_TRIES: u32 = 4;
+/// How long a manifest's answer may take: the server reads a package's whole archive before it.
+const MANIFEST_TIMEOUT: std::time::Duration = std::time::Duration::from_secs(11 * 60);
 /// An upload slower than this is given up.
 const MIN_BYTES_PER_SECOND: u64 = 16 * 1024;
 /// How much is read from the file at once.
@@ -95,7 +97,10 @@ pub(super) async fn upload_signed(
     let reference = tag.unwrap_or_else(|| Digest::of(&manifest).to_string());
     let path = format!("/v2/{repository}/manifests/{reference}");
     client
-        .send(|| client.request(Method::PUT, &path).header(CONTENT_TYPE, MANIFEST_TYPE).body(manifest.clone()))
+        .send(|| {
+            let request = client.request(Method::PUT, &path).timeout(MANIFEST_TIMEOUT);
+            request.header(CONTENT_TYPE, MANIFEST_TYPE).body(manifest.clone())
+        })
         .await?;
     Ok(())
 }

@@ -1,6 +1,7 @@
 //! The HTTP edge: one table of routes, each with who may call it, in front of handlers that look up, act and reply.
 //! It never holds SQL and never decides what an order means.
 
+pub mod archives;
 mod ask;
 pub mod attempts;
 pub mod auth;
@@ -172,6 +173,7 @@ impl FromRef<App> for oci::Registry {
             clock: app.clock.clone(),
             transfers: app.transfers.clone(),
             changes: app.changes.clone(),
+            readers: app.uploads.readers.clone(),
         }
     }
 }
@@ -327,9 +329,9 @@ fn routes_of_work() -> Vec<Route> {
         route!(GET "/api/v1/packages", Person(Read), packages::list),
         route!(POST "/api/v1/packages", Person(Publish), upload::package).streaming(),
         route!(GET "/api/v1/packages/{package}", Person(Read), packages::show),
-        route!(GET "/api/v1/packages/{package}/diff", Person(Read), packages::diff).within(packages::READING),
+        route!(GET "/api/v1/packages/{package}/diff", Person(Read), packages::diff).within(archives::READING),
         route!(GET "/api/v1/packages/{package}/{version}/files", Person(Read), packages::files)
-            .within(packages::READING),
+            .within(archives::READING),
         route!(DELETE "/api/v1/packages/{package}/{version}", Person(Publish), packages::remove),
         route!(GET "/api/v1/outputs", Person(Read), outputs::list),
         route!(GET "/api/v1/deployments", Person(Read), deployments::list),

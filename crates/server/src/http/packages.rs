@@ -3,11 +3,7 @@
 
 use std::collections::HashSet;
 use std::fmt;
-use std::io;
 use std::str::FromStr;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
 
 use axum::Json;
 use axum::extract::State;
@@ -186,54 +182,17 @@ pub(super) fn in_use(by: &Person, package: &str, users: &PackageUsers) -> String
     )
 }
 
-/// How long a whole archive, or two, may take to be read.
-pub(super) const READING: Duration = Duration::from_secs(10 * 60);
-
 /// The entries of a package, read from its archive.
 async fn listed(app: &App, view: &PackageView) -> Result<Vec<PackageFile>, ApiError> {
     let content = view.package.content;
     let gone = || ApiError::not_found(format!("the content of {} is gone", view.package.name));
     let blob = app.blobs.get(content.digest).await?.ok_or_else(gone)?;
-    // A few at a time: each keeps a processor busy.
-    let turn = app.uploads.readers.clone().acquire_owned().await;
-    let (facts, given_up) = (view.manifest.content, Arc::new(AtomicBool::new(false)));
-    let reader = GivenUp { inner: blob.reader(), given_up: given_up.clone() };
-    let _guard = GiveUp(given_up);
-    let reading = tokio::task::spawn_blocking(move || {
-        let listed = contents::list(reader, content.size, &facts);
-        drop(turn);
-        listed
-    });
-    match reading.await {
-        Ok(Ok(files)) => Ok(files),
-        Ok(Err(UnpackError::Refused(refusal))) => {
-            Err(ApiError::new(StatusCode::UNPROCESSABLE_ENTITY, "archive_refused", refusal.to_string()))
+    let facts = view.manifest.content;
+    let listed = app.uploads.readers.read(&blob, move |bytes| contents::list(bytes, content.size, &facts)).await;
+    listed.map_err(|error| match error {
+        UnpackError::Refused(refusal) => {
+            ApiError::new(StatusCode::UNPROCESSABLE_ENTITY, "archive_refused", refusal.to_string())
         }
-        Ok(Err(error @ (UnpackError::Source(_) | UnpackError::Disk { .. }))) => Err(ApiError::internal(&error)),
-        Err(panic) => std::panic::resume_unwind(panic.into_panic()),
-    }
-}
-
-/// Says that nobody waits any more.
-struct GiveUp(Arc<AtomicBool>);
-
-impl Drop for GiveUp {
-    fn drop(&mut self) {
-        self.0.store(true, Ordering::Relaxed);
-    }
-}
-
-/// Ends with an error once nobody waits any more: a request has a deadline, and a thread none.
-struct GivenUp<R> {
-    inner: R,
-    given_up: Arc<AtomicBool>,
-}
-
-impl<R: io::Read> io::Read for GivenUp<R> {
-    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        if self.given_up.load(Ordering::Relaxed) {
-            return Err(io::Error::new(io::ErrorKind::TimedOut, "nobody waits for it"));
-        }
-        self.inner.read(buffer)
-    }
+        UnpackError::Source(_) | UnpackError::Disk { .. } => ApiError::internal(&error),
+    })
 }

@@ -20,6 +20,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::time::timeout;
 
 use super::App;
+use super::archives::ArchiveReaders;
 use super::error::ApiError;
 use super::oci::{self, OciError, Registry};
 use super::openapi::Created;
@@ -29,8 +30,6 @@ use crate::person::Person;
 
 /// Archives that are unpacked and packed at the same time.
 const AT_ONCE: usize = 2;
-/// How many look into packages at the same time.
-const READERS: usize = 2;
 /// With whoever has a place.
 const PATIENCE: Patience = Patience { silence: Duration::from_secs(60), whole: Duration::from_secs(60 * 60) };
 /// Pieces of a body that wait to be unpacked.
@@ -54,8 +53,8 @@ pub struct UploadSpace {
     places: Arc<Semaphore>,
     /// Those whose archive is being unpacked.
     uploading: Arc<Mutex<HashSet<UserName>>>,
-    /// Whose turn it is to look into a package.
-    pub(super) readers: Arc<Semaphore>,
+    /// Those who read whole archives.
+    pub(super) readers: ArchiveReaders,
 }
 
 impl UploadSpace {
@@ -63,8 +62,8 @@ impl UploadSpace {
     pub fn new(directory: PathBuf, most_bytes: u64) -> Self {
         let limits = Limits::default();
         let limits = Limits { bytes: limits.bytes.min(most_bytes), ..limits };
-        let [places, readers] = [AT_ONCE, READERS].map(|most| Arc::new(Semaphore::new(most)));
-        Self { directory, limits, places, uploading: Arc::default(), readers }
+        let places = Arc::new(Semaphore::new(AT_ONCE));
+        Self { directory, limits, places, uploading: Arc::default(), readers: ArchiveReaders::default() }
     }
 
     /// A place for one archive of this person, who may have one at a time.

@@ -16,7 +16,7 @@ use taskd::config::Config;
 use tempfile::TempDir;
 use tokio::time::timeout;
 
-use crate::harness::{TestRobot, TestServer, answer};
+use crate::harness::{TestRobot, TestServer, answer, archive_with};
 
 /// More than anything here takes, unless it hangs.
 const PATIENCE: Duration = Duration::from_secs(40);
@@ -25,7 +25,8 @@ const QUIET: Duration = Duration::from_millis(500);
 const CONTENT_BYTES: usize = 4 * 1024 * 1024 + 17;
 
 fn content() -> Vec<u8> {
-    (0..CONTENT_BYTES).map(|at| (at % 251) as u8).collect()
+    let bytes: Vec<u8> = (0..CONTENT_BYTES).map(|at| (at % 251) as u8).collect();
+    archive_with(&bytes)
 }
 
 async fn deploy(server: &TestServer, package: &PackageRef, selector: &str, key: &str) -> DeploymentView {

@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 use task_proto::api::{DeploymentView, EnrollResponse, EnrollmentToken, IDEMPOTENCY_KEY, RobotView, ServerInfo};
 use task_proto::desired::{BlobRef, DesiredState, DesiredTask, PackageRef};
 use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope};
-use task_proto::manifest::TaskKind;
+use task_proto::manifest::{ContentFacts, TaskKind};
 use task_proto::oci::{ImageManifest, MANIFEST_TYPE};
 use task_proto::report::{HostFacts, Phase, Report, TaskReport};
 use task_proto::token::Token;
@@ -110,12 +110,12 @@ impl TestServer {
         TestRobot::new(enrolled.robot_id, enrolled.token)
     }
 
-    /// Pushes a package that no robot could unpack, but every robot can be told of.
+    /// Pushes a package of one small file.
     pub async fn push(&self, name: &str, version: &str) -> PackageRef {
-        self.push_content(name, version, format!("content of {name} {version}").into_bytes()).await
+        self.push_content(name, version, archive_with(format!("content of {name} {version}").as_bytes())).await
     }
 
-    /// The same, with this content.
+    /// The same with the content that [`archive_with`] or [`archive_of`] made.
     pub async fn push_content(&self, name: &str, version: &str, content: Vec<u8>) -> PackageRef {
         let content_ref = BlobRef { digest: Digest::of(&content), size: content.len() as u64 };
         let config = json!({
@@ -123,7 +123,7 @@ impl TestServer {
             "version": version,
             "build": { "tool": "none" },
             "run": { "exec": ["sh", "main.sh"] },
-            "content": { "tar_digest": Digest::of(b"tar"), "tar_size": 3, "entries": 1 },
+            "content": archive_facts(),
         });
         let config = serde_json::to_vec(&config).expect("json");
         let config_ref = BlobRef { digest: Digest::of(&config), size: config.len() as u64 };
@@ -205,6 +205,36 @@ impl TestRobot {
             tasks: state.tasks.iter().map(|task| in_phase(task, phase)).collect(),
         }
     }
+}
+
+/// A package's content: an archive of one file, and `bytes` in a skippable zstd frame, so that they travel as they are.
+pub fn archive_with(bytes: &[u8]) -> Vec<u8> {
+    let mut content = zstd::encode_all(&*archive(), 1).expect("in memory");
+    content.extend(0x184D_2A50_u32.to_le_bytes());
+    content.extend(u32::try_from(bytes.len()).expect("a frame's length").to_le_bytes());
+    content.extend(bytes);
+    content
+}
+
+/// The same with as much of `fill` as makes it `size` bytes.
+pub fn archive_of(size: usize, fill: u8) -> Vec<u8> {
+    archive_with(&vec![fill; size - archive_with(&[]).len()])
+}
+
+/// What a manifest says of that archive.
+pub fn archive_facts() -> ContentFacts {
+    let tar = archive();
+    ContentFacts { tar_digest: Digest::of(&tar), tar_size: tar.len() as u64, entries: 1 }
+}
+
+fn archive() -> Vec<u8> {
+    let mut header = tar::Header::new_ustar();
+    header.set_size(4);
+    header.set_mode(0o644);
+    header.set_entry_type(tar::EntryType::Regular);
+    let mut archive = tar::Builder::new(Vec::new());
+    archive.append_data(&mut header, "main.sh", &b"true"[..]).expect("in memory");
+    archive.into_inner().expect("in memory")
 }
 
 /// An HTTP client that trusts them.

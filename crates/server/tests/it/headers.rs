@@ -5,7 +5,7 @@ use reqwest::{Method, Response};
 use serde_json::{Value, json};
 use taskd::http::routes;
 
-use crate::harness::TestServer;
+use crate::harness::{TestServer, archive_with};
 
 const EVERYWHERE: [(&str, &str); 5] = [
     ("x-content-type-options", "nosniff"),
@@ -72,7 +72,7 @@ async fn every_answer_says_that_it_is_not_a_page() {
 async fn what_others_stored_is_never_a_page_and_neither_is_an_error() {
     let server = TestServer::start().await;
     let html = "<script>fetch('/api/v1/users')</script>";
-    let package = server.push_content("talker", "1.0.0", html.as_bytes().to_vec()).await;
+    let package = server.push_content("talker", "1.0.0", archive_with(html.as_bytes())).await;
     let get = |path: &str| server.request(Method::GET, path);
     for path in [
         format!("/v2/talker/blobs/{}", package.content.digest),

@@ -6,6 +6,7 @@ mod again;
 mod answering;
 mod api;
 mod approval;
+mod archives;
 mod audited;
 mod auth;
 mod bulk;

@@ -17,6 +17,7 @@ use taskd::store::{NewManifest, PutManifest, StoredManifest};
 
 use crate::database::{TestDatabase, on_both_databases};
 use crate::fleet::{Fleet, order_of, random_key};
+use crate::harness::{archive_facts, archive_with};
 use crate::registry::{GRACE, NOW_MS, TestRegistry, operator, refusal, refused, serve};
 
 const YEAR_MS: u64 = 365 * 24 * 3_600_000;
@@ -24,14 +25,14 @@ const YEAR_MS: u64 = 365 * 24 * 3_600_000;
 fn task(name: &str) -> Value {
     json!({
         "name": name, "version": "1.0.0", "run": { "exec": ["true"] },
-        "content": { "tar_digest": Digest::of(b""), "tar_size": 0, "entries": 0 },
+        "content": archive_facts(),
     })
 }
 
 #[tokio::test]
 async fn a_task_package_is_checked_and_listed() {
     let registry = TestRegistry::start().await;
-    let content = registry.push_blob("talker", b"content").await;
+    let content = registry.push_blob("talker", &archive_with(b"content")).await;
     let mut no_command = task("talker");
     no_command["run"] = json!({});
     for (config, reason) in [
@@ -74,7 +75,7 @@ async fn a_package_in_use_outlives_its_manifest(database: TestDatabase) {
     let store = database.store.clone();
     let registry = TestRegistry::start_on(store, data, BlobSettings::default(), Some(operator())).await;
     let config = registry.push_blob("talker", task("talker").to_string().as_bytes()).await;
-    let content = registry.push_blob("talker", b"content").await;
+    let content = registry.push_blob("talker", &archive_with(b"content")).await;
     let package = ImageManifest::package(config, content);
     let answer = registry.put_manifest("/v2/talker/manifests/1.0.0", MANIFEST_TYPE, &package).await;
     assert_eq!(answer.status(), StatusCode::CREATED);

@@ -19,6 +19,7 @@ use taskd::changes::Changes;
 use taskd::clock::Clock;
 use taskd::collector::{self, Collected};
 use taskd::config::TransferLimits;
+use taskd::http::archives::ArchiveReaders;
 use taskd::http::auth::Caller;
 use taskd::http::drain::drain_unread;
 use taskd::http::oci::{self, Registry};
@@ -59,7 +60,8 @@ impl TestRegistry {
         let site_label = "site".parse().expect("a label's key");
         let transfers = Transfers::new(&TransferLimits::default(), site_label);
         let (clock, changes) = (Clock::fixed(NOW_MS), Changes::new());
-        let registry = Registry { store, blobs, clock, transfers, changes };
+        let readers = ArchiveReaders::default();
+        let registry = Registry { store, blobs, clock, transfers, changes, readers };
         Self { base: serve(registry.clone(), caller).await, client: client(), registry, data }
     }
 

@@ -12,7 +12,7 @@ use task_proto::api::{DeploymentView, RobotView};
 use taskd::config::SiteLimits;
 use tempfile::TempDir;
 
-use crate::harness::{TestRobot, TestServer, answer};
+use crate::harness::{TestRobot, TestServer, answer, archive_of};
 
 /// More than a new connection holds while nobody reads.
 const BLOB_BYTES: usize = 8 * 1024 * 1024;
@@ -48,7 +48,7 @@ async fn two_hundred_robots_pull_eight_at_a_time_and_all_get_it() {
     let directory = TempDir::new().expect("a directory");
     let limit = |config: &mut taskd::config::Config| config.transfers.all.max = Some(LIMIT as u64);
     let server = Arc::new(TestServer::start_in(directory, limit).await);
-    let package = server.push_content("talker", "1.0.0", vec![7; BLOB_BYTES]).await;
+    let package = server.push_content("talker", "1.0.0", archive_of(BLOB_BYTES, 7)).await;
     let mut robots = Vec::new();
     for number in 0..ROBOTS {
         robots.push(server.enroll(&format!("robot-{number}")).await);
@@ -80,7 +80,7 @@ async fn two_hundred_robots_pull_eight_at_a_time_and_all_get_it() {
 async fn who_waits_is_told_when_to_come_back_and_only_robots_wait() {
     let directory = TempDir::new().expect("a directory");
     let server = TestServer::start_in(directory, |config| config.transfers.all.max = Some(1)).await;
-    let package = server.push_content("talker", "1.0.0", vec![7; BLOB_BYTES]).await;
+    let package = server.push_content("talker", "1.0.0", archive_of(BLOB_BYTES, 7)).await;
     let (one, two) = (server.enroll("one").await, server.enroll("two").await);
     server.deploy(&package, "*", "key-1").await;
     let blob = package.content.digest;
@@ -111,8 +111,8 @@ async fn robots_of_an_order_with_priority_are_told_to_come_back_before_all_other
     const OTHERS: usize = 5;
     let directory = TempDir::new().expect("a directory");
     let server = TestServer::start_in(directory, |config| config.transfers.all.max = Some(1)).await;
-    let calm = server.push_content("calm", "1.0.0", vec![7; BLOB_BYTES]).await;
-    let urgent = server.push_content("urgent", "1.0.0", vec![8; BLOB_BYTES]).await;
+    let calm = server.push_content("calm", "1.0.0", archive_of(BLOB_BYTES, 7)).await;
+    let urgent = server.push_content("urgent", "1.0.0", archive_of(BLOB_BYTES, 8)).await;
     let hurried = server.enroll("hurried").await;
     let mut others = Vec::new();
     for number in 0..=OTHERS {
@@ -143,7 +143,7 @@ async fn two_pulls_take_two_seconds(limit: impl FnOnce(&mut taskd::config::Confi
     const SMALL: usize = 256 * 1024;
     let directory = TempDir::new().expect("a directory");
     let server = TestServer::start_in(directory, |config| limit(config, SMALL as u64)).await;
-    let package = server.push_content("talker", "1.0.0", vec![7; SMALL]).await;
+    let package = server.push_content("talker", "1.0.0", archive_of(SMALL, 7)).await;
     let mut robots = Vec::new();
     for name in ["one", "two"] {
         let robot = server.enroll(name).await;

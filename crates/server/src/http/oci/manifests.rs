@@ -8,12 +8,14 @@ use bytes::Bytes;
 use http::header::CONTENT_TYPE;
 use http::request::Parts;
 use http::{HeaderMap, HeaderValue, StatusCode};
+use task_archive::{Limits, UnpackError};
 use task_proto::desired::{BlobRef, PackageRef};
-use task_proto::manifest::TaskManifest;
+use task_proto::manifest::{ContentFacts, TaskManifest};
 use task_proto::oci::{ImageManifest, PACKAGE_TYPE};
 use task_proto::output::{MAX_FILES, OutputSet};
 use task_proto::{Digest, RepositoryName, Tag};
 
+use super::super::archives::READING;
 use super::blobs::{REVALIDATED, caching, serve};
 use super::parsed::{Parsed, is_json};
 use super::uploads::kept_bytes;
@@ -91,13 +93,14 @@ pub(super) async fn push(
         return Err(OciError::denied("a robot may only push outputs"));
     }
 
-    // From here until the manifest is stored, nothing it is made of may be collected.
-    let _hold = registry.blobs.hold_collection().await;
     let manifest = BlobRef { digest, size: bytes.len() as u64 };
+    // Before the hold: an archive may take minutes to read. What is gone afterwards is missed when the manifest is stored.
     let package = match &parsed.package {
         Some(image) => Some(check_package(registry, repository, manifest, image).await?),
         None => None,
     };
+    // From here until the manifest is stored, nothing it is made of may be collected.
+    let _hold = registry.blobs.hold_collection().await;
     let output = match &parsed.output {
         Some(image) => {
             let max_bytes = registry.blobs.settings().max_robot_bytes;
@@ -288,7 +291,7 @@ async fn read_config(registry: &Registry, repository: &RepositoryName, config: B
     Ok(blob.read().await?)
 }
 
-/// Reads the task manifest out of a package's config blob and holds it to its rules.
+/// Reads the task manifest out of a package's config blob and holds it and the archive to their rules.
 async fn check_package(
     registry: &Registry,
     repository: &RepositoryName,
@@ -300,7 +303,7 @@ async fn check_package(
             format!("a manifest of artifactType {PACKAGE_TYPE} needs its config and one layer of its own types");
         return Err(OciError::manifest_invalid(message));
     };
-    check_blob(registry, repository, content).await?;
+    let archive = check_blob(registry, repository, content).await?;
     let task: TaskManifest = serde_json::from_slice(&read_config(registry, repository, config).await?)
         .map_err(|error| OciError::manifest_invalid(format!("the config is not a task manifest: {error}")))?;
     let mut problems: Vec<String> = task.problems().iter().map(ToString::to_string).collect();
@@ -314,8 +317,25 @@ async fn check_package(
     if !problems.is_empty() {
         return Err(OciError::manifest_invalid(problems.join("; ")));
     }
+    // What is stored was checked when it was pushed first.
+    if registry.store.package(&task.name, &manifest.digest).await?.is_none() {
+        check_archive(registry, &archive, content.size, task.content).await?;
+    }
     let package = PackageRef { name: task.name.clone(), version: task.version.clone(), manifest, config, content };
     Ok((package, task))
+}
+
+/// Reads the package's archive by the rules that a robot unpacks it by.
+async fn check_archive(registry: &Registry, blob: &Blob, size: u64, facts: ContentFacts) -> Result<(), OciError> {
+    let check = registry.readers.read(blob, move |bytes| task_archive::check(bytes, size, &facts, &Limits::default()));
+    let checked = tokio::time::timeout(READING, check).await;
+    match checked.map_err(|_| OciError::manifest_invalid("the package's archive took too long to read"))? {
+        Ok(()) => Ok(()),
+        Err(UnpackError::Refused(refusal)) => {
+            Err(OciError::manifest_invalid(format!("robots would refuse the package's archive: {refusal}")))
+        }
+        Err(error @ (UnpackError::Source(_) | UnpackError::Disk { .. })) => Err(OciError::internal(&error)),
+    }
 }
 
 fn created(

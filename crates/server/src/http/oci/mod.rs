@@ -24,6 +24,7 @@ use task_proto::{Digest, RepositoryName, RobotId};
 pub use error::OciError;
 pub use publish::publish;
 
+use super::archives::ArchiveReaders;
 use super::auth::Caller;
 use crate::blobs::Blobs;
 use crate::changes::Changes;
@@ -48,6 +49,8 @@ pub struct Registry {
     pub transfers: Transfers,
     /// Who hears of what was signed.
     pub changes: Changes,
+    /// Those who read whole archives.
+    pub readers: ArchiveReaders,
 }
 
 /// How every handler here ends.

@@ -8,7 +8,7 @@ use oci_client::manifest::OciImageManifest;
 use oci_client::secrets::RegistryAuth;
 use oci_client::{Client, Reference};
 
-use crate::harness::{Server, required};
+use crate::harness::{Server, required, write_package};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn the_oci_client_crate_pushes_and_pulls() {
@@ -74,4 +74,27 @@ async fn crane_logs_in_pushes_and_pulls() {
 
 fn source(name: &str) -> std::path::PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/it").join(name)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn crane_copies_a_package_under_another_name() {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let server = Server::start(&dir.path().join("server")).await;
+    let package = dir.path().join("talker");
+    write_package(&package, "talker", "1.0.0", "service", "exec sleep 1000\n");
+    server.operate(["push", package.to_str().expect("UTF-8")]).await;
+    let host = server.http.to_string();
+    let token = server.operator_token();
+    crane(dir.path(), &["auth", "login", &host, "-u", "anyone", "-p", &token]).await;
+    let (own, mirror) = (format!("{host}/talker:1.0.0"), format!("{host}/mirror/team/talker:1.0.0"));
+    crane(dir.path(), &["copy", "--insecure", &own, &mirror]).await;
+    let digest = crane(dir.path(), &["digest", "--insecure", &own]).await;
+    assert_eq!(crane(dir.path(), &["digest", "--insecure", &mirror]).await, digest);
+    let packages = server.get("/api/v1/packages").await.expect("a list");
+    let packages = packages["packages"].as_array().expect("packages");
+    assert_eq!(packages.len(), 1, "{packages:?}");
+    // And back, after its own was deleted.
+    server.operate(["package", "rm", "talker", "1.0.0", "--yes"]).await;
+    crane(dir.path(), &["copy", "--insecure", &mirror, &own]).await;
+    assert_eq!(crane(dir.path(), &["digest", "--insecure", &own]).await, digest);
 }

@@ -6,8 +6,10 @@ use futures_util::FutureExt as _;
 use reqwest::{Method, StatusCode};
 use serde_json::{Value, json};
 use task_proto::digest::Algorithm;
-use task_proto::oci::{ImageManifest, MANIFEST_TYPE};
+use task_proto::envelope::SigningKey;
+use task_proto::oci::{EMPTY, ImageManifest, MANIFEST_TYPE};
 use task_proto::person::{Role, Roles};
+use task_proto::publisher::{PackageStatement, SIGNATURE_ARTIFACT};
 use task_proto::{Digest, RepositoryName, RobotId};
 use taskd::blobs::BlobSettings;
 use taskd::collector::{self, Collected};
@@ -35,11 +37,7 @@ async fn a_task_package_is_checked_and_listed() {
     let content = registry.push_blob("talker", &archive_with(b"content")).await;
     let mut no_command = task("talker");
     no_command["run"] = json!({});
-    for (config, reason) in [
-        (task("listener"), "name: \"listener\" must be the repository's name"),
-        (no_command, "run: give either"),
-        (json!({ "name": "talker" }), "missing field"),
-    ] {
+    for (config, reason) in [(no_command, "run: give either"), (json!({ "name": "talker" }), "missing field")] {
         let config = registry.push_blob("talker", config.to_string().as_bytes()).await;
         let package = ImageManifest::package(config, content);
         let answer = registry.put_manifest("/v2/talker/manifests/1.0.0", MANIFEST_TYPE, &package).await;
@@ -68,6 +66,77 @@ async fn a_task_package_is_checked_and_listed() {
     let manifest = format!("/v2/talker/manifests/{}", view.package.manifest.digest);
     assert_eq!(registry.status(Method::DELETE, &manifest).await, StatusCode::ACCEPTED);
     assert_eq!(registry.registry.store.packages().await.expect("packages"), []);
+}
+
+#[tokio::test]
+async fn package_in_another_repository_is_a_copy_with_its_referrers() {
+    let registry = TestRegistry::start().await;
+    let own = registry.push_package("talker", "talker").await;
+    let store = &registry.registry.store;
+    for mirror in ["mirror/team/talker", "walker"] {
+        let copy = registry.push_package(mirror, "talker").await;
+        assert_eq!(copy, own, "a copy has the same digest");
+        let pulled = registry.get(&format!("/v2/{mirror}/manifests/1.0.0")).await;
+        assert_eq!(
+            (pulled.status(), crate::registry::header(&pulled, "docker-content-digest")),
+            (StatusCode::OK, own.to_string())
+        );
+        let signature = registry.push_signature(mirror, own).await;
+        let referrers: Value =
+            registry.get(&format!("/v2/{mirror}/referrers/{own}")).await.json().await.expect("a list");
+        assert_eq!(referrers["manifests"][0]["digest"], signature.to_string(), "{referrers}");
+    }
+    // It is ordered by its own name and listed once.
+    let packages = store.packages().await.expect("packages");
+    assert_eq!(packages.iter().map(|view| view.package.name.as_str()).collect::<Vec<_>>(), ["talker"]);
+    // What is wrong with it is refused there as well, and some repositories are for other things.
+    let content = registry.push_blob("mirror/x", b"no archive").await;
+    let config = registry.push_blob("mirror/x", task("talker").to_string().as_bytes()).await;
+    let damaged = ImageManifest::package(config, content);
+    let answer = registry.put_manifest("/v2/mirror/x/manifests/1.0.0", MANIFEST_TYPE, &damaged).await;
+    assert_eq!(refusal(answer).await, refused(400, "MANIFEST_INVALID"));
+    let answer = registry.try_push_package("outputs/r00000000000000a1/talker", "talker").await;
+    let body: Value = answer.json().await.expect("an error body");
+    let message = body["errors"][0]["message"].as_str().expect("text");
+    assert!(message.contains("talker can't be stored in outputs/r00000000000000a1/talker"), "{message}");
+
+    // A copy that is deleted takes nothing with it, and one that stays is no package.
+    let status = registry.status(Method::DELETE, &format!("/v2/walker/manifests/{own}")).await;
+    assert_eq!((status, store.packages().await.expect("packages").len()), (StatusCode::ACCEPTED, 1));
+    let status = registry.status(Method::DELETE, &format!("/v2/talker/manifests/{own}")).await;
+    assert_eq!((status, store.packages().await.expect("packages").len()), (StatusCode::ACCEPTED, 0));
+    let copy = registry.status(Method::GET, &format!("/v2/mirror/team/talker/manifests/{own}")).await;
+    assert_eq!(copy, StatusCode::OK);
+}
+
+impl TestRegistry {
+    /// Pushes version 1.0.0 of a package into a repository; the digest of its manifest.
+    async fn push_package(&self, repository: &str, name: &str) -> Digest {
+        let answer = self.try_push_package(repository, name).await;
+        assert_eq!(answer.status(), StatusCode::CREATED);
+        crate::registry::header(&answer, "docker-content-digest").parse().expect("a digest")
+    }
+
+    async fn try_push_package(&self, repository: &str, name: &str) -> reqwest::Response {
+        let content = self.push_blob(repository, &archive_with(b"")).await;
+        let config = self.push_blob(repository, task(name).to_string().as_bytes()).await;
+        let package = ImageManifest::package(config, content);
+        self.put_manifest(&format!("/v2/{repository}/manifests/1.0.0"), MANIFEST_TYPE, &package).await
+    }
+
+    /// Pushes a signature of the package with this manifest beside its copy.
+    async fn push_signature(&self, repository: &str, manifest: Digest) -> Digest {
+        let package = self.registry.store.package(&"talker".parse().expect("a name"), &manifest).await;
+        let package = package.expect("read").expect("there").package;
+        let envelope = PackageStatement { package: package.clone() }.seal(&SigningKey::from_bytes([7; 32]));
+        let layer = self.push_blob(repository, &serde_json::to_vec(&envelope).expect("JSON")).await;
+        self.push_blob(repository, EMPTY).await;
+        let document = ImageManifest::signed_document(SIGNATURE_ARTIFACT, layer, Some(package.manifest));
+        let digest = Digest::of(&serde_json::to_vec(&document).expect("JSON"));
+        let answer = self.put_manifest(&format!("/v2/{repository}/manifests/{digest}"), MANIFEST_TYPE, &document).await;
+        assert_eq!(answer.status(), StatusCode::CREATED, "{}", answer.text().await.unwrap_or_default());
+        digest
+    }
 }
 
 async fn a_package_in_use_outlives_its_manifest(database: TestDatabase) {

@@ -19,7 +19,7 @@ use super::super::archives::READING;
 use super::blobs::{REVALIDATED, caching, serve};
 use super::parsed::{Parsed, is_json};
 use super::uploads::kept_bytes;
-use super::{Answer, OciError, Registry, empty, signed};
+use super::{Answer, OciError, Registry, empty, is_reserved, signed};
 use crate::blobs::Blob;
 use crate::changes::Change;
 use crate::http::packages::in_use;
@@ -96,7 +96,7 @@ pub(super) async fn push(
     let manifest = BlobRef { digest, size: bytes.len() as u64 };
     // Before the hold: an archive may take minutes to read. What is gone afterwards is missed when the manifest is stored.
     let package = match &parsed.package {
-        Some(image) => Some(check_package(registry, repository, manifest, image).await?),
+        Some(image) => check_package(registry, repository, manifest, image).await?,
         None => None,
     };
     // From here until the manifest is stored, nothing it is made of may be collected.
@@ -291,13 +291,14 @@ async fn read_config(registry: &Registry, repository: &RepositoryName, config: B
     Ok(blob.read().await?)
 }
 
-/// Reads the task manifest out of a package's config blob and holds it and the archive to their rules.
+/// Reads the task manifest out of a package's config blob and holds it and the archive to their rules. A package can be
+/// ordered from the repository of its own name; one in another repository is a copy, checked likewise: `None`.
 async fn check_package(
     registry: &Registry,
     repository: &RepositoryName,
     manifest: BlobRef,
     image: &ImageManifest,
-) -> Result<(PackageRef, TaskManifest), OciError> {
+) -> Result<Option<(PackageRef, TaskManifest)>, OciError> {
     let Some((config, content)) = image.package_blobs() else {
         let message =
             format!("a manifest of artifactType {PACKAGE_TYPE} needs its config and one layer of its own types");
@@ -306,23 +307,20 @@ async fn check_package(
     let archive = check_blob(registry, repository, content).await?;
     let task: TaskManifest = serde_json::from_slice(&read_config(registry, repository, config).await?)
         .map_err(|error| OciError::manifest_invalid(format!("the config is not a task manifest: {error}")))?;
-    let mut problems: Vec<String> = task.problems().iter().map(ToString::to_string).collect();
-    if task.name.as_str() != repository.as_str() {
-        problems.push(format!(
-            "name: {:?} must be the repository's name, {:?}",
-            task.name.as_str(),
-            repository.as_str()
-        ));
-    }
+    let problems: Vec<String> = task.problems().iter().map(ToString::to_string).collect();
     if !problems.is_empty() {
         return Err(OciError::manifest_invalid(problems.join("; ")));
+    }
+    if is_reserved(repository) {
+        let message = format!("the package {} can't be stored in {repository}, which is for other things", task.name);
+        return Err(OciError::manifest_invalid(message));
     }
     // What is stored was checked when it was pushed first.
     if registry.store.package(&task.name, &manifest.digest).await?.is_none() {
         check_archive(registry, &archive, content.size, task.content).await?;
     }
     let package = PackageRef { name: task.name.clone(), version: task.version.clone(), manifest, config, content };
-    Ok((package, task))
+    Ok((RepositoryName::of_package(&task.name) == *repository).then_some((package, task)))
 }
 
 /// Reads the package's archive by the rules that a robot unpacks it by.

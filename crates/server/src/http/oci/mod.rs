@@ -216,13 +216,13 @@ async fn check_person(
 /// What a person needs for this. Outputs are the robots': one may be ended like the task it came from, and only who may do
 /// everything pushes in a robot's name. The list of publishers concerns all robots.
 fn needed(repository: &RepositoryName, method: &Method, endpoint: &Endpoint<'_>) -> Permission {
-    let is_output = repository.as_str().starts_with("outputs/");
+    let is_output = is_of_outputs(repository);
     match (method, endpoint) {
         (&Method::GET | &Method::HEAD, endpoint) if !matches!(endpoint, Endpoint::Uploads | Endpoint::Upload(_)) => {
             Permission::Read
         }
         (&Method::DELETE, Endpoint::Manifest(_)) if is_output => Permission::Operate,
-        _ if is_output || repository.as_str() == LIST_REPOSITORY => Permission::Administer,
+        _ if is_reserved(repository) => Permission::Administer,
         _ => Permission::Publish,
     }
 }
@@ -230,6 +230,15 @@ fn needed(repository: &RepositoryName, method: &Method, endpoint: &Endpoint<'_>)
 /// Only people delete.
 fn deleter(person: Option<&Person>) -> Result<&Person, OciError> {
     person.ok_or_else(|| OciError::denied("a robot deletes nothing"))
+}
+
+/// Whether the repository is for outputs, or for lists of publishers.
+fn is_reserved(repository: &RepositoryName) -> bool {
+    is_of_outputs(repository) || repository.as_str() == LIST_REPOSITORY
+}
+
+fn is_of_outputs(repository: &RepositoryName) -> bool {
+    repository.as_str().starts_with("outputs/")
 }
 
 /// Whether who was let in to this repository may push there: a robot comes this far only to its own outputs.

@@ -10,7 +10,7 @@ use task_proto::{RepositoryName, Tag};
 use super::manifests::check_blob;
 use super::parsed::Parsed;
 use super::{OciError, Registry};
-use crate::store::SignedDocument;
+use crate::store::{Reference, SignedDocument};
 
 /// The signed document that a manifest brings, if it is meant to bring one.
 pub(super) async fn check(
@@ -20,7 +20,7 @@ pub(super) async fn check(
     tags: &[Tag],
 ) -> Result<Option<SignedDocument>, OciError> {
     if let Some(image) = &parsed.signature {
-        return check_signature(registry, repository, image).await.map(Some);
+        return check_signature(registry, repository, image).await;
     }
     match &parsed.publishers {
         Some(image) => check_list(registry, repository, image, tags).await.map(Some),
@@ -46,25 +46,33 @@ pub(super) async fn tell(registry: &Registry, repository: &RepositoryName, docum
     }
 }
 
+/// The signature of a package in the package's own repository. Beside a copy in another repository it is a copy itself, and
+/// counts for nobody: `None`.
 async fn check_signature(
     registry: &Registry,
     repository: &RepositoryName,
     image: &ImageManifest,
-) -> Result<SignedDocument, OciError> {
+) -> Result<Option<SignedDocument>, OciError> {
     let subject =
         image.subject.as_ref().ok_or_else(|| OciError::manifest_invalid("subject: a signature is about one"))?;
-    let name = repository.as_str().parse().map_err(|error| OciError::name_invalid(&error))?;
-    let package = registry.store.package(&name, &subject.digest).await?.map(|view| view.package);
-    let package =
-        package.ok_or_else(|| OciError::manifest_invalid("subject: there is no such package; push it first"))?;
+    let stored = registry.store.manifest(repository, &Reference::Digest(subject.digest)).await?;
+    stored.ok_or_else(|| OciError::manifest_invalid("subject: there is no such package; push it first"))?;
     let (blob, envelope) = envelope(registry, repository, image, MAX_SIGNATURE_BYTES).await?;
     let statement = PackageStatement::unverified(&envelope);
-    let statement = statement.map_err(|error| OciError::manifest_invalid(format!("the signature: {error}")))?;
-    if statement.package != package {
-        let message = format!("{} {} was signed, not the subject", statement.package.name, statement.package.version);
+    let signed = statement.map_err(|error| OciError::manifest_invalid(format!("the signature: {error}")))?.package;
+    let own = match repository.as_str().parse() {
+        Ok(name) => registry.store.package(&name, &subject.digest).await?,
+        Err(_) => None,
+    };
+    let is_signed = match &own {
+        Some(view) => signed == view.package,
+        None => signed.manifest.digest == subject.digest,
+    };
+    if !is_signed {
+        let message = format!("{} {} was signed, not the subject", signed.name, signed.version);
         return Err(OciError::manifest_invalid(message));
     }
-    Ok(SignedDocument::Signature { package: subject.digest, envelope: blob })
+    Ok(own.map(|_| SignedDocument::Signature { package: subject.digest, envelope: blob }))
 }
 
 async fn check_list(

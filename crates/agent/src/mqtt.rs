@@ -325,7 +325,9 @@ async fn pump(event_loop: &mut EventLoop, events: mpsc::Sender<Event>, room: Mes
                 }
             }
             Err(ConnectionError::ConnectionRefused(
-                ConnectReturnCode::BadUserNamePassword | ConnectReturnCode::NotAuthorized,
+                ConnectReturnCode::BadUserNamePassword
+                | ConnectReturnCode::NotAuthorized
+                | ConnectReturnCode::BadClientId,
             )) => return Ended::Refused,
             Err(ConnectionError::MqttState(StateError::Deserialization(rumqttc::Error::PayloadSizeLimitExceeded(
                 bytes,

@@ -8,8 +8,10 @@ use serde_json::json;
 use task_proto::Digest;
 use task_proto::desired::BlobRef;
 use task_proto::oci::ImageManifest;
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::TcpStream;
 
-use crate::harness::{Fleet, Server};
+use crate::harness::{Fleet, Server, eventually};
 
 /// One tar entry, header written by hand: the `tar` crate refuses to write most of these.
 fn entry(name: &str, kind: u8, link: &str, data: &[u8]) -> Vec<u8> {
@@ -97,6 +99,31 @@ async fn hostile_archive_is_refused_at_push_with_its_reason() {
     assert_eq!(server.get("/api/v1/packages").await.expect("a list")["packages"], json!([]));
     assert_eq!(tree(dir.path()), outside, "something was written outside the server's directory");
     assert!(!Path::new("/tmp/taskd-escape").exists());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn mqtt_5_client_is_refused_and_named_in_the_servers_log() {
+    let dir = tempfile::TempDir::new().expect("temp dir");
+    let server = Server::start(&dir.path().join("server")).await;
+    // CONNECT of MQTT 5 with a clean start, no properties and no client id.
+    let connect = [0x10, 13, 0, 4, b'M', b'Q', b'T', b'T', 5, 2, 0, 60, 0, 0, 0];
+    let mut peer = None;
+    for _ in 0..3 {
+        let mut stream = TcpStream::connect(server.mqtt).await.expect("connected");
+        peer.get_or_insert(stream.local_addr().expect("bound"));
+        stream.write_all(&connect).await.expect("sent");
+        let mut answer = Vec::new();
+        stream.read_to_end(&mut answer).await.expect("an answer");
+        assert_eq!(answer, [0x20, 2, 0, 1]);
+    }
+    let peer = peer.expect("connected").to_string();
+    let line = eventually("a line in the log", async || {
+        let log = std::fs::read_to_string(server.data().with_extension("server.log")).ok()?;
+        let mut lines = log.lines().filter(|line| line.contains("MQTT 5")).map(str::to_owned).collect::<Vec<_>>();
+        (lines.len() == 1).then(|| lines.remove(0))
+    })
+    .await;
+    assert!(line.contains("WARN") && line.contains(&peer) && line.contains("MQTT 3.1.1"), "{line}");
 }
 
 async fn next_packet(events: &mut rumqttc::EventLoop) -> Result<Packet, ConnectionError> {

@@ -74,7 +74,7 @@ pub enum Refusal {
     /// No such user, or the wrong password (CONNACK 4).
     #[error("bad user name or password")]
     BadCredentials,
-    /// Known, but not allowed: a revoked token, another robot's name (CONNACK 5).
+    /// Known, but not allowed: a revoked token, another robot's name as user name (CONNACK 5).
     #[error("not authorised")]
     NotAuthorised,
     /// Nobody could say just now (CONNACK 3).

@@ -21,7 +21,7 @@ async fn logins_get_the_right_answer() {
         change(&mut connect, &other);
         connect.packet()
     };
-    let cases: [(Vec<u8>, u8); 12] = [
+    let cases: [(Vec<u8>, u8); 16] = [
         (with(|_, _| {}), 0),
         (with(|connect, _| connect.clean = false), 0),
         (Connect::operator("").packet(), 0),
@@ -29,8 +29,12 @@ async fn logins_get_the_right_answer() {
         (with(|connect, _| connect.password = None), 5),
         (with(|connect, _| (connect.user_name, connect.password) = (None, None)), 5),
         (with(|connect, _| connect.password = Some("revoked".to_owned())), 5),
-        (with(|connect, other| connect.client_id = other.to_string()), 5),
+        (with(|connect, other| connect.client_id = other.to_string()), 2),
+        (with(|connect, _| connect.client_id = "not a robot's id".to_owned()), 2),
+        (with(|connect, _| connect.client_id = String::new()), 2),
+        (Connect::operator(&"x".repeat(257)).packet(), 2),
         (with(|connect, other| connect.user_name = Some(other.to_string())), 5),
+        (retained_will(&robot, b"gone"), 5),
         (with(|connect, _| (connect.client_id, connect.clean) = (String::new(), false)), 2),
         (with(|connect, _| connect.password = Some("outage".to_owned())), 3),
         (with(|connect, _| connect.password = Some("slow".to_owned())), 3),
@@ -47,6 +51,55 @@ async fn logins_get_the_right_answer() {
         raw.send(&[0xe0, 0]).await;
         raw.expect_close().await;
     }
+}
+
+/// A CONNECT with a will to be retained.
+fn retained_will(robot: &RobotId, payload: &[u8]) -> Vec<u8> {
+    let will = Some((topic(robot, RobotTopic::Status), payload.to_vec()));
+    let mut packet = Connect { will, ..Connect::robot(robot) }.packet();
+    // The flags follow the fixed header, the protocol name and its level.
+    let flags = packet.windows(5).position(|bytes| bytes == b"MQTT\x04").expect("a protocol name") + 5;
+    packet[flags] |= 0x20;
+    packet
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn message_to_be_retained_ends_the_session_unless_it_is_empty() {
+    let broker = TestBroker::start().await;
+    for qos in 0..=2 {
+        let robot = RobotId::random();
+        let status = topic(&robot, RobotTopic::Status);
+        let mut operator = broker.operator(&status, 0).await;
+        let mut client = broker.robot(&robot).await;
+        let retained = |payload: &[u8]| {
+            let mut packet = publish(&status, qos, 9, payload);
+            packet[0] |= 1;
+            packet
+        };
+        // It asks to forget what is retained, which is nothing, and is passed on as any other message.
+        client.send(&retained(b"")).await;
+        match qos {
+            1 => client.expect(&[0x40, 2, 0, 9]).await,
+            2 => client.expect(&[0x50, 2, 0, 9]).await,
+            _ => client.expect_nothing().await,
+        }
+        operator.expect(&publish(&status, 0, 0, b"")).await;
+        client.send(&retained(b"online")).await;
+        client.expect_close().await;
+        operator.expect_nothing().await;
+    }
+    let robot = RobotId::random();
+    let mut empty_will = broker.raw_with(&retained_will(&robot, b"")).await;
+    empty_will.expect(&[0x20, 2, 0, 0]).await;
+    let mut operator = broker.operator("taskd/v1/#", 1).await;
+    operator
+        .send(&{
+            let mut packet = publish("taskd/v1/x", 1, 3, b"kept?");
+            packet[0] |= 1;
+            packet
+        })
+        .await;
+    operator.expect_close().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -73,7 +126,7 @@ async fn an_independent_client_listens_and_speaks() {
             }
         }
         for qos in [QoS::AtMostOnce, QoS::AtLeastOnce, QoS::ExactlyOnce] {
-            speaker.publish(topic(&robot, RobotTopic::Report), qos, true, "report").await.unwrap();
+            speaker.publish(topic(&robot, RobotTopic::Report), qos, false, "report").await.unwrap();
         }
         while rung.is_none() || heard.len() < 3 {
             let incoming = tokio::select! {

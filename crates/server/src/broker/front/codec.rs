@@ -65,7 +65,7 @@ pub struct Connect {
     pub password: Option<String>,
 }
 
-/// The retain flag is read and dropped: nothing is retained here.
+/// What a client leaves to be published after an end without DISCONNECT.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Will {
     /// Where.
@@ -76,7 +76,7 @@ pub struct Will {
     pub qos: QoS,
 }
 
-/// As with the will, no retain flag. The packet id is 0 for QoS 0.
+/// A message. The packet id is 0 for QoS 0.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Publish {
     /// Where: a name without wildcards.
@@ -89,12 +89,16 @@ pub struct Publish {
     pub payload: Bytes,
 }
 
-/// Why bytes are not a packet. Only [`DecodeError::UnknownProtocol`] deserves an answer.
+/// Why bytes are not a packet that this broker takes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum DecodeError {
-    /// Another MQTT.
-    #[error("asks for a protocol other than MQTT 3.1.1")]
-    UnknownProtocol,
+    /// Another MQTT, of this protocol level.
+    #[error("asks for protocol level {0}, and only MQTT 3.1.1 (level 4) is spoken")]
+    UnknownProtocol(u8),
+    /// The server must keep a retained message of QoS 1 or 2 (MQTT-3.3.1-5), and this one keeps none. One without a payload
+    /// asks to keep nothing.
+    #[error("sends a message to be retained, and nothing is retained here")]
+    Retained,
     /// More bytes than a packet may have here.
     #[error("sends a packet of {0} bytes, which is too large")]
     TooLarge(usize),
@@ -212,7 +216,7 @@ fn connect(body: &mut Body) -> Result<Connect, DecodeError> {
     match (&name[..], level) {
         (b"MQTT", 4) => {}
         // 3.1, 5.0 and versions to come: the answer is a CONNACK that says so.
-        (b"MQTT", _) | (b"MQIsdp", 3) => return Err(DecodeError::UnknownProtocol),
+        (b"MQTT", level) | (b"MQIsdp", level @ 3) => return Err(DecodeError::UnknownProtocol(level)),
         _ => return Err(Malformed("not the protocol name MQTT")),
     }
     let flags = body.byte()?;
@@ -232,7 +236,9 @@ fn connect(body: &mut Body) -> Result<Connect, DecodeError> {
     let will = if flags & 0b100 == 0 {
         None
     } else {
-        Some(Will { topic: topic_name(body)?, payload: body.binary()?, qos: will_qos })
+        let will = Will { topic: topic_name(body)?, payload: body.binary()?, qos: will_qos };
+        check_retained(flags & 0b10_0000 != 0, &will.payload)?;
+        Some(will)
     };
     let user_name = if flags & 0b1000_0000 == 0 { None } else { Some(body.text()?) };
     // A password may be any bytes; ours are text, so whatever is lost here would have been refused anyway.
@@ -247,7 +253,12 @@ fn publish(first: u8, mut body: Body) -> Result<Publish, DecodeError> {
     let qos = qos((first >> 1) & 0b11)?;
     let topic = topic_name(&mut body)?;
     let packet_id = if qos == QoS::AtMostOnce { 0 } else { body.packet_id()? };
+    check_retained(first & 1 != 0, &body.0)?;
     Ok(Publish { topic, qos, packet_id, payload: body.0 })
+}
+
+fn check_retained(is_retained: bool, payload: &[u8]) -> Result<(), DecodeError> {
+    if is_retained && !payload.is_empty() { Err(DecodeError::Retained) } else { Ok(()) }
 }
 
 fn qos(bits: u8) -> Result<QoS, DecodeError> {

@@ -207,7 +207,9 @@ pub(super) fn connack(code: ConnectReturnCode, output: &mut BytesMut) {
 pub(super) async fn reject<S: AsyncWrite + Unpin>(context: &Context, stream: &mut S, rejection: Rejection) {
     let code = match rejection {
         Rejection::Answered { code, .. } => code,
-        Rejection::Malformed(DecodeError::UnknownProtocol) => ConnectReturnCode::RefusedProtocolVersion,
+        Rejection::Malformed(DecodeError::UnknownProtocol(_)) => ConnectReturnCode::RefusedProtocolVersion,
+        // A will to be retained.
+        Rejection::Malformed(DecodeError::Retained) => ConnectReturnCode::NotAuthorized,
         Rejection::Malformed(_) | Rejection::Silent(_) => return,
     };
     let mut output = BytesMut::new();
@@ -260,14 +262,12 @@ async fn admit(context: &Arc<Context>, connect: &Connect, login: Login) -> Resul
             Err(answer(ConnectReturnCode::ClientIdentifierNotValid, "a client id that is too long"))
         }
         Ok(Principal::Operator(user)) => Ok(Visitor::Operator(user)),
-        Ok(Principal::Robot { .. }) if connect.client_id.is_empty() => {
-            Err(answer(ConnectReturnCode::ClientIdentifierNotValid, "a robot's credentials without a client id"))
-        }
         // A robot's name on another robot's token, or the other way round.
-        Ok(Principal::Robot { robot, .. })
-            if connect.client_id != robot.as_str() || connect.user_name.as_deref() != Some(robot.as_str()) =>
-        {
-            Err(answer(ConnectReturnCode::NotAuthorized, "a client id or user name that is not the token's robot id"))
+        Ok(Principal::Robot { robot, .. }) if connect.user_name.as_deref() != Some(robot.as_str()) => {
+            Err(answer(ConnectReturnCode::NotAuthorized, "a user name that is not the token's robot id"))
+        }
+        Ok(Principal::Robot { robot, .. }) if connect.client_id != robot.as_str() => {
+            Err(answer(ConnectReturnCode::ClientIdentifierNotValid, "a client id that is not the robot's id"))
         }
         Ok(Principal::Robot { robot, token_number, .. }) => Ok(Visitor::Robot { robot, token_number }),
     }

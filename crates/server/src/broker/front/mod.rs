@@ -1,7 +1,7 @@
 //! The MQTT front: all that lies between the network and the inbox or the router. rumqttd's own listeners must not face
 //! clients; what they get wrong is done here: admission, access, takeover, wills, time limits, bounds on memory.
-//! It never retains a message and never keeps a session beyond its connection; the retain flag and the wish for a
-//! lasting session are ignored.
+//! It never retains a message, so one that asks for that ends the session; and it never keeps a session beyond its
+//! connection: the wish for a lasting one is ignored.
 
 mod access;
 mod attendance;
@@ -10,6 +10,7 @@ mod doorbell;
 mod entrance;
 mod laggard;
 mod listener;
+mod other_protocol;
 mod outgoing;
 mod output;
 mod parts;
@@ -39,6 +40,7 @@ use crate::conduct::Conduct;
 use crate::tls::{ClientProof, Tls};
 use entrance::{Arrival, Rejection};
 pub(super) use entrance::{CANARY_ID, CanaryPass};
+use other_protocol::OtherProtocols;
 use parts::Grants;
 pub(super) use parts::{Grant, NotGranted};
 use places::{Claim, Places};
@@ -70,6 +72,8 @@ struct Context {
     places: Places,
     /// What the listener speaks, if it encrypts.
     tls: Option<Tls>,
+    /// Clients of other MQTT versions.
+    other_protocols: OtherProtocols,
     stop: CancellationToken,
 }
 
@@ -100,6 +104,7 @@ impl Front {
             grants: Grants::default(),
             canary_pass: Arc::default(),
             anteroom,
+            other_protocols: OtherProtocols::default(),
             stop: CancellationToken::new(),
         });
         let front = Arc::new(Self { local_addr, context, sessions: TaskTracker::new() });

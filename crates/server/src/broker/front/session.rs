@@ -92,6 +92,9 @@ where
     match entered {
         Err(rejection) => {
             tracing::debug!(%peer, "MQTT client turned away: {rejection}");
+            if let Rejection::Malformed(DecodeError::UnknownProtocol(level)) = rejection {
+                context.other_protocols.refused(peer, level);
+            }
             context.totals.refuse(Some(&meter));
             reject(&context, &mut stream, rejection).await;
         }

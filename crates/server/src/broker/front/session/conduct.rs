@@ -17,6 +17,7 @@ impl End {
     pub(super) fn offence(self) -> Option<Offence> {
         match self {
             Self::Malformed(DecodeError::TooLarge(bytes)) => Some(Offence::TooLarge(bytes)),
+            Self::Malformed(DecodeError::Retained) => Some(Offence::Violation("sends messages to be retained")),
             Self::Malformed(_) => Some(Offence::Violation("sends what is no MQTT")),
             Self::Violation(what) => Some(Offence::Violation(what)),
             _ => None,

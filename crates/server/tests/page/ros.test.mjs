@@ -36,12 +36,25 @@ test('nodes are looked at, changed and given parameters', async (t) => {
   await parameter.locator('.value', { hasText: /^2(\.0)?$/ }).waitFor();
   await assertAccessible(page, 'the graph');
 
-  await page.getByRole('button', { name: 'deactivate' }).click();
+  // Nothing is done to a node without a question.
+  const transitions = [];
+  page.on('request', (request) => request.postData()?.includes('"transition"') && transitions.push(request.postData()));
+  const dialog = page.getByRole('dialog');
+  await page.getByRole('button', { name: 'shutdown…' }).click();
+  await dialog.getByText('of the task mapper on atlas is active').waitFor();
+  await dialog.getByRole('button', { name: 'Cancel' }).click();
+  await dialog.waitFor({ state: 'hidden' });
+  assert.deepEqual(transitions, []);
+  const change = async (transition, action) => {
+    await page.getByRole('button', { name: transition, exact: true }).click();
+    await dialog.getByRole('button', { name: action, exact: true }).click();
+  };
+  await change('deactivate…', 'Deactivate');
   await row('Table of nodes', '/mapper mapper inactive').waitFor();
   await page.getByRole('link', { name: 'Monitor' }).click();
   await page.getByText('node inactive').first().waitFor();
   await page.goBack();
-  await page.getByRole('button', { name: 'activate', exact: true }).click();
+  await change('activate…', 'Activate');
   await row('Table of nodes', '/mapper mapper active').waitFor();
   assert.match(page.url(), /node=%2Fmapper/);
   assertQuiet(page);

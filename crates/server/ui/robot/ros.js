@@ -4,6 +4,7 @@
 import { html, nothing } from '../vendor/lit-html-3.3.3/lit-html.js';
 import { repeat } from '../vendor/lit-html-3.3.3/directives/repeat.js';
 import { askRobot } from '../api.js';
+import { open } from '../dialog.js';
 import { number, words } from '../format.js';
 import { change } from '../frame.js';
 import { tell } from '../notice.js';
@@ -14,6 +15,15 @@ const TRANSITIONS = {
   unconfigured: ['configure', 'shutdown'],
   inactive: ['activate', 'cleanup', 'shutdown'],
   active: ['deactivate', 'shutdown'],
+};
+
+/** What each does to a node. */
+const TRANSITION_WORDS = {
+  configure: 'It reads its parameters and becomes inactive.',
+  activate: 'It begins its work.',
+  deactivate: 'It stops its work until it is activated.',
+  cleanup: 'It gives up what it has and becomes unconfigured.',
+  shutdown: 'It ends its work for good: only a start of its task brings it back.',
 };
 
 /** Keeps numbers as they were written: to ROS 1.0 and 1 are of different types, and 64 bits are more than a number has here. */
@@ -147,9 +157,21 @@ export class Ros {
     const transitions = this.#page.app.can('operate') ? TRANSITIONS[node.lifecycle] ?? [] : [];
     return html`
       <p class="lifecycle">Lifecycle: ${lifecycleState(node)}
-        ${transitions.map((transition) => html`<button class="quiet-button" ?disabled=${this.#changing !== null} @click=${() => this.#change(node.name, transition)}>${transition}</button>`)}
+        ${transitions.map((transition) => html`<button class="quiet-button" ?disabled=${this.#changing !== null} @click=${() => this.#askChange(node, transition)}>${transition}…</button>`)}
         <span role="status">${this.#changing ? `${this.#changing}…` : ''}</span></p>
       ${this.#refused ? html`<p class="bad" role="alert"><span aria-hidden="true">▲ </span>${this.#refused}</p>` : nothing}`;
+  }
+
+  #askChange({ name, lifecycle, task }, transition) {
+    const robot = this.#page.robot.name;
+    const title = transition.charAt(0).toUpperCase() + transition.slice(1);
+    open({
+      title: `${title} ${name}?`,
+      action: title,
+      isDangerous: ['shutdown', 'cleanup', 'deactivate'].includes(transition),
+      body: () => html`<p>The node <code>${name}</code>${task ? html` of the task <strong>${task}</strong>` : nothing} on <strong>${robot}</strong> is ${words(lifecycle)}. ${TRANSITION_WORDS[transition]}</p>`,
+      act: () => void this.#change(name, transition),
+    });
   }
 
   async #change(name, transition) {

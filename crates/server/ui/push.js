@@ -7,9 +7,12 @@ import { close, isOpen, open } from './dialog.js';
 import { idsOf, isWaiting, labelsOf } from './fleet.js';
 import { number, plural, short, size, words } from './format.js';
 import { change } from './frame.js';
+import { tell } from './notice.js';
 import { go } from './router.js';
 
 const COUNT_PAUSE_MS = 250;
+// An order for more robots than this wants a word of its own, as the command does.
+const ASK_ABOVE = 10;
 // Robots named after the count of those that a selector means.
 const NAMED = 5;
 const SHOWN_LABELS = 6;
@@ -56,15 +59,15 @@ class Order {
   #match = {};
   /** What the server refused, at its field. */
   #problems = {};
+  /** For how many robots it was said that so many are meant. */
+  #confirmed = 0;
 
   constructor(app, ids, packages, given) {
     Object.assign(this, { app, ids, packages });
     this.names = [...new Set(packages.map(({ package: { name } }) => name))];
-    const last = remembered(app);
-    const name = given.package ?? (this.names.includes(last.name) ? last.name : this.names[0] ?? '');
-    this.fields = { selector: '*', delivery: 'adaptive', batch: '', max_failures: '', priority: '', hours: '', ...last, name, manifest: given.manifest };
+    // What is ordered and of whom is chosen each time: a form that is sent by mistake must order nothing.
+    this.fields = { delivery: 'adaptive', batch: '', max_failures: '', priority: '', hours: '', ...remembered(app), restart: false, selector: '', name: given.package ?? '', manifest: given.manifest };
     this.hasMore = ['batch', 'max_failures', 'priority', 'hours'].some((field) => this.fields[field]);
-    if (!ids) this.#count();
   }
 
   get #versions() {
@@ -101,21 +104,38 @@ class Order {
           <span id="delivery-words" class="hint quiet">${DELIVERIES.find(([id]) => id === delivery)?.[2]}</span>`, 'wide')}
       </div>
       <details class="more" ?open=${this.hasMore} @invalid=${UNFOLD}>
-        <summary>Batches, priority, expiry</summary>
+        <summary>Batches, priority, expiry, restart</summary>
         <div class="fields">
           ${this.#number('batch', 'Robots at a time', { min: 1, placeholder: 'all' })}
           ${this.#number('max_failures', 'Failures to bear before pausing', { min: 0, placeholder: 'any number' })}
           ${this.#number('priority', 'Priority', { min: -100, max: 100, placeholder: '0' })}
           ${this.#number('hours', 'Expires after hours', { min: 1, placeholder: 'as the server is set' })}
         </div>
+        <label class="choice"><input type="checkbox" .checked=${this.fields.restart} @change=${({ currentTarget }) => this.#set('restart', currentTarget.checked)}> Run it anew where it runs already</label>
       </details>
-      <p class="in-words" aria-live="polite">${this.#inWords()}</p>`;
+      <p class="in-words" aria-live="polite">${this.#inWords()}</p>
+      ${this.#confirmation()}`;
+  }
+
+  /** Of many robots it is asked whether they are meant. */
+  #confirmation() {
+    const robots = this.#robots ?? 0;
+    if (robots <= ASK_ABOVE) return nothing;
+    const whom = !this.ids && this.fields.selector.trim() === '*' ? `all ${number(robots)} robots` : `${number(robots)} robots`;
+    return this.#field('many', '', html`<label class="choice"><input id="order-many" type="checkbox" required aria-describedby="order-many-problem" .checked=${this.#confirmed === robots} @change=${({ currentTarget }) => this.#confirm(currentTarget.checked ? robots : 0)}> Yes, order it on ${whom}</label>`, 'wide');
+  }
+
+  #confirm(robots) {
+    change(() => {
+      this.#confirmed = robots;
+      delete this.#problems.many;
+    });
   }
 
   /** A field with its label and, below it, what is wrong with it. */
   #field(field, title, input, kind = '') {
     const problem = this.#problems[field];
-    return html`<div class="field ${kind}"><label for=${`order-${field}`}>${title}</label>${input}<p id=${`order-${field}-problem`} class="bad" role="alert" ?hidden=${!problem}>${problem ? `▲ ${problem}` : ''}</p></div>`;
+    return html`<div class="field ${kind}">${title ? html`<label for=${`order-${field}`}>${title}</label>` : nothing}${input}<p id=${`order-${field}-problem`} class="bad" role="alert" ?hidden=${!problem}>${problem ? `▲ ${problem}` : ''}</p></div>`;
   }
 
   #number(field, title, { min, max, placeholder }) {
@@ -129,7 +149,7 @@ class Order {
       this.#set('name', currentTarget.value.trim());
       this.#set('manifest', undefined);
     };
-    if (this.names.length <= LISTED_PACKAGES) return html`<select id="order-name" aria-describedby="order-name-problem" @change=${choose}>${this.names.map((one) => html`<option .selected=${one === name}>${one}</option>`)}</select>`;
+    if (this.names.length <= LISTED_PACKAGES) return html`<select id="order-name" required aria-invalid=${'name' in this.#problems} aria-describedby="order-name-problem" @change=${choose}><option value="" .selected=${!name}>Choose a package</option>${this.names.map((one) => html`<option value=${one} .selected=${one === name}>${one}</option>`)}</select>`;
     return html`<input id="order-name" list="order-names" required autocomplete="off" autocapitalize="none" spellcheck="false" placeholder=${`one of ${number(this.names.length)}`} .value=${name}
         aria-invalid=${'name' in this.#problems} aria-describedby="order-name-problem" @input=${choose}>
       <datalist id="order-names">${this.names.map((one) => html`<option value=${one}></option>`)}</datalist>`;
@@ -140,10 +160,11 @@ class Order {
     const isBad = Boolean(problem) || total === 0;
     const take = (selector) => {
       this.#set('selector', selector);
+      this.#confirmed = 0;
       this.#count();
     };
     return this.#field('selector', 'Robots', html`
-      <input id="order-selector" class="code" required .value=${this.fields.selector} autocomplete="off" autocapitalize="none" spellcheck="false" aria-invalid=${isBad} aria-describedby="match order-selector-problem" @input=${({ currentTarget }) => take(currentTarget.value)}>
+      <input id="order-selector" class="code" required placeholder="site=lab" .value=${this.fields.selector} autocomplete="off" autocapitalize="none" spellcheck="false" aria-invalid=${isBad} aria-describedby="match order-selector-problem" @input=${({ currentTarget }) => take(currentTarget.value)}>
       <p id="match" class=${isBad ? 'bad' : 'quiet'} role="status">${problem ?? (total === undefined ? ' ' : matched(total, some))}</p>
       <p class="suggestions" role="group" aria-label="Robots to choose">${['*', ...this.#labels].map((selector) => html`<button type="button" class="plain link" aria-pressed=${this.fields.selector === selector} @click=${() => take(selector)}>${selector === '*' ? 'all' : selector}</button>`)}</p>
       <p class="hint quiet">Several with a comma, <code>arm,cart</code>; without one, <code>site=lab,!arm</code>.</p>`);
@@ -162,12 +183,13 @@ class Order {
   /** What is about to be ordered, in a sentence. */
   #inWords() {
     const version = this.#version?.package;
+    if (!this.fields.name) return html`<span class="quiet">Choose a package${this.ids ? '' : ' and its robots'}.</span>`;
     if (!version) return html`<span class="quiet">There is no package ${this.fields.name}.</span>`;
     const robots = this.#robots;
     const whole = robots ? ` to ${plural(robots, 'robot')}, ${size(robots * version.content.size)} in all` : '';
-    const { batch, max_failures: bears, priority, hours } = this.fields;
+    const { batch, max_failures: bears, priority, hours, restart } = this.fields;
     const options = optionsInWords({ batch: Number(batch), max_failures: bears === '' ? null : Number(bears), priority: Number(priority) });
-    return [`${version.name}@${version.version}${whole}`, ...options, hours && `expires after ${plural(Number(hours), 'hour')}`].filter(Boolean).join('; ');
+    return [`${version.name}@${version.version}${whole}`, ...options, hours && `expires after ${plural(Number(hours), 'hour')}`, restart && 'anew where it runs already'].filter(Boolean).join('; ');
   }
 
   // What the selector means.
@@ -188,22 +210,39 @@ class Order {
   async act() {
     const { name, delivery, selector } = this.fields;
     const version = this.#version;
+    if (!name) this.#refuse('name', 'Choose a package.');
     if (!version) this.#refuse('name', `There is no package ${name}.`);
+    await this.#check(selector.trim());
     const body = { package: name, manifest: version.package.manifest.digest, delivery, selector: this.ids ? idsOf(this.ids) : selector.trim() };
     const { batch, max_failures, priority, hours } = this.fields;
     for (const [field, value] of Object.entries({ batch, max_failures, priority, expires_in_s: hours && Number(hours) * 3600 })) if (value !== '') body[field] = Number(value);
+    if (this.fields.restart) body.restart = true;
     const text = JSON.stringify(body);
     if (this.#keyed && this.#keyed !== text) this.#key = newKey();
     this.#keyed = text;
     try {
-      const { id } = await order('/deployments', body, this.#key);
-      remember(this.app, this.fields, this.ids);
+      const { id, assignments = [] } = await order('/deployments', body, this.#key);
+      remember(this.app, this.fields);
+      const running = assignments.filter(({ phase }) => phase === 'running').length;
+      if (running) tell(`${name}@${version.package.version} runs already on ${plural(running, 'robot')}, and goes on there.`);
       go(['deployments', id]);
     } catch (error) {
       const field = fieldOf(error);
       if (field && (field !== 'selector' || !this.ids)) this.#refuse(field, error.message);
       throw error;
     }
+  }
+
+  /** Whom it is for is known before it is sent, and of many it was said that they are meant. */
+  async #check(selector) {
+    if (!this.ids) {
+      if (!selector) this.#refuse('selector', 'Say which robots.');
+      const match = await matchOf(selector, this.app.fleet);
+      if (!match) throw new SignedOut();
+      change(() => (this.#match = match));
+      if (match.problem) this.#refuse('selector', match.problem);
+    }
+    if (this.#robots > ASK_ABOVE && this.#confirmed !== this.#robots) this.#refuse('many', `Say that ${number(this.#robots)} robots are meant.`);
   }
 
   /** Says what is wrong at the field, and goes there. */
@@ -242,7 +281,7 @@ const FIELD_OF_KEY = { selector: 'selector', package: 'name', manifest: 'manifes
 /** The field that a refusal is about. */
 const fieldOf = ({ code, message }) => FIELD_OF_CODE[code] ?? FIELD_OF_KEY[/^([a-z_]+)(: |\b)/.exec(message)?.[1]];
 
-// The choices are kept for as long as the tab is open, each person's own.
+// How it is to be done is kept for as long as the tab is open, each person's own; what and of whom is not.
 
 const placeOf = ({ me }) => `taskd.order.${me?.name}`;
 
@@ -254,9 +293,8 @@ function remembered(app) {
   }
 }
 
-function remember(app, { manifest, selector, ...fields }, ids) {
-  const before = remembered(app).selector;
-  sessionStorage.setItem(placeOf(app), JSON.stringify({ ...fields, selector: ids ? before : selector }));
+function remember(app, { delivery, batch, max_failures, priority, hours }) {
+  sessionStorage.setItem(placeOf(app), JSON.stringify({ delivery, batch, max_failures, priority, hours }));
 }
 
 function optionsInWords({ batch, max_failures: bears, priority }) {

@@ -33,6 +33,7 @@ test('two robots are chosen, get a package while it is seen to come, and run it'
   for (const name of ['atlas', 'borea']) await row(page, name).getByRole('checkbox').click();
   await page.getByRole('button', { name: 'Push…' }).click();
   await page.getByRole('dialog').getByText('Push to 2 robots').waitFor();
+  await page.getByRole('dialog').getByLabel('Package').selectOption('talker');
   await page.getByRole('dialog').getByRole('button', { name: 'Deploy' }).click();
   await page.waitForURL(/#\/deployments\/d/);
   await page.getByRole('link', { name: 'Robots' }).click();
@@ -185,6 +186,7 @@ test('who is limited to some robots gives orders to all that they see', async (t
   const page = await open(t, server, { token });
   await page.getByRole('checkbox', { name: 'Select all that are shown' }).click();
   await page.getByRole('button', { name: 'Push…' }).click();
+  await page.getByRole('dialog').getByLabel('Package').selectOption('talker');
   await page.getByRole('dialog').getByRole('button', { name: 'Deploy' }).click();
   await page.waitForURL(/#\/deployments\/d/);
   const { deployments: [{ counts }] } = await server.ask('GET', '/deployments');

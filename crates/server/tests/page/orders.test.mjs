@@ -171,9 +171,63 @@ test('who comes unseen gets nothing of what is ordered for all', async (t) => {
   const corvus = await server.ask('GET', '/robots/corvus');
   assert.deepEqual([corvus.labels, corvus.tasks[0].wanted], [{}, 'running']);
   await page.getByRole('button', { name: 'Push…' }).click();
+  await dialog.getByLabel('Package').selectOption('talker');
   await dialog.getByRole('button', { name: 'Deploy' }).click();
   await page.waitForURL(/#\/deployments\/d/);
   assert.deepEqual(await receivers(server, await newest(server)), ['atlas', 'borea']);
+  assertQuiet(page);
+});
+
+test('an order needs a package, robots that there are, and a word of its own for many', async (t) => {
+  const server = await Server.start(t);
+  await enrolAll(server, Object.fromEntries(Array.from({ length: 12 }, (_, number) => [`r${number}`, { half: number % 2 ? 'odd' : 'even' }])));
+  server.push('talker', '1.0.0');
+  const page = await open(t, server, { hash: '#/deployments' });
+  const dialog = page.getByRole('dialog');
+  const [robots, deploy] = [dialog.getByLabel('Robots', { exact: true }), dialog.getByRole('button', { name: 'Deploy' })];
+  const ordered = async () => (await server.ask('GET', '/deployments')).deployments.length;
+  const isRefusedAt = async (id) => {
+    await until(page, (field) => document.activeElement.id === field, id);
+    assert.equal(await ordered(), 0, id);
+  };
+  await page.getByRole('button', { name: 'New deployment…' }).click();
+  await deploy.waitFor();
+  await page.keyboard.press('Enter');
+  await isRefusedAt('order-selector');
+  await robots.fill('*');
+  await page.keyboard.press('Enter');
+  await isRefusedAt('order-name');
+  await dialog.getByLabel('Package').selectOption('talker');
+  await dialog.getByText('Yes, order it on all 12 robots').waitFor();
+  await deploy.click();
+  await isRefusedAt('order-many');
+  await assertAccessible(page, 'an order for many');
+  // A name that there is not is no order for the others, and no robot is meant without one.
+  for (const [selector, said] of [['r1,r77', 'No robot has the name or id r77.'], ['!r77', 'No robot has the name or id r77.'], ['site=mars', 'No robot is meant.']]) {
+    await robots.fill(selector);
+    await dialog.locator('#match', { hasText: said }).waitFor();
+    await robots.press('Enter');
+    await isRefusedAt('order-selector');
+  }
+  // What was said of twelve does not hold for others; of few nothing is asked.
+  await robots.fill('*');
+  await dialog.getByText('Yes, order it on all 12 robots').click();
+  await robots.fill('half=odd');
+  await dialog.getByText('6 robots now').waitFor();
+  assert.equal(await dialog.getByText('Yes, order it').count(), 0);
+  await robots.fill('!r1');
+  await dialog.getByText('Yes, order it on 11 robots').waitFor();
+  await deploy.click();
+  await isRefusedAt('order-many');
+  await dialog.getByText('Yes, order it on 11 robots').click();
+  await deploy.click();
+  await page.waitForURL(/#\/deployments\/d/);
+  assert.equal((await receivers(server, await newest(server))).length, 11);
+  // Nothing of it is chosen the next time.
+  await page.goto(`${server.url}/#/deployments`);
+  await page.getByRole('button', { name: 'New deployment…' }).click();
+  await deploy.waitFor();
+  assert.deepEqual([await robots.inputValue(), await dialog.getByLabel('Package').inputValue()], ['', '']);
   assertQuiet(page);
 });
 
@@ -198,6 +252,7 @@ test('who waits for approval gets no orders, and is deleted like others', async 
   // Also of those that a selector means.
   await page.goto(`${server.url}/#/packages`);
   await page.getByRole('button', { name: 'Push talker 1.0.0' }).click();
+  await dialog.getByLabel('Robots', { exact: true }).fill('*');
   await dialog.getByText('1 robot now: atlas').waitFor();
   await page.keyboard.press('Escape');
   await page.goto(`${server.url}/#/settings`);
@@ -224,6 +279,7 @@ test('what is wrong in a part of the order that is folded is shown', async (t) =
   const page = await open(t, server, { hash: '#/packages' });
   const dialog = page.getByRole('dialog');
   await page.getByRole('button', { name: 'Push talker 1.0.0' }).click();
+  await dialog.getByLabel('Robots', { exact: true }).fill('atlas');
   await dialog.getByText('Batches, priority, expiry').click();
   await dialog.getByLabel('Priority').fill('1000');
   await dialog.getByText('Batches, priority, expiry').click();

@@ -37,6 +37,7 @@ test('a folder that is brought is the package that the command makes of it, and 
   assert.ok(JSON.stringify(packed).includes(brought.package.manifest.digest), 'the same digest');
   await assertAccessible(page, 'the packages');
   await page.locator('[data-package="talker@1.0.0"]').getByRole('button', { name: 'Push' }).click();
+  await page.getByRole('dialog').getByLabel('Robots', { exact: true }).fill('*');
   await page.getByRole('dialog').getByText('1 robot now: atlas').waitFor();
   await assertAccessible(page, 'the order');
   await page.getByRole('dialog').getByRole('button', { name: 'Deploy' }).click();

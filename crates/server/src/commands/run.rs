@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use clap::Args;
 use task_proto::api::{CreateDeployment, DeploymentView, RobotView};
+use task_proto::desired::PackageRef;
 use task_proto::{RobotId, RobotName};
 
 use super::output::{printable, say};
@@ -29,14 +30,14 @@ pub struct RunOrder {
     /// A package's directory (with a / in it, or .), or a package on the server as NAME, NAME:VERSION or NAME@DIGEST
     #[arg(value_name = "PKG", add = complete::packages(), value_hint = clap::ValueHint::DirPath)]
     package: String,
-    /// The launch file's name
+    /// The launch file's name; without it the package runs as its own [run] says, which needs no ros2 launch if that is a command
     #[arg(value_name = "FILE.launch.py")]
-    file: String,
+    file: Option<String>,
     /// Launch arguments; those of the package's own launch file stay where nothing else is said
     #[arg(value_name = "ARG:=VALUE")]
     arguments: Vec<Argument>,
     /// The ROS package that has the launch file [default: that of the package's own launch file, else the one of its name]
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, value_name = "NAME", requires = "file")]
     ros_package: Option<String>,
     /// Show what the robot's task says once it runs, until Ctrl-C; it runs on
     #[arg(short, long, conflicts_with = "detach")]
@@ -77,33 +78,18 @@ pub(super) async fn run(session: &Session, order: RunOrder) -> Result<Outcome, C
     let robot = robot::one(session, &order.robot).await?;
     let arguments: BTreeMap<String, String> =
         order.arguments.iter().map(|argument| (argument.name.clone(), argument.value.clone())).collect();
-    let launch = Launch { ros_package: order.ros_package.clone(), file: order.file.clone(), arguments };
+    let file = order.file.clone();
+    if let Some(argument) = file.as_ref().filter(|file| file.contains(":=")) {
+        return Err(CommandError::Usage(format!("{argument}: FILE.launch.py comes before the arguments for it")));
+    }
+    let launch = file.map(|file| Launch { ros_package: order.ros_package.clone(), file, arguments });
     let package = match order.package.contains('/') || order.package == "." {
         true => {
-            let packed = packed(PathBuf::from(&order.package), Some(launch)).await?;
+            let packed = packed(PathBuf::from(&order.package), launch).await?;
             upload(&session.client, &Upload::of(&packed, false)).await?;
             packed.package
         }
-        false => {
-            let named: PackageName =
-                order.package.parse().map_err(|error| CommandError::Usage(format!("PKG: {error}")))?;
-            let stored = find(session, &named).await?;
-            let manifest = launch.put_into(stored.manifest);
-            let problems = manifest.problems();
-            if !problems.is_empty() {
-                let problem = |problem: task_proto::manifest::ManifestProblem| Problem {
-                    file: "FILE and ARG".to_owned(),
-                    reason: problem.to_string(),
-                };
-                let problems = problems.into_iter().map(problem).collect();
-                return Err(PackageError::Invalid { dir: PathBuf::from(&order.package), problems }.into());
-            }
-            let variant = describe(&manifest, stored.package.content)?;
-            let (config, manifest) = (&variant.config_bytes[..], &variant.manifest_bytes[..]);
-            let package = &variant.package;
-            upload(&session.client, &Upload { package, config, manifest, content: None, tagged: false }).await?;
-            variant.package
-        }
+        false => stored(session, &order.package, launch).await?,
     };
     sign(session, &package, &keys).await?;
     let selector = robot.id.as_str().parse().map_err(|error| CommandError::Usage(format!("{error}")))?;
@@ -119,13 +105,36 @@ pub(super) async fn run(session: &Session, order: RunOrder) -> Result<Outcome, C
         return Ok(Outcome::Succeeded);
     }
     let outcome = wait::until_settled(session, &ordered.id, order.timeout).await?;
-    if outcome != Outcome::Succeeded {
+    if matches!(outcome, Outcome::Failed | Outcome::SomeFailed | Outcome::TimedOut) {
         say_what_still_runs(session, &robot.id, &ordered).await?;
     }
     match order.follow && outcome == Outcome::Succeeded {
         true => logs::follow_task(session, robot.name, package.name).await,
         false => Ok(outcome),
     }
+}
+
+/// A package on the server, with this launch file instead of its own.
+async fn stored(session: &Session, text: &str, launch: Option<Launch>) -> Result<PackageRef, CommandError> {
+    let named: PackageName = text.parse().map_err(|error| CommandError::Usage(format!("PKG: {error}")))?;
+    let stored = find(session, &named).await?;
+    let Some(launch) = launch else { return Ok(stored.package) };
+    let manifest = launch.put_into(stored.manifest);
+    let problems = manifest.problems();
+    if !problems.is_empty() {
+        let problem = |problem: task_proto::manifest::ManifestProblem| Problem {
+            file: "FILE and ARG".to_owned(),
+            reason: problem.to_string(),
+        };
+        let problems = problems.into_iter().map(problem).collect();
+        return Err(PackageError::Invalid { dir: PathBuf::from(text), problems }.into());
+    }
+    let variant = describe(&manifest, stored.package.content)?;
+    let (config, manifest) = (&variant.config_bytes[..], &variant.manifest_bytes[..]);
+    let package = &variant.package;
+    let new = Upload { package, config, manifest, content: None, tagged: false };
+    upload(&session.client, &new).await?;
+    Ok(variant.package)
 }
 
 /// Says that the version before goes on, where the new one could not take its place.

@@ -251,6 +251,9 @@ pub struct RobotTask {
     pub degraded: Option<Failure>,
     /// The version whose process lives.
     pub active: Option<ActiveVersion>,
+    /// Whether the ordered version means another package by now: a forced push took it.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub outdated: bool,
     /// Times the process was started again in this run.
     pub restarts: u32,
 }
@@ -434,6 +437,9 @@ pub struct DeploymentView {
     pub counts: Vec<PhaseCount>,
     /// Deployments it took the place of on some robot; none for who is limited to some robots.
     pub supersedes: Vec<DeploymentId>,
+    /// Whether its version means another package by now: a forced push took it.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub outdated: bool,
     /// One per robot, sorted by name; only in `GET /deployments/{id}` and the answer to an order.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub assignments: Option<Vec<AssignmentView>>,

@@ -11,7 +11,7 @@ import { Parts, canRetry, reasonOf } from './deployments/parts.js';
 import { list, steps, strip, tookInAll } from './timeline.js';
 import { open } from './dialog.js';
 import { idsOf } from './fleet.js';
-import { bytes, duration, moment, number, plural, size, tone, words } from './format.js';
+import { bytes, duration, moment, number, plural, short, size, tone, words } from './format.js';
 import { change } from './frame.js';
 import { tell } from './notice.js';
 import { optionsOf } from './push.js';
@@ -170,13 +170,14 @@ export class DeploymentView {
 
   #head(now, { retried, newer }) {
     const deployment = this.#deployment;
-    const { package: { name, version, manifest }, selector, created_at_ms: created, expires_at_ms: expires, state } = deployment;
+    const { package: { name, version, manifest }, selector, created_at_ms: created, expires_at_ms: expires, state, outdated } = deployment;
     const isUnsettled = this.#isUnsettled;
     return html`
       <p class="path"><a href=${at(['deployments'])}>Deployments</a> <span class="quiet">/ <span class="code">${this.id}</span></span></p>
       <header class="bar-of-tools deployment-head">
         <h1><a href=${at(['packages', name], { version: manifest.digest })}>${name}<span class="quiet">@${version}</span></a></h1>
         <p class="state">${deploymentState(deployment)}</p>
+        ${outdated ? html`<p class="bad">▲ outdated: ${version} is another package now, this is <span class="code">${short(manifest.digest)}</span></p>` : nothing}
         ${this.app.can('operate') ? html`<span class="acts">
           ${state === 'paused' ? html`<button class="primary" @click=${() => this.#askResume()}>Resume…</button>` : nothing}
           ${retried.size ? html`<button class="quiet-button" @click=${() => this.#askRetry([...this.#parts.all.values()])}>Retry ${plural(retried.size, 'robot')}…</button>` : nothing}

@@ -26,8 +26,9 @@ export const progressBar = ({ task, phase, progress }) => progress?.total && ton
   : null;
 
 /** What else is worth knowing of a task that has not failed. */
-export function remarks({ active, version, deployment, restarts, wanted, phase, degraded }) {
+export function remarks({ active, version, deployment, outdated, restarts, wanted, phase, degraded }) {
   const said = [];
+  if (outdated) said.push(`▲ outdated: ${version} is another package now`);
   if (degraded) said.push(`▲ degraded: ${words(degraded.code)}`);
   if (active && active.deployment !== deployment) said.push(active.version === version ? 'what was there before still runs' : `${active.version} still runs`);
   if (restarts) said.push(`restarted ${restarts}×`);

@@ -58,6 +58,9 @@ pub struct Push {
     /// Sign it with this private key, of taskd key new; may be repeated
     #[arg(long = "sign", value_name = "KEY")]
     keys: Vec<PathBuf>,
+    /// Take the version from a package with other content; robots that have that one are marked as outdated
+    #[arg(long)]
+    force: bool,
     /// Only check the package and list the robots that are meant
     #[arg(long)]
     dry_run: bool,
@@ -126,7 +129,8 @@ pub(super) async fn run(session: &Session, push: Push) -> Result<Outcome, Comman
     if let (Some(selector), Some(matched)) = (&push.to, &matched) {
         confirm(&format!("push {} to {selector}", packed.package.name), matched.robots.len(), push.yes)?;
     }
-    upload::upload(&session.client, &upload::Upload::of(&packed, true)).await?;
+    let package = upload::Upload { force: push.force, ..upload::Upload::of(&packed, true) };
+    upload::upload(&session.client, &package).await?;
     sign(session, &packed.package, &keys).await?;
     let Some(selector) = push.to else {
         session.output.described(&packed.package, reference, |_| describe(&packed))?;

@@ -64,7 +64,8 @@ fn standing(task: &RobotTask) -> String {
         (None, Some(_)) => "/earlier-runs",
         (None, None) => "",
     };
-    format!("{}:{}{health}", task.task, task.phase)
+    let age = if task.outdated { "/outdated" } else { "" };
+    format!("{}:{}{health}{age}", task.task, task.phase)
 }
 
 /// The version that goes on although a newer order has failed or can't begin.
@@ -170,7 +171,7 @@ fn task_row(task: &RobotTask) -> Vec<String> {
     };
     vec![
         task.task.to_string(),
-        task.version.to_string(),
+        if task.outdated { format!("{} (outdated)", task.version) } else { task.version.to_string() },
         wanted.to_owned(),
         task.run.to_string(),
         task.phase.to_string(),

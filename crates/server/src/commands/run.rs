@@ -132,7 +132,7 @@ async fn stored(session: &Session, text: &str, launch: Option<Launch>) -> Result
     let variant = describe(&manifest, stored.package.content)?;
     let (config, manifest) = (&variant.config_bytes[..], &variant.manifest_bytes[..]);
     let package = &variant.package;
-    let new = Upload { package, config, manifest, content: None, tagged: false };
+    let new = Upload { package, config, manifest, content: None, tagged: false, force: false };
     upload(&session.client, &new).await?;
     Ok(variant.package)
 }

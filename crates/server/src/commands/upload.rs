@@ -42,13 +42,15 @@ pub(super) struct Upload<'a> {
     pub(super) content: Option<&'a Path>,
     /// Whether its version means it from now on; else it goes by its digest alone.
     pub(super) tagged: bool,
+    /// Whether it may take its version from a package with other content.
+    pub(super) force: bool,
 }
 
 impl<'a> Upload<'a> {
     /// A directory's package, under its version or by its digest alone.
     pub(super) fn of(packed: &'a Packed, tagged: bool) -> Self {
         let (config, manifest) = (&packed.config_bytes, &packed.manifest_bytes);
-        Self { package: &packed.package, config, manifest, content: Some(packed.content.path()), tagged }
+        Self { package: &packed.package, config, manifest, content: Some(packed.content.path()), tagged, force: false }
     }
 }
 
@@ -56,6 +58,7 @@ impl<'a> Upload<'a> {
 pub(super) async fn upload(client: &Client, upload: &Upload<'_>) -> Result<(), CommandError> {
     let package = upload.package;
     let name = package.name.as_str();
+    check_version(client, upload).await?;
     let mut sent = 0;
     let content = upload.content.map(|path| (package.content, Source::File(path)));
     for (blob, source) in [Some((package.config, Source::Bytes(upload.config))), content].into_iter().flatten() {
@@ -193,22 +196,50 @@ async fn body(source: &Source<'_>, size: u64) -> Result<Body, CommandError> {
     }
 }
 
+/// A version that is there with other content is refused before anything travels; the server has the last word.
+async fn check_version(client: &Client, upload: &Upload<'_>) -> Result<(), CommandError> {
+    let package = upload.package;
+    if !upload.tagged {
+        return Ok(());
+    }
+    let path = format!("/v2/{}/manifests/{}", package.name, package.version);
+    let known = match client.send(|| client.request(Method::HEAD, &path)).await {
+        Ok(response) => digest_of(&response),
+        Err(error) if status_of(&error) == Some(StatusCode::NOT_FOUND) => None,
+        Err(error) => return Err(error.into()),
+    };
+    match known.filter(|known| *known != package.manifest.digest.to_string()) {
+        None => Ok(()),
+        Some(other) if upload.force => {
+            say(&format!("{} {} takes its version from {other}", package.name, package.version));
+            Ok(())
+        }
+        Some(other) => Err(CommandError::Usage(format!(
+            "{name} {version} is on the server with other content, {other}; this is {new}. Raise the version in task.toml or \
+             package.xml, or --force: robots that have the other one are marked as outdated",
+            name = package.name,
+            version = package.version,
+            new = package.manifest.digest
+        ))),
+    }
+}
+
+fn digest_of(response: &Response) -> Option<String> {
+    response.headers().get("docker-content-digest").and_then(|value| value.to_str().ok()).map(ToOwned::to_owned)
+}
+
 /// Puts the manifest, under the version as its tag unless it is to go by its digest, if it is not there already.
 async fn put_manifest(client: &Client, upload: &Upload<'_>) -> Result<(), CommandError> {
-    let Upload { package, manifest, tagged, .. } = upload;
+    let Upload { package, manifest, tagged, force, .. } = upload;
     let reference = if *tagged { package.version.to_string() } else { package.manifest.digest.to_string() };
     let path = format!("/v2/{}/manifests/{reference}", package.name);
     match client.send(|| client.request(Method::HEAD, &path)).await {
-        Ok(response) => {
-            let known = response.headers().get("docker-content-digest").and_then(|value| value.to_str().ok());
-            if known == Some(&package.manifest.digest.to_string()) {
-                return Ok(());
-            }
-            say(&format!("version {} is on the server with other content; its tag moves", package.version));
-        }
+        Ok(response) if digest_of(&response) == Some(package.manifest.digest.to_string()) => return Ok(()),
+        Ok(_) => {}
         Err(error) if status_of(&error) == Some(StatusCode::NOT_FOUND) => {}
         Err(error) => return Err(error.into()),
     }
+    let path = if *force { format!("{path}?force=true") } else { path };
     let put = || client.request(Method::PUT, &path).header(CONTENT_TYPE, MANIFEST_TYPE).body(manifest.to_vec());
     client.send(put).await?;
     Ok(())

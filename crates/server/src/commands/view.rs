@@ -74,6 +74,9 @@ fn describe(view: &DeploymentView) -> String {
         ("created", time(view.created_at_ms)),
         ("expires", time(view.expires_at_ms)),
     ];
+    if view.outdated {
+        facts.push(("outdated", "a forced push gave this version to another package".to_owned()));
+    }
     if view.priority != 0 {
         facts.push(("priority", view.priority.to_string()));
     }

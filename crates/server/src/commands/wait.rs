@@ -203,6 +203,7 @@ pub(super) mod tests {
             expires_at_ms: 0,
             counts: Vec::new(),
             supersedes: Vec::new(),
+            outdated: false,
             assignments: Some(assignments),
         }
     }

@@ -12,16 +12,19 @@ use axum::extract::{FromRef as _, Request, State};
 use bytes::Bytes;
 use futures_util::StreamExt as _;
 use http::{HeaderMap, StatusCode, header};
+use serde::Deserialize;
 use task_archive::{Compression, Limits, Refusal, UnpackError, unpack_unannounced};
 use task_proto::UserName;
 use task_proto::api::PackageView;
 use tempfile::TempDir;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::time::timeout;
+use utoipa::IntoParams;
 
 use super::App;
 use super::archives::ArchiveReaders;
 use super::error::ApiError;
+use super::extract::QueryParams;
 use super::oci::{self, OciError, Registry};
 use super::openapi::Created;
 use crate::blobs::BlobError;
@@ -113,11 +116,22 @@ enum UploadError {
     Disk(#[from] io::Error),
 }
 
+/// The query of `POST /packages`.
+#[derive(Deserialize, IntoParams)]
+#[serde(deny_unknown_fields)]
+pub(super) struct UploadQuery {
+    /// Whether the package may take its version from one with other content, which is outdated by that.
+    #[serde(default)]
+    #[param(required = false)]
+    force: bool,
+}
+
 /// Takes a package's directory as a tar archive, compressed with zstd or not, and packs it as `taskd push` would.
 #[utoipa::path(post, path = "/api/v1/packages", tag = "packages",
     request_body(description = "The directory: its files, directories and links, or that one directory with all that is in it.",
         content((String = "application/x-tar"), (String = "application/zstd"))),
     responses((status = 400, description = "The body broke off."),
+        (status = 409, description = "`version_taken`: the version is there with other content; the message says which."),
         (status = 413, description = "`too_large`: it is more than the server unpacks."),
         (status = 415, description = "The body is neither `application/x-tar` nor `application/zstd`."),
         (status = 422, description = "`archive_refused`: there is something in it that a package can't have. \
@@ -128,12 +142,13 @@ enum UploadError {
 pub(super) async fn package(
     State(app): State<App>,
     by: Person,
+    QueryParams(query): QueryParams<UploadQuery>,
     request: Request,
 ) -> Result<Created<PackageView>, ApiError> {
     let compression = compression(request.headers())?;
     let place = app.uploads.place(&by.name)?;
     let (packed, _place) = receive(&app, place, compression, request.into_body()).await?;
-    Ok(Created(oci::publish(&Registry::from_ref(&app), &by, &packed).await?))
+    Ok(Created(oci::publish(&Registry::from_ref(&app), &by, &packed, query.force).await?))
 }
 
 fn too_slow(message: &str) -> ApiError {

@@ -1,6 +1,6 @@
 //! Deployments: the operators' orders, and how far they have come.
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeSet, HashMap, HashSet};
 
 use sqlx::{AssertSqlSafe, Row as _};
 use task_proto::api::{AssignmentView, CreateDeployment, DeploymentView, PhaseCount};
@@ -160,6 +160,18 @@ impl Store {
         rows.iter().map(|row| id("deployments.id", row)).collect()
     }
 
+    /// The deployments whose package lost its version to another: mostly none.
+    pub(super) async fn outdated_deployments(&self) -> Result<HashSet<String>, StoreError> {
+        // The same package has the same text.
+        let rows: Vec<String> = sqlx::query_scalar(
+            "SELECT d.id FROM packages p JOIN deployments d ON d.task = p.name AND d.package = p.package
+             WHERE p.replaced_by IS NOT NULL",
+        )
+        .fetch_all(&self.reads)
+        .await?;
+        Ok(rows.into_iter().collect())
+    }
+
     /// The packages some robot should have, or may get (back): what must not be collected.
     pub async fn packages_in_use(&self) -> Result<Vec<PackageRef>, StoreError> {
         let rows: Vec<String> = sqlx::query_scalar(
@@ -193,9 +205,12 @@ impl Store {
         for (newer, older) in superseded {
             supersedes.entry(newer).or_default().push(super::rows::id("assignments.deployment_id", &older)?);
         }
+        let outdated = self.outdated_deployments().await?;
         let view = |row: &sqlx::any::AnyRow| {
             let id: String = row.try_get("id")?;
-            deployment_view(row, counts.remove(&id).unwrap_or_default(), supersedes.remove(&id).unwrap_or_default())
+            let (counts, supersedes) = (counts.remove(&id), supersedes.remove(&id));
+            let view = deployment_view(row, counts.unwrap_or_default(), supersedes.unwrap_or_default())?;
+            Ok::<_, StoreError>(DeploymentView { outdated: outdated.contains(&id), ..view })
         };
         rows.iter().map(view).collect()
     }
@@ -382,6 +397,7 @@ fn deployment_view(
         expires_at_ms: number(row.try_get("expires_at_ms")?),
         counts,
         supersedes,
+        outdated: false,
         assignments: None,
     })
 }

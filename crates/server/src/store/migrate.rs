@@ -28,6 +28,7 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[
     (18, "referrers", include_str!("../migrations/0018_referrers.sql")),
     (19, "needs", include_str!("../migrations/0019_needs.sql")),
     (20, "last_run", include_str!("../migrations/0020_last_run.sql")),
+    (21, "replaced", include_str!("../migrations/0021_replaced.sql")),
 ];
 
 /// Applies what has not been applied yet.

@@ -48,6 +48,8 @@ pub struct NewManifest {
     pub parts: Vec<Digest>,
     /// The tags that shall point to it.
     pub tags: Vec<Tag>,
+    /// Whether a package may take its version from another, which is outdated by that.
+    pub takes_version: bool,
     /// What it says if it is a task package.
     pub package: Option<(PackageRef, TaskManifest)>,
     /// What it says if it is the output of a run.
@@ -61,6 +63,8 @@ pub struct NewManifest {
 pub enum PutManifest {
     /// It is stored.
     Stored,
+    /// Nothing is stored: it is a package, and this other one has its version.
+    VersionTaken(Digest),
     /// Nothing is stored: these parts are not in the repository.
     PartsMissing(Vec<Digest>),
     /// Nothing is stored: it is a list of publishers, and another has its version or a later one.
@@ -93,6 +97,17 @@ impl Store {
             && !write.insert_document(repository, &new.manifest.digest, document, now_ms).await?
         {
             return Ok(PutManifest::Outdated);
+        }
+        // What is stored for one order alone goes by its digest, and takes no version.
+        if let Some((package, _)) = new.package.as_ref().filter(|_| !new.tags.is_empty())
+            && let Some(other) = write.other_of_version(package).await?
+        {
+            if !new.takes_version {
+                return Ok(PutManifest::VersionTaken(other));
+            }
+            if new.tags.iter().any(|tag| tag.as_str() == package.version.as_str()) {
+                write.replace_package(package, &other).await?;
+            }
         }
         write.insert_manifest(repository, new, now_ms).await?;
         for tag in &new.tags {
@@ -324,6 +339,33 @@ impl Write {
         .bind(manifest.to_string())
         .execute(self.connection())
         .await?;
+        Ok(())
+    }
+
+    /// Another package that the version of this one means.
+    async fn other_of_version(&mut self, package: &PackageRef) -> Result<Option<Digest>, StoreError> {
+        let other: Option<String> = sqlx::query_scalar(
+            "SELECT t.manifest FROM tags t JOIN packages p ON p.name = t.repository AND p.manifest = t.manifest
+             WHERE t.repository = $1 AND t.tag = $2 AND t.manifest <> $3",
+        )
+        .bind(package.name.as_str())
+        .bind(package.version.as_str())
+        .bind(package.manifest.digest.to_string())
+        .fetch_optional(self.connection())
+        .await?;
+        other.map(|digest| rows::id("tags.manifest", &digest)).transpose()
+    }
+
+    /// Marks the package `outdated` as one whose version means `package` from now on, and that one as none.
+    async fn replace_package(&mut self, package: &PackageRef, outdated: &Digest) -> Result<(), StoreError> {
+        for (manifest, replaced_by) in [(outdated, Some(&package.manifest.digest)), (&package.manifest.digest, None)] {
+            sqlx::query("UPDATE packages SET replaced_by = $3 WHERE name = $1 AND manifest = $2")
+                .bind(package.name.as_str())
+                .bind(manifest.to_string())
+                .bind(replaced_by.map(Digest::to_string))
+                .execute(self.connection())
+                .await?;
+        }
         Ok(())
     }
 

@@ -1,6 +1,6 @@
 //! Robots: who they are, and how the operator sees them.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 
 use sqlx::{AssertSqlSafe, Row as _};
@@ -92,12 +92,13 @@ impl Store {
         // The tasks first: no phase stands beside a report that is older than it.
         let tasks = sqlx::query(TASK_ROWS).fetch_all(&self.reads).await?;
         let robots = sqlx::query(ROBOT_ROWS).fetch_all(&self.reads).await?;
-        robot_views(robots, tasks)
+        robot_views(robots, tasks, &self.outdated_deployments().await?)
     }
 
     /// Those of `robots` that are registered, likewise.
     pub async fn robots_among(&self, robots: &[RobotId]) -> Result<Vec<RobotView>, StoreError> {
         let mut views = Vec::with_capacity(robots.len());
+        let outdated = self.outdated_deployments().await?;
         for group in groups(robots) {
             let ids = values(1, group.len(), &["TEXT"]);
             let mut robots = sqlx::query(AssertSqlSafe(format!("{ROBOT_ROWS} AND r.id IN ({ids})")));
@@ -107,7 +108,7 @@ impl Store {
                 tasks = tasks.bind(robot.as_str());
             }
             let tasks = tasks.fetch_all(&self.reads).await?;
-            views.extend(robot_views(robots.fetch_all(&self.reads).await?, tasks)?);
+            views.extend(robot_views(robots.fetch_all(&self.reads).await?, tasks, &outdated)?);
         }
         views.sort_by(|one: &RobotView, other| one.name.cmp(&other.name));
         Ok(views)
@@ -475,10 +476,16 @@ fn riding(task: &DesiredTask) -> Vec<BlobRef> {
     }
 }
 
-fn robot_views(robots: Vec<sqlx::any::AnyRow>, tasks: Vec<sqlx::any::AnyRow>) -> Result<Vec<RobotView>, StoreError> {
+fn robot_views(
+    robots: Vec<sqlx::any::AnyRow>,
+    tasks: Vec<sqlx::any::AnyRow>,
+    outdated: &HashSet<String>,
+) -> Result<Vec<RobotView>, StoreError> {
     let mut tasks_of: HashMap<String, Vec<RobotTask>> = HashMap::new();
     for row in &tasks {
-        tasks_of.entry(row.try_get("robot_id")?).or_default().push(robot_task(row)?);
+        let task = robot_task(row)?;
+        let outdated = outdated.contains(task.deployment.as_str());
+        tasks_of.entry(row.try_get("robot_id")?).or_default().push(RobotTask { outdated, ..task });
     }
     let mut views = Vec::with_capacity(robots.len());
     for row in &robots {
@@ -558,6 +565,7 @@ fn robot_task(row: &sqlx::any::AnyRow) -> Result<RobotTask, StoreError> {
         failure: from_optional_json("assignments.failure", row.try_get("failure")?)?,
         degraded: None,
         active: None,
+        outdated: false,
         restarts: 0,
     })
 }

@@ -48,6 +48,7 @@ impl Fleet {
             subject: None,
             parts: Vec::new(),
             tags: vec![version.parse().expect("a tag")],
+            takes_version: false,
             package: Some((view.package.clone(), view.manifest.clone())),
             output: None,
             document: None,

@@ -192,6 +192,39 @@ pub struct Robot {
     seq: std::cell::Cell<u64>,
 }
 
+/// What could not take the place of another says so, and what goes on.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_run_that_is_unmet_says_what_runs_on() {
+    let bench = Bench::start().await;
+    let robot = bench.enroll(1).await;
+    let order = ["push", &bench.package("1", ""), "--to", "*", "-o", "json"];
+    let before = bench.taskd(&order).await.expect(0, "").json();
+    bench.report(&robot, &before, "running").await;
+    let again = bench.taskd(&["push", &bench.package("1", ""), "--to", "*"]).await;
+    again.expect(0, "already running on robot-1; --restart runs it anew there");
+    let new = bench.package("2", "");
+    let run = ["run", "robot-1", &new, "-o", "json", "--timeout", "60s"];
+    let (ran, ()) = tokio::join!(bench.taskd(&run), async {
+        let newest = loop {
+            let list = bench.taskd(&["deploy", "list", "-n", "1", "-o", "json"]).await.expect(0, "").json();
+            let newest = list["deployments"][0].clone();
+            if newest["package"]["version"] == "2" {
+                break newest;
+            }
+        };
+        let task = json!([{
+            "task": "hello", "deployment": newest["id"], "package": newest["package"], "wanted": "running", "run": 1,
+            "kind": "service", "phase": "unmet", "phase_ms": 1,
+            "failure": { "code": "requirements_unmet", "text": "no ros2launch" },
+            "active": { "deployment": before["id"], "version": "1", "pid": 7 },
+        }]);
+        bench.report_tasks(&robot, task).await;
+    });
+    ran.expect(1, "robot-1 still runs hello 1, which it had before; the new one does not run: requirements_unmet");
+    let list = bench.taskd(&["robot", "list"]).await.expect(0, "").stdout;
+    assert!(list.contains("hello:unmet/earlier-runs"), "{list}");
+}
+
 /// Ctrl-C ends the wait and nothing else, and says how to go on.
 #[tokio::test(flavor = "multi_thread")]
 async fn an_interrupted_wait_says_how_to_follow_and_cancel() {
@@ -381,14 +414,29 @@ async fn robots_and_deployments_are_shown_and_removed() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_version_means_what_was_pushed_under_it_last() {
+async fn a_version_means_what_was_pushed_under_it_by_force_last() {
     let bench = Bench::start().await;
+    let robot = bench.enroll(1).await;
     let push = async |extra: &str| {
-        let pushed = bench.taskd(&["push", &bench.package("1", extra), "-o", "json"]).await.expect(0, "").json();
-        pushed["manifest"]["digest"].clone()
+        let push = ["push", &bench.package("1", extra), "--force", "-o", "json"];
+        bench.taskd(&push).await.expect(0, "").json()["manifest"]["digest"].clone()
     };
     let first = push("").await;
+    let order = ["push", &bench.package("1", ""), "--to", "*", "-o", "json"];
+    let deployment = bench.taskd(&order).await.expect(0, "").json();
+    bench.report(&robot, &deployment, "running").await;
+    let changed = bench.package("1", "[ready]\nhold_s = 9\n");
+    let refused = bench.taskd(&["push", &changed, "--to", "*"]).await;
+    let said = format!("hello 1 is on the server with other content, {}", first.as_str().unwrap());
+    assert!(refused.expect(2, &said).stderr.contains("Raise the version"));
+    let list = async || bench.taskd(&["robot", "list"]).await.expect(0, "").stdout;
+    assert!(list().await.contains("hello:running") && !list().await.contains("outdated"));
     let second = push("[ready]\nhold_s = 9\n").await;
+    assert!(list().await.contains("hello:running/outdated"), "{}", list().await);
+    let info = bench.taskd(&["robot", "info", "robot-1"]).await.expect(0, "").stdout;
+    assert!(info.contains("1 (outdated)"), "{info}");
+    let info = bench.taskd(&["deploy", "info", deployment["id"].as_str().unwrap()]).await.expect(0, "").stdout;
+    assert!(info.contains("a forced push gave this version to another package"), "{info}");
     let meant = async || {
         let info = bench.taskd(&["package", "info", "hello:1", "-o", "json"]).await.expect(0, "").json();
         info["package"]["manifest"]["digest"].clone()

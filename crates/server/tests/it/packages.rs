@@ -10,6 +10,7 @@ use task_proto::envelope::SigningKey;
 use task_proto::oci::{EMPTY, ImageManifest, MANIFEST_TYPE};
 use task_proto::person::{Role, Roles};
 use task_proto::publisher::{PackageStatement, SIGNATURE_ARTIFACT};
+use task_proto::report::Phase;
 use task_proto::{Digest, RepositoryName, RobotId};
 use taskd::blobs::BlobSettings;
 use taskd::collector::{self, Collected};
@@ -20,7 +21,7 @@ use taskd::store::{NewManifest, PutManifest, StoredManifest};
 use crate::database::{TestDatabase, on_both_databases};
 use crate::fleet::{Fleet, order_of, random_key};
 use crate::harness::{archive_facts, archive_with};
-use crate::registry::{GRACE, NOW_MS, TestRegistry, operator, refusal, refused, serve};
+use crate::registry::{GRACE, NOW_MS, TestRegistry, image, operator, refusal, refused, serve};
 
 const YEAR_MS: u64 = 365 * 24 * 3_600_000;
 
@@ -139,6 +140,57 @@ impl TestRegistry {
     }
 }
 
+async fn a_version_moves_to_other_content_only_by_force(database: TestDatabase) {
+    let data = tempfile::tempdir().expect("a directory");
+    let store = database.store.clone();
+    let registry = TestRegistry::start_on(store, data, BlobSettings::default(), Some(operator())).await;
+    let config = registry.push_blob("talker", task("talker").to_string().as_bytes()).await;
+    let mut packages = Vec::new();
+    for content in [archive_with(b"first"), archive_with(b"other")] {
+        packages.push(ImageManifest::package(config, registry.push_blob("talker", &content).await));
+    }
+    let put = async |path: &str, package: &ImageManifest| {
+        registry.put_manifest(&format!("/v2/talker/manifests/{path}"), MANIFEST_TYPE, package).await
+    };
+    let digest = |package: &ImageManifest| Digest::of(&serde_json::to_vec(package).expect("JSON"));
+    let [first, second] = &packages[..] else { panic!("{packages:?}") };
+    for tag in ["1.0.0", "1.0.0", "stable"] {
+        assert_eq!(put(tag, first).await.status(), StatusCode::CREATED, "the same is the same under each name");
+    }
+    let fleet = Fleet::new(database).await;
+    let mut robots = fleet.enroll(1).await;
+    let ordered = registry.registry.store.packages().await.expect("packages").remove(0);
+    let order = order_of(&ordered);
+    let id = fleet.actions.create_deployment(&fleet.operator, &random_key(), &order, &ordered).await.expect("ordered");
+    fleet.follow(&mut robots[0], Phase::Running).await;
+    let is_outdated = async || (fleet.view(&robots[0]).await.tasks[0].outdated, fleet.deployment(&id).await.outdated);
+
+    for tag in ["1.0.0", "stable", "latest"] {
+        let refused = put(tag, second).await;
+        assert_eq!(refused.status(), StatusCode::CONFLICT, "{tag}");
+        let body: Value = refused.json().await.expect("an error body");
+        assert_eq!(body["errors"][0]["code"], "DENIED");
+        let said = body["errors"][0]["message"].as_str().expect("text");
+        assert!(said.contains(&digest(first).to_string()) && said.contains("--force"), "{said}");
+    }
+    assert_eq!(is_outdated().await, (false, false));
+    // What goes by its digest alone takes no version.
+    assert_eq!(put(&digest(second).to_string(), second).await.status(), StatusCode::CREATED);
+    assert_eq!(is_outdated().await, (false, false));
+    assert_eq!(put("1.0.0?force=true", second).await.status(), StatusCode::CREATED);
+    assert_eq!(is_outdated().await, (true, true));
+    assert_eq!(put("1.0.0?force=true", first).await.status(), StatusCode::CREATED, "and back");
+    assert_eq!(is_outdated().await, (false, false));
+    // A tag that was taken away is free.
+    assert_eq!(registry.status(Method::DELETE, "/v2/talker/manifests/1.0.0").await, StatusCode::ACCEPTED);
+    assert_eq!(put("1.0.0", second).await.status(), StatusCode::CREATED);
+    // A version that means something else than a package, and what is no package, move as ever.
+    for layer in [&b"one"[..], b"two"] {
+        let image = image(config, registry.push_blob("talker", layer).await);
+        assert_eq!(put("2.0.0", &image).await.status(), StatusCode::CREATED);
+    }
+}
+
 async fn a_package_in_use_outlives_its_manifest(database: TestDatabase) {
     let data = tempfile::tempdir().expect("a directory");
     let store = database.store.clone();
@@ -218,6 +270,7 @@ async fn what_is_needed_since_it_was_looked_for_is_kept(database: TestDatabase) 
         subject: None,
         parts: vec![part.digest],
         tags: Vec::new(),
+        takes_version: false,
         package: None,
         output: None,
         document: None,
@@ -233,6 +286,7 @@ async fn what_is_needed_since_it_was_looked_for_is_kept(database: TestDatabase) 
 }
 
 on_both_databases! {
+    a_version_moves_to_other_content_only_by_force,
     a_package_in_use_outlives_its_manifest,
     what_is_needed_holds_no_push_back_and_is_no_write,
     what_is_needed_since_it_was_looked_for_is_kept,

@@ -17,15 +17,24 @@ export class Uploads {
   /** Sends what was chosen, one after the other. That a package has come, everybody hears from the stream. */
   add(chosen) {
     for (const { name, file, entries } of chosen) {
-      const one = { name, stage: 'waiting', done: 0, total: 0, problem: null, end: new AbortController() };
-      // What can't be read is said in its turn.
-      entries?.catch(() => {});
-      change(() => this.#all.push(one));
-      this.#last = this.#last.then(() => this.#send(one, { file, entries }));
+      this.#add({ name, file, entries });
     }
   }
 
-  async #send(one, { file, entries }) {
+  #add({ name, file, entries, force = false }) {
+    const one = { name, stage: 'waiting', done: 0, total: 0, problem: null, end: new AbortController() };
+    // A version that is taken is taken over only at somebody's word.
+    one.insist = () => {
+      this.#forget(one);
+      this.#add({ name, file, entries, force: true });
+    };
+    // What can't be read is said in its turn.
+    entries?.catch(() => {});
+    change(() => this.#all.push(one));
+    this.#last = this.#last.then(() => this.#send(one, { file, entries, force }));
+  }
+
+  async #send(one, { file, entries, force }) {
     const { name, end } = one;
     if (end.signal.aborted) return this.#forget(one);
     try {
@@ -33,13 +42,13 @@ export class Uploads {
       const { blob, type } = entries ? { blob: await packed(name, await entries), type: 'application/x-tar' } : { blob: await file, type: typeOf(name) };
       change(() => Object.assign(one, { stage: 'sending', total: blob.size }));
       const told = (done) => change(() => Object.assign(one, { done, stage: done < blob.size ? 'sending' : 'checking' }));
-      const view = await upload('/packages', blob, type, { told, signal: end.signal });
+      const view = await upload(force ? '/packages?force=true' : '/packages', blob, type, { told, signal: end.signal });
       this.#forget(one);
       const { name: stored, version } = view.package;
       tell(`${stored}@${version} is there.`, [at(['packages', stored], { version }), 'Look at it']);
     } catch (error) {
       if (end.signal.aborted) return this.#forget(one);
-      change(() => (one.problem = problemOf(error)));
+      change(() => Object.assign(one, { problem: problemOf(error), isTaken: error.code === 'version_taken' }));
     }
   }
 
@@ -67,13 +76,14 @@ export class Uploads {
   }
 
   #one(one) {
-    const { name, stage, done, total, problem } = one;
+    const { name, stage, done, total, problem, isTaken, insist } = one;
     return html`
       <li class="upload">
         <p><strong>${name}</strong>
           ${problem ? nothing : html`<span class="quiet">${STAGES[stage]}</span>
             ${total ? html`<progress max=${total} .value=${done} aria-label=${`${name} sent`}></progress><span class="quiet">${bytes({ done, total })}</span>` : nothing}`}
           <button class="plain link" @click=${() => this.#end(one)}>${problem ? 'Dismiss' : 'Break off'}</button></p>
+        ${isTaken ? html`<p><button class="plain link" @click=${insist}>Replace the version: robots that have the other content are marked as outdated</button></p>` : nothing}
         <p class="bad problem" role="alert">${problem ? `▲ ${problem}` : ''}</p>
       </li>`;
   }

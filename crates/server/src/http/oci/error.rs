@@ -42,8 +42,8 @@ impl OciError {
         Self::new(StatusCode::FORBIDDEN, "DENIED", message)
     }
 
-    /// 409: robots should have the package that this belongs to.
-    pub fn in_use(message: impl Into<String>) -> Self {
+    /// 409: it stays as it is, because robots should have it, or because of its tag.
+    pub fn conflict(message: impl Into<String>) -> Self {
         Self::new(StatusCode::CONFLICT, "DENIED", message)
     }
 
@@ -192,6 +192,7 @@ impl From<BlobError> for OciError {
 impl From<OciError> for ApiError {
     fn from(error: OciError) -> Self {
         let code = match error.status {
+            StatusCode::CONFLICT => "version_taken",
             StatusCode::PAYLOAD_TOO_LARGE => "too_large",
             StatusCode::INSUFFICIENT_STORAGE => "disk_full",
             StatusCode::TOO_MANY_REQUESTS => "too_many_requests",

@@ -65,6 +65,8 @@ pub(super) struct Push<'a> {
     pub(super) by: Option<&'a Person>,
     /// The only type of artifact that is taken.
     pub(super) only: Option<&'static str>,
+    /// Whether a package may take its version from another.
+    pub(super) takes_version: bool,
 }
 
 /// `PUT`: stores the exact bytes, if all they refer to is in the repository.
@@ -84,7 +86,7 @@ pub(super) async fn push(
     headers: &HeaderMap,
     bytes: Bytes,
 ) -> Result<NewManifest, OciError> {
-    let Push { repository, reference, by, only } = push;
+    let Push { repository, reference, by, only, takes_version } = push;
     let digest = digest_of(&bytes, &reference)?;
     let content_type = headers.get(CONTENT_TYPE).and_then(|value| value.to_str().ok());
     let parsed = Parsed::new(content_type, &bytes)?;
@@ -132,17 +134,19 @@ pub(super) async fn push(
         subject: parsed.subject,
         parts: parsed.parts,
         tags,
+        takes_version,
         package,
         output,
         document,
     };
     let deed = by.map(|by| pushed(by, repository, &new));
     match registry.store.put_manifest(repository, &new, deed.as_ref(), now_ms).await? {
+        PutManifest::VersionTaken(other) => Err(version_taken(&new, &other)),
         PutManifest::PartsMissing(missing) => Err(OciError::parts_unknown(&missing)),
         PutManifest::Outdated => Err(OciError::manifest_invalid("there is a list of publishers as new as this one")),
         PutManifest::TagInUse(tag, users) => {
             let message = by.map(|by| in_use(by, &format!("{repository}:{tag}"), &users)).unwrap_or_default();
-            Err(OciError::in_use(message))
+            Err(OciError::conflict(message))
         }
         PutManifest::Stored => {
             signed::tell(registry, repository, new.document.as_ref()).await;
@@ -152,6 +156,24 @@ pub(super) async fn push(
             Ok(new)
         }
     }
+}
+
+/// Why a version does not move to another package without being told to.
+fn version_taken(new: &NewManifest, other: &Digest) -> OciError {
+    let (name, version) = match &new.package {
+        Some((package, _)) => (package.name.as_str(), package.version.as_str()),
+        None => ("", ""),
+    };
+    OciError::conflict(format!(
+        "{name} {version} is there with other content, manifest {other}: robots that have it would show this version for \
+         two contents. Raise the version, or push with --force (?force=true)"
+    ))
+}
+
+/// Whether the query says that a package may take its version from another.
+pub(super) fn is_forced(parts: &Parts) -> Result<bool, OciError> {
+    let pairs: Vec<(String, String)> = super::query(&parts.uri)?;
+    Ok(pairs.iter().any(|(key, value)| key == "force" && value == "true"))
 }
 
 /// What a manifest hashes to, which must be what it is pushed as.
@@ -208,7 +230,7 @@ pub(super) async fn delete(
 pub(super) fn deleted(by: &Person, deletion: Deletion, named: &str, unknown: fn() -> OciError) -> Answer {
     match deletion {
         Deletion::Deleted(_) => empty(StatusCode::ACCEPTED, []),
-        Deletion::InUse(users) => Err(OciError::in_use(in_use(by, named, &users))),
+        Deletion::InUse(users) => Err(OciError::conflict(in_use(by, named, &users))),
         Deletion::Unknown => Err(unknown()),
     }
 }

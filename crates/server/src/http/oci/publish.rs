@@ -21,7 +21,12 @@ use crate::store::Reference;
 const CHUNK_BYTES: usize = 256 * 1024;
 
 /// Stores a package, whose tag is its version, as `by` would have pushed it.
-pub async fn publish(registry: &Registry, by: &Person, packed: &Packed) -> Result<PackageView, OciError> {
+pub async fn publish(
+    registry: &Registry,
+    by: &Person,
+    packed: &Packed,
+    takes_version: bool,
+) -> Result<PackageView, OciError> {
     let package = &packed.package;
     let repository = RepositoryName::of_package(&package.name);
     let tag: Tag = package.version.as_str().parse().map_err(|error| OciError::tag_invalid(&error))?;
@@ -33,7 +38,8 @@ pub async fn publish(registry: &Registry, by: &Person, packed: &Packed) -> Resul
     let mut headers = HeaderMap::new();
     headers.insert(CONTENT_TYPE, HeaderValue::from_static(MANIFEST_TYPE));
     let manifest = packed.manifest_bytes.clone().into();
-    let as_tag = Push { repository: &repository, reference: Reference::Tag(tag.clone()), by: Some(by), only: None };
+    let reference = Reference::Tag(tag.clone());
+    let as_tag = Push { repository: &repository, reference, by: Some(by), only: None, takes_version };
     push(registry, as_tag, vec![tag], &headers, manifest).await?;
     let view = registry.store.package(&package.name, &package.manifest.digest).await?;
     view.ok_or_else(OciError::manifest_unknown)

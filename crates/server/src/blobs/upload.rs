@@ -1,8 +1,10 @@
-//! Unfinished uploads: `uploads/<id>` holds the bytes that came, memory holds their running hash by SHA-256; a restart ends them all.
+//! Unfinished uploads: `uploads/<id>.<repository>` holds the bytes that came, memory holds their running hash by SHA-256. After a
+//! restart they go on at the end of their file, and are hashed once they are whole.
 //! It never lets bytes become a blob before they hash to what was announced, nor robots take more than is theirs, nor uploads
 //! that somebody left keep others from pushing.
 
 use std::collections::HashMap;
+use std::ffi::OsStr;
 use std::fs::{self, File};
 use std::io::{self, Read as _};
 use std::os::unix::fs::FileExt as _;
@@ -30,6 +32,8 @@ const SILENCE: Duration = Duration::from_secs(60);
 /// Uploads that one robot may leave unfinished: it sends one file after another, and forgets some on the way.
 const MAX_OF_ROBOT: usize = 8;
 const ID_DIGITS: usize = 32;
+/// What file systems take as one name.
+const MAX_NAME_BYTES: usize = 255;
 
 /// Names an upload.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -75,6 +79,13 @@ struct Active {
     bytes: Arc<AtomicU64>,
 }
 
+impl Active {
+    fn new(repository: RepositoryName, upload: Upload) -> Self {
+        let bytes = Arc::clone(&upload.bytes);
+        Self { repository, upload: Arc::new(tokio::sync::Mutex::new(upload)), bytes }
+    }
+}
+
 /// One upload. Whoever holds its lock is the only writer.
 struct Upload {
     path: PathBuf,
@@ -82,7 +93,8 @@ struct Upload {
     offset: u64,
     /// The same for those who don't hold the lock.
     bytes: Arc<AtomicU64>,
-    hasher: Sha256,
+    /// `None`: it was begun before the server started.
+    hasher: Option<Sha256>,
     /// When it was begun or got its last bytes.
     written_at: Instant,
     /// Finished or cancelled by whoever had the lock before.
@@ -92,8 +104,17 @@ struct Upload {
 impl Upload {
     fn create(path: PathBuf) -> io::Result<Self> {
         let file = File::create_new(&path)?;
-        let (bytes, hasher, written_at) = (Arc::default(), Sha256::new(), Instant::now());
+        let (bytes, hasher, written_at) = (Arc::default(), Some(Sha256::new()), Instant::now());
         Ok(Self { path, file, offset: 0, bytes, hasher, written_at, ended: false })
+    }
+
+    /// Takes up what an earlier process left. Its bytes came in order, so all that are there count: whether they are the right
+    /// ones is seen when they are hashed.
+    fn resume(path: PathBuf) -> io::Result<Self> {
+        let file = File::options().write(true).open(&path)?;
+        let offset = file.metadata()?.len();
+        let (bytes, written_at) = (Arc::new(AtomicU64::new(offset)), Instant::now());
+        Ok(Self { path, file, offset, bytes, hasher: None, written_at, ended: false })
     }
 
     /// Takes all of `chunks` or, on an error, nothing: bytes beyond the offset are overwritten by the next try.
@@ -103,8 +124,8 @@ impl Upload {
             self.file.write_all_at(chunk, offset).map_err(BlobError::disk("write", &self.path))?;
             offset += chunk.len() as u64;
         }
-        for chunk in chunks {
-            self.hasher.update(chunk);
+        if let Some(hasher) = &mut self.hasher {
+            chunks.iter().for_each(|chunk| hasher.update(chunk));
         }
         self.offset = offset;
         self.written_at = Instant::now();
@@ -128,9 +149,11 @@ impl Upload {
         self.ended = true;
         // A write that failed half way may have left bytes behind the end.
         self.file.set_len(self.offset).map_err(BlobError::disk("cut", &self.path))?;
-        let actual = match expected.algorithm() {
-            Algorithm::Sha256 => Digest::from_sha256(self.hasher.clone().finalize().into()),
-            Algorithm::Sha512 => sha512(&self.path).map_err(BlobError::disk("read", &self.path))?,
+        let unreadable = BlobError::disk("read", &self.path);
+        let actual = match (expected.algorithm(), &self.hasher) {
+            (Algorithm::Sha256, Some(hasher)) => Digest::from_sha256(hasher.clone().finalize().into()),
+            (Algorithm::Sha256, None) => Digest::from_sha256(hash::<Sha256>(&self.path).map_err(unreadable)?.into()),
+            (Algorithm::Sha512, _) => Digest::from_sha512(hash::<Sha512>(&self.path).map_err(unreadable)?.into()),
         };
         if actual != expected {
             return Err(BlobError::WrongDigest { expected: expected.into(), actual: actual.into() });
@@ -141,29 +164,55 @@ impl Upload {
     }
 }
 
-/// What a file hashes to by the algorithm that few ask for, and only once everything has come.
-fn sha512(path: &Path) -> io::Result<Digest> {
-    let (mut file, mut hasher, mut piece) = (File::open(path)?, Sha512::new(), vec![0; GATHERED_BYTES]);
+/// The hash of a file. SHA-512 is computed so, which few ask for, and that of an upload which was taken up.
+fn hash<D: sha2::Digest>(path: &Path) -> io::Result<sha2::digest::Output<D>> {
+    let (mut file, mut hasher, mut piece) = (File::open(path)?, D::new(), vec![0; GATHERED_BYTES]);
     loop {
         match file.read(&mut piece)? {
-            0 => return Ok(Digest::from_sha512(hasher.finalize().into())),
+            0 => return Ok(hasher.finalize()),
             count => hasher.update(&piece[..count]),
         }
     }
 }
 
+/// The name of an upload's file. That of a repository whose name leaves no room for the id is the id alone, which no restart
+/// goes on with.
+fn file_name(id: &UploadId, repository: &RepositoryName) -> String {
+    let name = format!("{}.{}", id.as_str(), repository.as_str().replace('/', "+"));
+    if name.len() <= MAX_NAME_BYTES { name } else { id.as_str().to_owned() }
+}
+
+/// The upload that a file is named by.
+fn named_by(file_name: &OsStr) -> Option<(UploadId, RepositoryName)> {
+    let (id, repository) = file_name.to_str()?.split_once('.')?;
+    Some((id.parse().ok()?, repository.replace('+', "/").parse().ok()?))
+}
+
 impl Uploads {
-    /// Opens the directory and removes what an earlier process left in it.
+    /// Opens the directory, takes up the uploads that an earlier process left unfinished, as many as there may be, the newest
+    /// first, and removes whatever else is in it.
     pub(super) fn open(directory: PathBuf, settings: BlobSettings) -> Result<Self, BlobError> {
-        let clean = || {
+        let resume = || {
             fs::create_dir_all(&directory)?;
+            let mut left = Vec::new();
             for entry in fs::read_dir(&directory)? {
-                fs::remove_file(entry?.path())?;
+                let entry = entry?;
+                match named_by(&entry.file_name()) {
+                    Some(upload) => left.push((entry.metadata()?.modified()?, entry.path(), upload)),
+                    None => fs::remove_file(entry.path())?,
+                }
             }
-            Ok(())
+            left.sort_by_key(|(modified, ..)| std::cmp::Reverse(*modified));
+            for (_, path, _) in left.drain(settings.max_uploads.min(left.len())..) {
+                fs::remove_file(path)?;
+            }
+            let resumed = left
+                .into_iter()
+                .map(|(_, path, (id, repository))| Ok((id, Active::new(repository, Upload::resume(path)?))));
+            resumed.collect::<io::Result<HashMap<_, _>>>()
         };
-        clean().map_err(BlobError::disk("clean", &directory))?;
-        Ok(Self { directory, settings, active: Mutex::default() })
+        let active = resume().map_err(BlobError::disk("clean", &directory))?;
+        Ok(Self { directory, settings, active: Mutex::new(active) })
     }
 
     /// A name nothing else in the directory has.
@@ -236,12 +285,10 @@ impl Blobs {
     /// Begins an upload; only requests for the same repository reach it.
     pub async fn begin_upload(&self, repository: &RepositoryName) -> Result<UploadId, BlobError> {
         let id = UploadId::random();
-        let path = self.shared.uploads.directory.join(id.as_str());
+        let path = self.shared.uploads.directory.join(file_name(&id, repository));
         let created = Upload::create(path.clone()).map_err(BlobError::disk("create", &path))?;
-        let bytes = Arc::clone(&created.bytes);
-        let active =
-            Active { repository: repository.clone(), upload: Arc::new(tokio::sync::Mutex::new(created)), bytes };
-        // Best effort, both: what stays is removed at the next start.
+        let active = Active::new(repository.clone(), created);
+        // Best effort, both: what stays is an upload that nobody goes on with, which the collector gives up.
         match self.shared.uploads.insert(id.clone(), active) {
             Ok(None) => {}
             Ok(Some(mut left)) => drop(on_disk(move || left.cancel()).await),
@@ -445,6 +492,53 @@ mod tests {
         let gone = blobs.upload_offset(&repository, &id).await;
         assert!(matches!(gone, Err(BlobError::UploadUnknown)), "{gone:?}");
         assert_eq!(fs::read_dir(&blobs.shared.uploads.directory).expect("there").count(), 0);
+    }
+
+    #[tokio::test]
+    async fn unfinished_uploads_go_on_after_a_restart_within_their_bounds() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let settings = BlobSettings { max_uploads: 3, ..BlobSettings::default() };
+        let body = |bytes: &'static [u8]| futures_util::stream::iter([Ok::<_, io::Error>(Bytes::from_static(bytes))]);
+        let (repository, other): (RepositoryName, RepositoryName) =
+            ("lab/talker".parse().expect("a name"), "lab/other".parse().expect("a name"));
+        let long: RepositoryName = ["a"; 128].join("/").parse().expect("a name");
+        let blobs = Blobs::open(directory.path(), settings).expect("opens");
+        let id = blobs.begin_upload(&repository).await.expect("begins");
+        let forgotten = blobs.begin_upload(&long).await.expect("begins");
+        blobs.append(&repository, &id, None, body(b"some"), 0).await.expect("there is room");
+        let uploads = directory.path().join("uploads");
+        fs::write(uploads.join("0123456789abcdef0123456789abcdef"), "left by a write").expect("written");
+        drop(blobs);
+
+        let blobs = Blobs::open(directory.path(), settings).expect("opens");
+        assert_eq!(fs::read_dir(&uploads).expect("there").count(), 1);
+        for (repository, id) in [(&other, &id), (&long, &forgotten)] {
+            let unknown = blobs.upload_offset(repository, id).await;
+            assert!(matches!(unknown, Err(BlobError::UploadUnknown)), "{unknown:?}");
+        }
+        assert_eq!(blobs.upload_offset(&repository, &id).await.expect("there"), 4);
+        assert_eq!(blobs.append(&repository, &id, Some(4), body(b"more"), 0).await.expect("goes on"), 8);
+        let (right, wrong) = (Digest::of(b"somemore"), Digest::of(b"something"));
+        assert_eq!(blobs.finish_upload(&repository, &id, right).await.expect("it is whole"), 8);
+        assert!(blobs.get(right).await.expect("read").is_some());
+
+        // Bytes that a power cut left wrong never become a blob.
+        let id = blobs.begin_upload(&repository).await.expect("begins");
+        blobs.append(&repository, &id, None, body(b"somethinh"), 0).await.expect("there is room");
+        for _ in 0..2 {
+            blobs.begin_upload(&repository).await.expect("begins");
+        }
+        drop(blobs);
+        let few = BlobSettings { max_uploads: 2, ..settings };
+        assert_eq!(Blobs::open(directory.path(), few).expect("opens").shared.uploads.active().len(), 2);
+        assert_eq!(fs::read_dir(&uploads).expect("there").count(), 2);
+        for entry in fs::read_dir(&uploads).expect("there") {
+            fs::remove_file(entry.expect("an entry").path()).expect("removed");
+        }
+        fs::write(uploads.join(file_name(&id, &repository)), "somethinh").expect("written");
+        let blobs = Blobs::open(directory.path(), settings).expect("opens");
+        let refused = blobs.finish_upload(&repository, &id, wrong).await;
+        assert!(matches!(refused, Err(BlobError::WrongDigest { .. })), "{refused:?}");
     }
 
     #[tokio::test]

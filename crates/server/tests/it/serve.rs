@@ -436,3 +436,29 @@ fn a_wrong_setting_is_wrong_usage_wherever_it_stands() {
     }
     assert!(!directory.path().join("data").exists());
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn chunked_push_goes_on_after_a_restart() {
+    let server = TestServer::start().await;
+    let begun = server.request(Method::POST, "/v2/talker/blobs/uploads/").send().await.expect("an answer");
+    let upload = begun.headers()["location"].to_str().expect("text").to_owned();
+    let chunk = |server: &TestServer, range: &str, bytes: &'static str| {
+        let request = server.request(Method::PATCH, &upload).header("content-type", "application/octet-stream");
+        request.header("content-range", range).body(bytes)
+    };
+    let sent = chunk(&server, "0-3", "some").send().await.expect("an answer");
+    assert_eq!(sent.status(), StatusCode::ACCEPTED);
+
+    // The clock of the test is ahead of the times of files.
+    let keep = |config: &mut Config| config.blob_grace = Duration::from_secs(1 << 32);
+    let server = TestServer::start_in(server.stop().await, keep).await;
+    let stands = server.request(Method::GET, &upload).send().await.expect("an answer");
+    assert_eq!((stands.status(), &stands.headers()["range"]), (StatusCode::NO_CONTENT, &"0-3".parse().expect("text")));
+    let sent = chunk(&server, "4-7", "more").send().await.expect("an answer");
+    assert_eq!(sent.status(), StatusCode::ACCEPTED);
+    let digest = task_proto::Digest::of(b"somemore");
+    let done = server.request(Method::PUT, &format!("{upload}?digest={digest}")).send().await.expect("an answer");
+    assert_eq!(done.status(), StatusCode::CREATED);
+    let blob = server.request(Method::GET, &format!("/v2/talker/blobs/{digest}")).send().await.expect("an answer");
+    assert_eq!(blob.text().await.expect("a body"), "somemore");
+}

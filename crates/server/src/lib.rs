@@ -29,6 +29,7 @@ pub mod key_file;
 pub mod log_limits;
 pub mod mqtt_access;
 pub mod oidc;
+pub mod open_files;
 pub mod pace;
 pub mod package;
 pub mod part_requests;

@@ -5,7 +5,6 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::Context as _;
-use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use nix::sys::stat::{Mode, umask};
 use task_proto::line::OneLineEach;
 use taskd::clock::Clock;
@@ -13,6 +12,7 @@ use taskd::command_line::{Command, CommandLine};
 use taskd::commands;
 use taskd::config::{Config, ConfigError, ServeFlags};
 use taskd::log_limits::LogLimits;
+use taskd::open_files;
 use taskd::serve::Server;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio_util::sync::CancellationToken;
@@ -29,8 +29,6 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 const LEFTOVER_PATIENCE: Duration = Duration::from_millis(500);
 /// An eighth of what tokio takes if it is not told.
 const TASKS_PER_LOOK: u32 = 7;
-/// Open files beside connections: the database, blobs that travel, the system's own.
-const OTHER_FILES: usize = 500;
 
 fn main() -> ExitCode {
     commands::complete(CommandLine::describe);
@@ -67,8 +65,8 @@ async fn serve(flags: &ServeFlags) -> anyhow::Result<ExitCode> {
     let _stopped = stop.clone().drop_guard();
     tokio::spawn(limits.run(stop));
     let mut config = Config::load(flags, std::env::vars_os())?;
-    match open_files() {
-        Ok(files) => fit_to(&mut config, files),
+    match open_files::raise() {
+        Ok(allowed) => open_files::fit(&mut config, allowed)?,
         Err(error) => tracing::warn!(%error, "the limit on open files can't be raised"),
     }
     // Installed before anything is started, so that an early signal stops it softly as well.
@@ -82,7 +80,7 @@ async fn serve(flags: &ServeFlags) -> anyhow::Result<ExitCode> {
             () = signals.next() => break ExitCode::SUCCESS,
             _ = hangup.recv() => reload(&server),
             seen = server.broken() => {
-                tracing::error!(seen, "MQTT can't be served any more, so the server ends; start it again");
+                tracing::error!(seen, "the server can't go on, so it ends; start it again");
                 break ExitCode::FAILURE;
             }
         }
@@ -99,27 +97,6 @@ fn reload(server: &Server) {
     if let Err(error) = server.reload_certificate() {
         tracing::warn!(error = &error as &dyn std::error::Error, "the certificate stays what it was");
     }
-}
-
-/// Lets the process have as many open files as the system grants it, usually 1,024 are free to use; says how many.
-fn open_files() -> nix::Result<usize> {
-    let (allowed, most) = getrlimit(Resource::RLIMIT_NOFILE)?;
-    if allowed < most {
-        setrlimit(Resource::RLIMIT_NOFILE, most, most)?;
-    }
-    Ok(usize::try_from(most).unwrap_or(usize::MAX))
-}
-
-/// Leaves room for the database and blobs, and for robots' sessions before requests, which come and go.
-fn fit_to(config: &mut Config, files: usize) {
-    let room = files.saturating_sub(OTHER_FILES).max(2);
-    if config.max_http_connections + config.max_mqtt_connections <= room {
-        return;
-    }
-    config.max_http_connections = config.max_http_connections.min((room / 3).max(1));
-    config.max_mqtt_connections = config.max_mqtt_connections.min(room - config.max_http_connections);
-    let (http, mqtt) = (config.max_http_connections, config.max_mqtt_connections);
-    tracing::warn!(files, http, mqtt, "so few files may be open that fewer connections are allowed; see ulimit -n");
 }
 
 /// On stdout: where the server is, and the first three things to do with it.

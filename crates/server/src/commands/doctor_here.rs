@@ -14,13 +14,12 @@ use task_proto::checkup::Checkup;
 use super::output::bytes;
 use crate::config::{Config, ServeFlags};
 use crate::data_directory::is_locked;
+use crate::open_files;
 
 /// With less free the database may be refused its next page.
 const LOW_BYTES: u64 = 256 << 20;
 /// With less than this share free it is time to look.
 const LOW_PERCENT: u64 = 10;
-/// Files beside connections.
-const OTHER_FILES: u64 = 500;
 
 /// Looks at `data`, and at what a server there would need if none answers.
 pub(super) fn check(checkup: &mut Checkup, data: &Path, is_up: bool) {
@@ -95,10 +94,13 @@ fn disk(checkup: &mut Checkup, data: &Path) {
 
 fn files(checkup: &mut Checkup, config: &Config) {
     let Ok((_, most)) = getrlimit(Resource::RLIMIT_NOFILE) else { return };
-    let wanted = (config.max_http_connections + config.max_mqtt_connections) as u64 + OTHER_FILES;
-    match most >= wanted {
-        true => checkup.good("files", format!("a server started from here may have {most} files open")),
-        false => checkup.notice(
+    let (allowed, wanted) = (usize::try_from(most).unwrap_or(usize::MAX), open_files::wanted(config));
+    match open_files::check(config, allowed) {
+        Err(too_few) => checkup.bad("files", too_few.to_string(), "a server started from here would not start"),
+        Ok(()) if allowed >= wanted => {
+            checkup.good("files", format!("a server started from here may have {most} files open"));
+        }
+        Ok(()) => checkup.notice(
             "files",
             format!("a server started from here may have {most} files open, for up to {wanted} connections and files"),
             "raise the limit (LimitNOFILE= in its unit, ulimit -n here), or it takes fewer connections",

@@ -437,6 +437,20 @@ fn a_wrong_setting_is_wrong_usage_wherever_it_stands() {
     assert!(!directory.path().join("data").exists());
 }
 
+#[test]
+#[expect(clippy::disallowed_methods, reason = "the test starts the program it tests")]
+fn too_few_open_files_are_refused_with_the_number_needed() {
+    let directory = tempfile::TempDir::new().expect("a directory");
+    let mut command = std::process::Command::new("/bin/sh");
+    command.args(["-c", "ulimit -n 256; exec \"$0\" serve --http 127.0.0.1:0 --mqtt 127.0.0.1:0 --data \"$1\""]);
+    command.arg(env!("CARGO_BIN_EXE_taskd")).arg(directory.path().join("data")).env_clear().stdin(Stdio::null());
+    let ended = command.stdout(Stdio::null()).output().expect("it runs");
+    let said = String::from_utf8_lossy(&ended.stderr);
+    assert_eq!(ended.status.code(), Some(1), "{said}");
+    assert!(said.contains("only 256 files may be open, 1024 are needed"), "{said}");
+    assert!(said.contains("LimitNOFILE=1024") && said.contains("ulimit -n 1024"), "{said}");
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn chunked_push_goes_on_after_a_restart() {
     let server = TestServer::start().await;

@@ -1,0 +1,85 @@
+//! The process's limit on open files, and how many connections fit into it.
+
+use nix::sys::resource::{Resource, getrlimit, setrlimit};
+
+use crate::config::Config;
+
+/// Open files beside connections: the database, blobs that travel, the system's own.
+pub const OTHER_FILES: usize = 500;
+/// With fewer there are too few connections left to be of use.
+pub const LEAST_FILES: usize = 1024;
+
+/// The system grants too few.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "only {allowed} files may be open, {needed} are needed: raise the limit (LimitNOFILE={needed} or more in the unit, \
+     ulimit -n {needed} in the shell)"
+)]
+pub struct TooFewFiles {
+    /// What is granted.
+    pub allowed: usize,
+    /// What is needed at least.
+    pub needed: usize,
+}
+
+/// Lets the process have as many open files as the system grants it, usually 1,024 are free to use; says how many.
+pub fn raise() -> nix::Result<usize> {
+    let (allowed, most) = getrlimit(Resource::RLIMIT_NOFILE)?;
+    if allowed < most {
+        setrlimit(Resource::RLIMIT_NOFILE, most, most)?;
+    }
+    Ok(usize::try_from(most).unwrap_or(usize::MAX))
+}
+
+/// How many files it takes for all connections that the settings allow.
+pub fn wanted(config: &Config) -> usize {
+    config.max_http_connections.saturating_add(config.max_mqtt_connections).saturating_add(OTHER_FILES)
+}
+
+/// Refuses a limit with which the server would serve hardly anybody.
+pub fn check(config: &Config, allowed: usize) -> Result<(), TooFewFiles> {
+    let needed = wanted(config).min(LEAST_FILES);
+    if allowed < needed { Err(TooFewFiles { allowed, needed }) } else { Ok(()) }
+}
+
+/// Leaves room for the database and blobs, and for robots' sessions before requests, which come and go.
+pub fn fit(config: &mut Config, allowed: usize) -> Result<(), TooFewFiles> {
+    check(config, allowed)?;
+    if wanted(config) <= allowed {
+        return Ok(());
+    }
+    let room = allowed - OTHER_FILES;
+    config.max_http_connections = config.max_http_connections.min(room / 3);
+    config.max_mqtt_connections = config.max_mqtt_connections.min(room - config.max_http_connections);
+    let (http, mqtt) = (config.max_http_connections, config.max_mqtt_connections);
+    tracing::warn!(
+        files = allowed,
+        http,
+        mqtt,
+        "so few files may be open that fewer connections are allowed; see ulimit -n"
+    );
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn config(http: usize, mqtt: usize) -> Config {
+        let data = std::path::PathBuf::from("/nowhere");
+        Config { max_http_connections: http, max_mqtt_connections: mqtt, ..Config::with_data(data) }
+    }
+
+    #[test]
+    fn connections_are_fitted_to_the_limit_and_too_low_a_limit_is_refused() {
+        let fitted = |http, mqtt, allowed| {
+            let mut config = config(http, mqtt);
+            fit(&mut config, allowed).map(|()| (config.max_http_connections, config.max_mqtt_connections))
+        };
+        assert_eq!(fitted(20_000, 20_000, 40_500), Ok((20_000, 20_000)));
+        assert_eq!(fitted(20_000, 20_000, 1024), Ok((174, 350)));
+        assert_eq!(fitted(20_000, 20_000, 1023), Err(TooFewFiles { allowed: 1023, needed: 1024 }));
+        assert_eq!(fitted(10, 10, 520), Ok((10, 10)));
+        assert_eq!(fitted(10, 10, 519), Err(TooFewFiles { allowed: 519, needed: 520 }));
+    }
+}

@@ -54,9 +54,8 @@ pub async fn run(store: Store, blobs: Blobs, clock: Clock, grace: Duration, stop
         match collect(&store, &blobs, clock.now_ms(), grace).await {
             Ok(Collected { uploads: 0, blobs: 0 }) => {}
             Ok(Collected { uploads, blobs }) => tracing::info!(uploads, blobs, "collected what nobody needs"),
-            Err(error) => {
-                tracing::warn!(error = &error as &dyn std::error::Error, "collecting failed");
-            }
+            Err(CollectError::Store(error)) => error.log("collecting failed"),
+            Err(error) => tracing::warn!(error = &error as &dyn std::error::Error, "collecting failed"),
         }
     }
 }

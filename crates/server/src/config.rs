@@ -41,6 +41,8 @@ pub struct Config {
     pub broker_pin: Option<CaPin>,
     /// The database's URL; absent: SQLite in the data directory.
     pub database: Option<String>,
+    /// How often a SQLite database is checked in full.
+    pub database_check_interval: Duration,
     /// What all MQTT topics start with.
     pub topic_prefix: TopicPrefix,
     /// Whether unencrypted listeners may be reached from other machines.
@@ -277,6 +279,7 @@ impl Config {
             broker: None,
             broker_pin: None,
             database: None,
+            database_check_interval: DAY,
             topic_prefix: TopicPrefix::default(),
             allow_plaintext: false,
             tls: TlsSettings::default(),

@@ -100,6 +100,12 @@ pub enum DataError {
         /// The directory.
         path: PathBuf,
     },
+    /// There is no room for a file.
+    #[error("{} can't be written on a full disk: make at least 16 MB free on its file system", path.display())]
+    Full {
+        /// Which.
+        path: PathBuf,
+    },
     /// A file holds something else than it should.
     #[error("{} does not hold {expected}; put the right file back, or move it away to get a new one", path.display())]
     Content {
@@ -108,6 +114,16 @@ pub enum DataError {
         /// What should be in it.
         expected: &'static str,
     },
+}
+
+impl DataError {
+    fn io(path: impl Into<PathBuf>) -> impl FnOnce(io::Error) -> Self {
+        let path = path.into();
+        move |source| match source.kind() {
+            io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => Self::Full { path },
+            _ => Self::Io { path, source },
+        }
+    }
 }
 
 impl Drop for DataDirectory {
@@ -120,11 +136,10 @@ impl Drop for DataDirectory {
 impl DataDirectory {
     /// Makes the directory if it is missing, and locks it. What a killed server published there is withdrawn.
     pub fn open(path: &Path) -> Result<Self, DataError> {
-        let io_error = |path: PathBuf| move |source| DataError::Io { path, source };
-        DirBuilder::new().recursive(true).mode(0o700).create(path).map_err(io_error(path.to_owned()))?;
+        DirBuilder::new().recursive(true).mode(0o700).create(path).map_err(DataError::io(path))?;
         let lock_path = path.join(LOCK);
         let lock = OpenOptions::new().create(true).truncate(false).write(true).mode(0o600).open(&lock_path);
-        let lock = lock.map_err(io_error(lock_path.clone()))?;
+        let lock = lock.map_err(DataError::io(&lock_path))?;
         loop {
             match lock.try_lock() {
                 Ok(()) => {
@@ -176,15 +191,21 @@ impl DataDirectory {
         &self.path
     }
 
-    /// An empty directory in it; what an earlier server left there is gone.
+    /// An empty directory in it; what an earlier server left there is gone. One that is there stays, so that this takes no room.
     pub fn fresh_directory(&self, name: &str) -> Result<PathBuf, DataError> {
         let path = self.path.join(name);
-        let io_error = |source| DataError::Io { path: path.clone(), source };
-        match std::fs::remove_dir_all(&path) {
-            Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(io_error(error)),
-            _ => {}
-        }
-        DirBuilder::new().mode(0o700).create(&path).map_err(io_error)?;
+        let clear = || {
+            DirBuilder::new().recursive(true).mode(0o700).create(&path)?;
+            for entry in std::fs::read_dir(&path)? {
+                let entry = entry?;
+                match entry.file_type()?.is_dir() {
+                    true => std::fs::remove_dir_all(entry.path())?,
+                    false => std::fs::remove_file(entry.path())?,
+                }
+            }
+            Ok(())
+        };
+        clear().map_err(DataError::io(&path))?;
         Ok(path)
     }
 
@@ -239,7 +260,7 @@ impl DataDirectory {
         let path = self.path.join(ADDRESSES);
         let text = serde_json::to_string(addresses)
             .map_err(|error| DataError::Io { path: path.clone(), source: error.into() })?;
-        self.write_new(&path, &format!("{text}\n")).map_err(|source| DataError::Io { path, source })
+        self.write_new(&path, &format!("{text}\n")).map_err(DataError::io(path))
     }
 
     /// Nobody listens there, or soon nobody will: what else does is not shown our token.
@@ -255,15 +276,14 @@ impl DataDirectory {
     }
 
     fn read_or_make(&self, path: &Path, make: impl FnOnce() -> String) -> Result<String, DataError> {
-        let io_error = |source| DataError::Io { path: path.to_owned(), source };
         match std::fs::read_to_string(path) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => {
                 let text = make();
                 let text = text.trim_end().to_owned();
-                self.write_new(path, &format!("{text}\n")).map_err(io_error)?;
+                self.write_new(path, &format!("{text}\n")).map_err(DataError::io(path))?;
                 Ok(text)
             }
-            other => other.map_err(io_error),
+            other => other.map_err(DataError::io(path)),
         }
     }
 

@@ -42,7 +42,7 @@ impl StoreGatekeeper {
         let password = login.password.as_deref().ok_or(Refusal::BadCredentials)?;
         let token: Token = password.parse().map_err(|_| Refusal::BadCredentials)?;
         let unchecked = |error: StoreError| {
-            tracing::warn!(error = &error as &dyn std::error::Error, "a login over MQTT could not be checked");
+            error.log("a login over MQTT could not be checked");
             Refusal::Unavailable
         };
         let admitted = self.store.admit(&token, &login.proof, self.clock.now_ms()).await.map_err(unchecked)?;

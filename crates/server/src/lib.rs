@@ -16,6 +16,7 @@ pub mod commands;
 pub mod conduct;
 pub mod config;
 pub mod data_directory;
+pub mod database;
 pub mod delivery;
 pub mod deployment;
 pub mod downlink;

@@ -19,8 +19,10 @@ use crate::store::Store;
 const CHECK_INTERVAL: Duration = Duration::from_secs(5);
 /// How long one component may take to answer.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// A data directory with less room than this is full.
-const LEAST_FREE_BYTES: u64 = 1 << 20;
+/// A file system with less room than this is full.
+const LEAST_FREE_BYTES: u64 = 16 << 20;
+/// On a small file system it is this share.
+const LEAST_FREE_SHARE: u64 = 64;
 
 /// A part that the server cannot work without.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -84,8 +86,8 @@ impl ReadinessCheck {
         self.readiness.set(
             Component::Database,
             match database {
-                Ok(Ok(())) => None,
-                Ok(Err(_)) => Some("it refuses a statement".to_owned()),
+                Ok(Ok(())) => self.store.state().problem(),
+                Ok(Err(_)) => self.store.state().problem().or_else(|| Some("it refuses a statement".to_owned())),
                 Err(_) => Some("it does not answer".to_owned()),
             },
         );
@@ -143,6 +145,10 @@ impl DiskProbe {
         }
         match finished {
             Some(Ok(Ok(()))) => None,
+            Some(Ok(Err(error))) if error.kind() == io::ErrorKind::StorageFull => {
+                let free = room(&self.data).map_or(0, |(free, _)| free);
+                Some(format!("the data directory's disk is full: {free} bytes are free"))
+            }
             Some(Ok(Err(error))) => Some(format!("the data directory can't be written: {}", error.kind())),
             Some(Err(_)) => Some("the data directory can't be checked".to_owned()),
             None => Some("the data directory does not answer".to_owned()),
@@ -154,7 +160,9 @@ fn probe_disk(data: &Path) -> io::Result<()> {
     std::fs::write(data.join(".ready"), b"ready\n")?;
     // The file is short and was there before, so it may be written again where nothing else can.
     match room(data) {
-        Some((free, _)) if free < LEAST_FREE_BYTES => Err(io::ErrorKind::StorageFull.into()),
+        Some((free, total)) if free < LEAST_FREE_BYTES.min(total / LEAST_FREE_SHARE) => {
+            Err(io::ErrorKind::StorageFull.into())
+        }
         _ => Ok(()),
     }
 }

@@ -23,7 +23,7 @@ use crate::chooser::Chooser;
 use crate::clock::Clock;
 use crate::happening::{Happening, TaskNews};
 use crate::report_meter::ReportMeter;
-use crate::store::{OpenAssignment, ReportedRobot, Store, StoreError, Write};
+use crate::store::{DatabaseState, Fault, OpenAssignment, ReportedRobot, Store, StoreError, Write};
 use memory::Memory;
 
 /// Reports that may wait; beyond it callers wait for room.
@@ -44,6 +44,7 @@ const DISK_STEP_BYTES: u64 = 16 << 20;
 pub struct ReportWriter {
     queue: mpsc::Sender<Submission>,
     meter: ReportMeter,
+    database: DatabaseState,
 }
 
 /// Why a report was not stored. The robot keeps it and sends it again.
@@ -60,7 +61,7 @@ pub enum ReportError {
     Busy,
     /// The database did not take it.
     #[error("the report could not be stored")]
-    NotStored,
+    NotStored(Option<Fault>),
 }
 
 #[derive(Debug)]
@@ -75,13 +76,17 @@ impl ReportWriter {
     /// Starts the writer. The task ends, after all that was handed in, when the last clone is dropped.
     pub fn start(store: Store, clock: Clock, changes: Changes, chooser: Chooser) -> (Self, JoinHandle<()>) {
         let (queue, submissions) = mpsc::channel(QUEUE);
-        let meter = ReportMeter::new(Instant::now());
-        (Self { queue, meter }, tokio::spawn(write_all(submissions, store, clock, changes, chooser)))
+        let (meter, database) = (ReportMeter::new(Instant::now()), store.state().clone());
+        (Self { queue, meter, database }, tokio::spawn(write_all(submissions, store, clock, changes, chooser)))
     }
 
     /// Stores `report`, as far as it is kept, whose `robot_id` the caller has authenticated by the robot's token of this number. Resolves after
     /// the commit.
     pub async fn submit(&self, report: Report, token_number: u64) -> Result<ReportReply, ReportError> {
+        // It would wait behind what was handed in before, for nothing.
+        if !self.database.is_there() {
+            return Err(ReportError::NotStored(Some(Fault::Away)));
+        }
         let (came, report) = (Instant::now(), report.tidied());
         let (answer, answered) = oneshot::channel();
         let submission = Submission { fingerprint: fingerprint(&report), report, token_number, answer };
@@ -89,6 +94,11 @@ impl ReportWriter {
         let reply = answered.await.map_err(|_| ReportError::Busy)??;
         self.meter.stored(Instant::now(), came.elapsed());
         Ok(reply)
+    }
+
+    /// Resolves when the database answers. Cancel-safe.
+    pub async fn database_there(&self) {
+        self.database.there().await;
     }
 
     /// What counts them.
@@ -115,12 +125,8 @@ async fn write_all(
                 Ok(answers)
             }
             Err(error) => {
-                tracing::error!(
-                    error = &error as &dyn std::error::Error,
-                    reports = batch.len(),
-                    "reports were refused"
-                );
-                Err(ReportError::NotStored)
+                error.log("reports were refused");
+                Err(ReportError::NotStored(error.fault()))
             }
         };
         for Submission { report, token_number, answer, .. } in batch.drain(..) {
@@ -196,9 +202,20 @@ async fn write_with_retries(
         if tries == TRIES {
             return Err(error);
         }
-        tracing::warn!(error = &error as &dyn std::error::Error, reports = reports.len(), "reports are tried again");
-        tokio::time::sleep(pause).await;
-        pause *= 2;
+        match error.fault() {
+            // Another try would find the same. Robots keep their reports and send them again.
+            Some(Fault::Corrupt | Fault::Full) => return Err(error),
+            // One that was restarted is soon there again. Reports that come meanwhile do not get as far as this.
+            Some(Fault::Away) => {
+                let there = tokio::time::timeout(PATIENCE, store.state().there()).await;
+                there.map_err(|_| error)?;
+            }
+            Some(Fault::Busy) | None => {
+                error.log("reports are tried again");
+                tokio::time::sleep(pause).await;
+                pause *= 2;
+            }
+        }
         tries += 1;
     }
 }

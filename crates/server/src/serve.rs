@@ -6,17 +6,19 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicUsize;
 use std::time::Duration;
 
+use task_proto::CaPin;
 use task_proto::api::{FeedKind, ListenerView};
 use tokio::sync::broadcast::{
     self,
     error::{RecvError, TryRecvError},
 };
+use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tokio::time::{Interval, MissedTickBehavior};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-use crate::actions::{ActionSettings, Actions};
+use crate::actions::{ActionError, ActionSettings, Actions};
 use crate::backlog::listen;
 use crate::blobs::{BlobError, BlobSettings, Blobs};
 use crate::broker::{Broker, BrokerConfig, BrokerError, ExternalConfig, Gatekeeper, Health, Inbox, Limits};
@@ -27,6 +29,7 @@ use crate::collector;
 use crate::conduct::Conduct;
 use crate::config::{Config, TlsSettings};
 use crate::data_directory::{Addresses, DataDirectory, DataError, room};
+use crate::database::{Database, keep_checked};
 use crate::downlink::Downlink;
 use crate::fan_out::FanOutWorker;
 use crate::feed::{Feed, FeedSource};
@@ -116,6 +119,7 @@ pub struct Server {
     data: DataDirectory,
     addresses: Addresses,
     store: Store,
+    unusable: watch::Receiver<Option<String>>,
     broker: Broker,
     tls: Option<Tls>,
     stop: CancellationToken,
@@ -131,9 +135,8 @@ impl Server {
         let key = data.signing_key()?;
         let public_key = key.public_key();
         let tls = config.encrypts().then(|| Tls::open(tls_settings(&config), &data, clock.clone())).transpose()?;
-        let url = config.database.clone().unwrap_or_else(|| sqlite_url(&data.path().join("taskd.sqlite")));
-        let store = Store::open(&url).await?;
-        register_operator(&store, &data, &clock).await?;
+        let database = open_database(&config, &data, clock.clone()).await?;
+        let (store, unusable) = (database.store().clone(), database.unusable());
         let blobs = Blobs::open(data.path(), blob_settings(&config))?;
         let http = listen(config.http).map_err(|source| ServeError::Listen { address: config.http, source })?;
         let http_address = http.local_addr().map_err(|source| ServeError::Listen { address: config.http, source })?;
@@ -198,6 +201,7 @@ impl Server {
             tasks.spawn(tls.keep_current(stop.clone()));
         }
         tasks.spawn(watch_load(app.clone(), load));
+        tasks.spawn(database.attend(stop.clone()));
         let service = listener::Service {
             router: crate::http::router(app),
             tls: tls.clone(),
@@ -205,14 +209,8 @@ impl Server {
             traffic: http_traffic,
         };
         let http = listener::serve(http, service, http_limits(&config), stop.clone(), REQUEST_PATIENCE);
-        let mqtt_address = broker.local_addr().map(|bound| reachable(bound).to_string());
-        let addresses = Addresses {
-            http: reachable(http_address).to_string(),
-            mqtt: mqtt_address.unwrap_or_else(|| broker.address()),
-            ca_pin: tls.as_ref().map(Tls::pin),
-        };
-        data.publish(&addresses)?;
-        Ok(Self { data, addresses, store, broker, tls, stop, tasks, http: tokio::spawn(http), reports })
+        let addresses = publish(&data, http_address, &broker, tls.as_ref().map(Tls::pin))?;
+        Ok(Self { data, addresses, store, unusable, broker, tls, stop, tasks, http: tokio::spawn(http), reports })
     }
 
     /// Where it listens.
@@ -230,16 +228,25 @@ impl Server {
         self.tls.as_ref().map_or(Ok(()), Tls::reload)
     }
 
-    /// Waits until the broker can't be helped any more; says what was seen.
+    /// Waits until broker or database can't be helped any more; says what was seen.
     pub async fn broken(&self) -> String {
-        let mut health = self.broker.health();
-        loop {
-            if let Health::Failed(seen) = &*health.borrow_and_update() {
-                return seen.clone();
+        let (mut health, mut unusable) = (self.broker.health(), self.unusable.clone());
+        let broker = async {
+            match health.wait_for(|health| matches!(health, Health::Failed(_))).await.as_deref() {
+                Ok(Health::Failed(seen)) => format!("MQTT can't be served any more: {seen}"),
+                _ => "the broker's watchdog has ended".to_owned(),
             }
-            if health.changed().await.is_err() {
-                return "the broker's watchdog has ended".to_owned();
+        };
+        let database = async {
+            match unusable.wait_for(Option::is_some).await.as_deref() {
+                Ok(Some(why)) => why.clone(),
+                // Nobody waits for the database any more.
+                _ => std::future::pending().await,
             }
+        };
+        tokio::select! {
+            seen = broker => seen,
+            why = database => why,
         }
     }
 
@@ -287,6 +294,7 @@ fn start_tasks(tasks: &TaskTracker, app: &App, config: &Config) {
     };
     tasks.spawn(app.events.clone().run(source, app.changes.clone(), app.stop.clone()));
     let (store, blobs, clock, stop) = (app.store.clone(), app.blobs.clone(), app.clock.clone(), app.stop.clone());
+    tasks.spawn(keep_checked(store.clone(), clock.clone(), config.database_check_interval, stop.clone()));
     tasks.spawn(collector::run(store, blobs, clock, config.blob_grace, stop));
     tasks.spawn(expire_assignments(app.clone()));
     let worker = FanOutWorker {
@@ -328,6 +336,7 @@ async fn expire_assignments(app: App) {
         match app.actions.expire().await {
             // They come back with a token that is good, if they have one.
             Ok(users) => users.iter().for_each(|user| app.broker.disconnect_person(user)),
+            Err(ActionError::Store(error)) => error.log("assignments could not be looked through for expired ones"),
             Err(error) => tracing::error!(
                 error = &error as &dyn std::error::Error,
                 "assignments could not be looked through for expired ones"
@@ -426,20 +435,29 @@ async fn next_tick(ticks: &mut Interval, stop: &CancellationToken) -> bool {
     }
 }
 
-/// Makes sure that the token in the directory opens this database, which may be new or restored.
-async fn register_operator(store: &Store, data: &DataDirectory, clock: &Clock) -> Result<(), ServeError> {
-    let token = data.operator_token()?;
-    let now_ms = clock.now_ms();
-    if store.token_holder(&token, now_ms).await?.is_some() {
-        return Ok(());
-    }
-    match store.create_operator_token(&token, now_ms).await {
-        Err(error) if error.is_unique_violation() => {
-            tracing::warn!("the token in {} was revoked and stays so", data.operator_token_path().display());
-            Ok(())
+async fn open_database(config: &Config, data: &DataDirectory, clock: Clock) -> Result<Database, ServeError> {
+    let url = config.database.clone().unwrap_or_else(|| sqlite_url(&data.path().join("taskd.sqlite")));
+    Ok(Database::open(&url, data.operator_token()?, data.operator_token_path(), clock).await?)
+}
+
+/// Tells programs on this machine where the server listens, if there is room for that.
+fn publish(
+    data: &DataDirectory,
+    http: SocketAddr,
+    broker: &Broker,
+    ca_pin: Option<CaPin>,
+) -> Result<Addresses, DataError> {
+    let mqtt = broker.local_addr().map(|bound| reachable(bound).to_string());
+    let mqtt = mqtt.unwrap_or_else(|| broker.address());
+    let addresses = Addresses { http: reachable(http).to_string(), mqtt, ca_pin };
+    match data.publish(&addresses) {
+        Err(error @ DataError::Full { .. }) => {
+            let error = &error as &dyn std::error::Error;
+            tracing::warn!(error, "commands on this machine do not find the server; name it with --server");
         }
-        other => Ok(other?),
+        published => published?,
     }
+    Ok(addresses)
 }
 
 fn milliseconds(time: Duration) -> u64 {

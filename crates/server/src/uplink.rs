@@ -70,6 +70,8 @@ impl Uplink {
         };
         self.saw_instance(message, &report.instance);
         let observed = report.observed_generation;
+        // While the database is away its sessions stay, for as long as the broker lets this take.
+        self.reports.database_there().await;
         match self.reports.submit(report, token_number).await {
             Ok(reply) => {
                 if reply.generation > observed {
@@ -79,6 +81,8 @@ impl Uplink {
             }
             // It was removed a moment ago; sending again would not help.
             Err(ReportError::RobotNotFound(_)) => Ok(()),
+            // The database's state was logged when it changed.
+            Err(ReportError::NotStored(Some(_))) => Err(NotStored),
             Err(error) => {
                 tracing::warn!(robot = %message.robot, %error, "a report was not stored; the robot sends it again");
                 Err(NotStored)

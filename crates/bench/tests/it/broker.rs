@@ -380,8 +380,8 @@ async fn server_and_robots_fail_over_to_the_next_broker_of_the_list() {
     assert_eq!(view.from, LogsFrom::Robot, "asked over the second broker");
 
     // An agent that knows one address is told the broker at which the server is.
-    let token: Value = serde_json::from_slice(&std::fs::read(robot.data().join("identity.json")).expect("identity"))
-        .expect("json");
+    let token: Value =
+        serde_json::from_slice(&std::fs::read(robot.data().join("identity.json")).expect("identity")).expect("json");
     let url = server.url(&format!("/api/v1/robots/{}/mqtt", robot.id));
     let token = token["token"].as_str().expect("a token");
     let told = reqwest::Client::new().get(url).bearer_auth(token).send().await.expect("an answer");

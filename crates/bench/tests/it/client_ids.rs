@@ -183,11 +183,13 @@ async fn fleet_works_through_nats_where_robots_reach_their_own_subjects_only() {
 
     let (client, mut events) = connect_as(nats.mqtt, &attacker, "spy").await;
     let (own, other) = (format!("taskd/v1/r/{}/desired", attacker.id), format!("taskd/v1/r/{}/desired", victim.id));
-    let refused = ["#", "+/#", "taskd/v1/#", "taskd/v1/r/+/desired", &other, "$MQTT/#", "$MQTT/sub/+", "$JS/#", "$SYS/#"];
-    for (filter, code) in refused.map(|filter| (filter, SubscribeReasonCode::Failure)).into_iter().chain([(
-        own.as_str(),
-        SubscribeReasonCode::Success(QoS::AtLeastOnce),
-    )]) {
+    let refused =
+        ["#", "+/#", "taskd/v1/#", "taskd/v1/r/+/desired", &other, "$MQTT/#", "$MQTT/sub/+", "$JS/#", "$SYS/#"];
+    for (filter, code) in refused
+        .map(|filter| (filter, SubscribeReasonCode::Failure))
+        .into_iter()
+        .chain([(own.as_str(), SubscribeReasonCode::Success(QoS::AtLeastOnce))])
+    {
         client.subscribe(filter, QoS::AtLeastOnce).await.expect("queued");
         let answer = loop {
             if let Packet::SubAck(answer) = next(&mut events).await {
@@ -199,7 +201,8 @@ async fn fleet_works_through_nats_where_robots_reach_their_own_subjects_only() {
     // With the same account over NATS' own protocol.
     let mut stream = TcpStream::connect(nats.client).await.expect("connected");
     let password = identity(&attacker)["mqtt"]["external"]["password"].as_str().expect("a password").to_owned();
-    let hello = format!("CONNECT {{\"verbose\":false,\"user\":\"{}\",\"pass\":\"{password}\"}}\r\nPING\r\n", attacker.id);
+    let hello =
+        format!("CONNECT {{\"verbose\":false,\"user\":\"{}\",\"pass\":\"{password}\"}}\r\nPING\r\n", attacker.id);
     stream.write_all(hello.as_bytes()).await.expect("sent");
     let mut answer = String::new();
     stream.read_to_string(&mut answer).await.expect("it is closed");

@@ -108,6 +108,15 @@ pub struct DatabaseStatus {
     pub size_bytes: Option<u64>,
     /// Of a question asked now.
     pub latency_ms: f64,
+    /// For people: why orders and reports are refused; absent where nothing is known against the database.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub problem: Option<String>,
+    /// When the server last checked all of it since its start and found nothing wrong. SQLite only.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fully_checked_at_ms: Option<u64>,
+    /// For people: how the database itself notices damage to its pages. Postgres only.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub guard: Option<String>,
 }
 
 /// The data directory's file system.

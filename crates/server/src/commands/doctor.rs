@@ -8,7 +8,7 @@ use std::time::Duration;
 use http::StatusCode;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
-use task_proto::api::{BrokerCheck, BrokerChecks, Me, RobotList, ServerInfo, ServerStatus, TokenList};
+use task_proto::api::{BrokerCheck, BrokerChecks, DatabaseStatus, Me, RobotList, ServerInfo, ServerStatus, TokenList};
 use task_proto::checkup::{Checkup, Verdict};
 use task_proto::person::Permission;
 use task_proto::time::span;
@@ -20,6 +20,9 @@ use super::output::{Format, Output, time};
 use super::{CommandError, Connection, Outcome, doctor_here};
 use crate::clock::Clock;
 
+/// What mends a corrupt database.
+pub(super) const INTEGRITY_MEND: &str =
+    "stop the server and put back a copy of its data directory, or save what can be read: docs/server.md says how";
 /// How long each answer may take.
 const PATIENCE: Duration = Duration::from_secs(5);
 /// A clock that is wrong by more confuses whoever reads times.
@@ -40,7 +43,7 @@ pub(super) async fn run(connection: &Connection) -> Result<Outcome, CommandError
         Err(error) => return Err(error),
     };
     match data_directory(connection) {
-        Some(data) if data.exists() => doctor_here::check(&mut checkup, &data, is_up),
+        Some(data) if data.exists() => doctor_here::check(&mut checkup, &data, is_up).await,
         Some(data) if connection.data.is_some() => {
             checkup.bad("data", format!("{} does not exist", data.display()), "look at --data and TASKD_DATA");
         }
@@ -220,6 +223,7 @@ async fn known_to(checkup: &mut Checkup, connection: &Connection) {
     };
     clocks(checkup, &info, begun, Clock::system().now_ms());
     token(checkup, &client).await;
+    integrity(checkup, &client).await;
     mqtt(checkup, &client, &info).await;
     versions(checkup, &client, &info).await;
 }
@@ -274,6 +278,26 @@ async fn token(checkup: &mut Checkup, client: &Client) {
             );
         }
         _ => checkup.good("token", found),
+    }
+}
+
+/// Whether the pages of the database are sound, and since when that is known.
+async fn integrity(checkup: &mut Checkup, client: &Client) {
+    let DatabaseStatus { problem, fully_checked_at_ms, guard, .. } = match asked(client, "/server/status").await {
+        Ok(ServerStatus { database, .. }) => database,
+        Err(problem) => return checkup.notice("integrity", problem, "look at the server's log"),
+    };
+    match (problem, fully_checked_at_ms, guard) {
+        (Some(problem), ..) => checkup.bad("integrity", problem, INTEGRITY_MEND),
+        (None, Some(at_ms), _) => {
+            checkup.good("integrity", format!("the last full check, {}, found nothing wrong", time(at_ms)))
+        }
+        (None, None, Some(guard)) => checkup.good("integrity", guard),
+        (None, None, None) => checkup.notice(
+            "integrity",
+            "the database was not checked in full since the server started",
+            "it is checked beside the service: look again later",
+        ),
     }
 }
 

@@ -1,5 +1,5 @@
 //! What `taskd doctor` looks at on the machine that the server is on, or is to be on: its directory, the disk, how many
-//! files may be open, its settings and its ports. It opens neither the database nor any secret.
+//! files may be open, its settings and its ports. It opens no secret, and the database only where no server runs, to check it.
 
 use std::io;
 use std::net::{SocketAddr, TcpListener};
@@ -11,10 +11,12 @@ use nix::sys::statvfs::statvfs;
 use nix::unistd::{AccessFlags, access, geteuid};
 use task_proto::checkup::Checkup;
 
+use super::doctor::INTEGRITY_MEND;
 use super::output::bytes;
 use crate::config::{Config, ServeFlags};
 use crate::data_directory::is_locked;
 use crate::open_files;
+use crate::store::check_at_rest;
 
 /// With less free the database may be refused its next page.
 const LOW_BYTES: u64 = 256 << 20;
@@ -22,7 +24,7 @@ const LOW_BYTES: u64 = 256 << 20;
 const LOW_PERCENT: u64 = 10;
 
 /// Looks at `data`, and at what a server there would need if none answers.
-pub(super) fn check(checkup: &mut Checkup, data: &Path, is_up: bool) {
+pub(super) async fn check(checkup: &mut Checkup, data: &Path, is_up: bool) {
     if let Some(owner) = anothers(data) {
         return checkup.notice(
             "data",
@@ -37,6 +39,7 @@ pub(super) fn check(checkup: &mut Checkup, data: &Path, is_up: bool) {
         Ok(config) => {
             files(checkup, &config);
             if !is_up {
+                database(checkup, data, &config).await;
                 ports(checkup, data, &config);
             }
         }
@@ -69,6 +72,25 @@ fn directory(checkup: &mut Checkup, data: &Path) {
             "data",
             format!("{}: {error}", part.display()),
             "serve as the directory's owner, or give it to the account that serves (chown -R)",
+        ),
+    }
+}
+
+/// Whether the structure of a SQLite file that nobody serves is sound.
+async fn database(checkup: &mut Checkup, data: &Path, config: &Config) {
+    let path = data.join("taskd.sqlite");
+    if config.database.is_some() || !path.exists() || is_locked(data).is_ok_and(|is_up| is_up) {
+        return;
+    }
+    match check_at_rest(&path).await {
+        Ok(None) => checkup.good("integrity", format!("a quick check of {} found nothing wrong", path.display())),
+        Ok(Some(finding)) => {
+            checkup.bad("integrity", format!("{} is corrupt: {finding}", path.display()), INTEGRITY_MEND);
+        }
+        Err(error) => checkup.bad(
+            "integrity",
+            format!("{} can't be checked: {:#}", path.display(), anyhow::Error::from(error)),
+            "look at the file system",
         ),
     }
 }

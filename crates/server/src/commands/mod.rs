@@ -1,5 +1,5 @@
 //! The operator's commands: what they are called, what they take, and which exit code they end with. Each command talks
-//! to the server over its public API only; none of them opens the server's database or files (the published address and
+//! to the server over its public API only; none of them opens the files of a server that runs (the published address and
 //! the first token excepted).
 
 use std::path::PathBuf;

@@ -2,7 +2,9 @@
 
 use std::time::Duration;
 
-use task_proto::api::{ListenerView, RobotSession, RuleView, ServerRules, ServerStatus, SessionList, SiteStatus};
+use task_proto::api::{
+    DatabaseStatus, ListenerView, RobotSession, RuleView, ServerRules, ServerStatus, SessionList, SiteStatus,
+};
 use task_proto::time::span;
 
 use super::output::{bytes, facts, time};
@@ -62,7 +64,10 @@ fn describe(status: &ServerStatus) -> String {
         ("reports", format!("{:.1}/s{latency}", reports.per_s)),
         ("mqtt", format!("{} in, {} out", bytes(mqtt.all.bytes_in), bytes(mqtt.all.bytes_out))),
         ("http", format!("{} requests, {} in, {} out", http.requests, bytes(http.bytes_in), bytes(http.bytes_out))),
-        ("database", format!("{}{size}, answers in {:.1} ms", database.kind, database.latency_ms)),
+        (
+            "database",
+            format!("{}{size}, answers in {:.1} ms{}", database.kind, database.latency_ms, integrity(database)),
+        ),
         (
             "disk",
             format!(
@@ -74,6 +79,16 @@ fn describe(status: &ServerStatus) -> String {
         ),
         ("broker", format!("{health}: {}, {}", broker.kind, broker.detail)),
     ])
+}
+
+/// For the line about the database: whether it is sound, as far as that is known.
+fn integrity(DatabaseStatus { problem, fully_checked_at_ms, guard, .. }: &DatabaseStatus) -> String {
+    let known = match (problem, fully_checked_at_ms) {
+        (Some(problem), _) => Some(format!("NOT READY: {problem}")),
+        (None, Some(at_ms)) => Some(format!("checked in full {}", time(*at_ms))),
+        (None, None) => guard.clone(),
+    };
+    known.map_or_else(String::new, |known| format!("; {known}"))
 }
 
 fn site_row(site: &SiteStatus) -> Vec<String> {

@@ -74,6 +74,12 @@ pub(super) const SETTINGS: &[Setting] = &[
         set: |config, text| database_url(text).map(|url| config.database = Some(url)),
     },
     Setting {
+        name: "database-check-interval",
+        value_name: "TIME",
+        help: "How often a SQLite database is checked in full while it is served [default: 1d]",
+        set: |config, text| lifetime(text).map(|time| config.database_check_interval = time),
+    },
+    Setting {
         name: "topic-prefix",
         value_name: "PREFIX",
         help: "What all MQTT topics start with [default: taskd/v1]",

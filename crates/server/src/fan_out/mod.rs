@@ -80,10 +80,7 @@ impl FanOutWorker {
             let looked_at = Instant::now();
             match self.wanted().await {
                 Ok(wanted) => self.begin(wanted, &mut under_way),
-                Err(error) => tracing::warn!(
-                    error = &error as &dyn std::error::Error,
-                    "what is to be fanned out could not be read; it is tried again"
-                ),
+                Err(error) => error.log("what is to be fanned out could not be read; it is tried again"),
             }
             loop {
                 tokio::select! {

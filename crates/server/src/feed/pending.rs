@@ -172,8 +172,7 @@ impl Pending {
 /// What was read, if there is such a thing.
 fn read<T>(found: Result<Option<T>, StoreError>) -> Option<T> {
     found.unwrap_or_else(|error| {
-        let error = &error as &dyn std::error::Error;
-        tracing::warn!(error, "the feed could not read what it was to tell of");
+        error.log("the feed could not read what it was to tell of");
         None
     })
 }

@@ -28,7 +28,7 @@ use crate::conduct::Way;
 use crate::gatekeeper::ended_others;
 use crate::http_connections::{Connection, Holder};
 use crate::person::Person;
-use crate::store::{Admitted, StoreError, TokenHolder, with_shared_reads};
+use crate::store::{Admitted, Fault, StoreError, TokenHolder, with_shared_reads};
 use crate::tls::ClientProof;
 
 /// Who may call a route.
@@ -159,6 +159,9 @@ pub(super) async fn guard(
     let answer = answered(request, next, gate.deadline, counted.map(|counted| (gate.app.clone(), counted)));
     let Some(deadline) = gate.deadline else { return answer.await };
     tokio::time::timeout(deadline, answer).await.unwrap_or_else(|_| {
+        if !gate.app.store.state().is_there() {
+            return ApiError::from(Fault::Away).into_response();
+        }
         let message = "the request took too long to arrive or to be answered";
         ApiError::new(StatusCode::REQUEST_TIMEOUT, "timeout", message).into_response()
     })

@@ -1,6 +1,8 @@
 //! The API's one error shape: a status, a stable code for programs and a sentence for people. It never tells a caller
 //! what went wrong inside: that is logged.
 
+use std::io;
+
 use axum::Json;
 use axum::response::{IntoResponse, Response};
 use http::{HeaderValue, StatusCode, header};
@@ -11,10 +13,13 @@ use crate::actions::ActionError;
 use crate::blobs::BlobError;
 use crate::person::Person;
 use crate::report_writer::ReportError;
-use crate::store::StoreError;
+use crate::store::{Fault, StoreError};
 
 /// The code of [`ApiError::robot_revoked`].
 pub(super) const ROBOT_REVOKED: &str = "robot_revoked";
+
+/// The code where the database is corrupt.
+pub(super) const DATABASE_CORRUPT: &str = "database_corrupt";
 
 /// An answer that is not the one hoped for.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -97,6 +102,19 @@ impl ApiError {
         Self::new(StatusCode::INTERNAL_SERVER_ERROR, "internal", "the server failed; its log says why")
     }
 
+    /// 507: the server's disk is full.
+    pub fn disk_full() -> Self {
+        Self::new(StatusCode::INSUFFICIENT_STORAGE, "disk_full", "the server's disk is full")
+    }
+
+    /// Our own disk refused something; `source` is how.
+    pub fn disk(error: &(dyn std::error::Error + 'static), source: &io::Error) -> Self {
+        match source.kind() {
+            io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => Self::disk_full(),
+            _ => Self::internal(error),
+        }
+    }
+
     /// The answer in the shape of the OCI distribution specification, for everything below `/v2`.
     pub fn into_oci_response(self) -> Response {
         let code = match self.status {
@@ -104,6 +122,9 @@ impl ApiError {
             StatusCode::FORBIDDEN => "DENIED",
             StatusCode::TOO_MANY_REQUESTS => "TOOMANYREQUESTS",
             StatusCode::NOT_FOUND => "NAME_UNKNOWN",
+            StatusCode::INSUFFICIENT_STORAGE => "DENIED",
+            _ if self.code == DATABASE_CORRUPT => "DATABASE_CORRUPT",
+            StatusCode::SERVICE_UNAVAILABLE => "UNAVAILABLE",
             _ => "UNSUPPORTED",
         };
         let body = json!({ "errors": [{ "code": code, "message": self.message }] });
@@ -133,7 +154,27 @@ impl IntoResponse for ApiError {
 
 impl From<BlobError> for ApiError {
     fn from(error: BlobError) -> Self {
-        Self::internal(&error)
+        match error {
+            BlobError::DiskFull | BlobError::DiskReserved { .. } => {
+                Self { message: error.to_string(), ..Self::disk_full() }
+            }
+            error => Self::internal(&error),
+        }
+    }
+}
+
+/// A fault is logged where it is noticed, not for each request that it ends.
+impl From<Fault> for ApiError {
+    fn from(fault: Fault) -> Self {
+        match fault {
+            Fault::Corrupt => {
+                let message = "the server's database is corrupt, so nothing is changed until it is mended; taskd doctor says more";
+                Self::new(StatusCode::SERVICE_UNAVAILABLE, DATABASE_CORRUPT, message)
+            }
+            Fault::Full => Self::disk_full(),
+            Fault::Away => Self::unavailable("the server's database does not answer; try again"),
+            Fault::Busy => Self::unavailable("the server's database is busy; try again"),
+        }
     }
 }
 
@@ -144,7 +185,7 @@ impl From<StoreError> for ApiError {
             StoreError::TooManyActs { seconds, .. } => {
                 Self { retry_after_s: seconds, ..Self::too_many(error.to_string()) }
             }
-            _ => Self::internal(&error),
+            _ => error.fault().map_or_else(|| Self::internal(&error), Self::from),
         }
     }
 }
@@ -204,7 +245,8 @@ impl From<ReportError> for ApiError {
         match error {
             ReportError::RobotNotFound(_) => Self::not_found(error.to_string()),
             ReportError::TokenEnded(_) => Self::unauthorized(error.to_string()),
-            ReportError::Busy | ReportError::NotStored => Self::unavailable(error.to_string()),
+            ReportError::NotStored(Some(fault)) => fault.into(),
+            ReportError::Busy | ReportError::NotStored(None) => Self::unavailable(error.to_string()),
         }
     }
 }

@@ -243,10 +243,7 @@ impl EventFeed {
                 continue;
             }
             if let Err(error) = self.send_all(&source, gathered).await {
-                tracing::warn!(
-                    error = &error as &dyn std::error::Error,
-                    "events could not be read; listeners are told to fetch the lists"
-                );
+                error.log("events could not be read; listeners are told to fetch the lists");
                 has_missed = true;
             }
             if has_missed {

@@ -174,7 +174,8 @@ pub(super) async fn desired(
 
 /// Stores a report of the robot; the answer comes after the commit.
 #[utoipa::path(post, path = "/api/v1/robots/{robot}/report", tag = "agent",
-    responses((status = 503, description = "Too many reports wait to be stored.")))]
+    responses((status = 503, description = "Too many reports wait to be stored, or the database does not answer or is corrupt."),
+        (status = 507, description = "`disk_full`: the server's disk is, and the report is not stored.")))]
 pub(super) async fn report(
     State(app): State<App>,
     ConnectInfo(peer): ConnectInfo<SocketAddr>,

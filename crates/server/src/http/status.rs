@@ -50,6 +50,7 @@ pub(super) async fn status(State(app): State<App>, by: Person) -> Result<Json<Se
     app.store.ping().await?;
     let latency_ms = (asked.elapsed().as_secs_f64() * 100_000.0).round() / 100.0;
     let Slow { database, packages_bytes } = slow_figures(&app).await?;
+    let state = app.store.state();
     let is_online = |robot: &KnownRobot| app.presence.is_online(&robot.id, now_ms);
     let online = robots.iter().filter(|(robot, _)| is_online(robot)).count() as u64;
     let (free_bytes, total_bytes) = room(&app.data).unwrap_or_default();
@@ -67,7 +68,14 @@ pub(super) async fn status(State(app): State<App>, by: Person) -> Result<Json<Se
         },
         sites: sites(&app, &robots, is_online),
         reports: app.reports.meter().read(Instant::now()),
-        database: DatabaseStatus { kind: database.kind.to_owned(), size_bytes: database.bytes, latency_ms },
+        database: DatabaseStatus {
+            kind: database.kind.to_owned(),
+            size_bytes: database.bytes,
+            latency_ms,
+            problem: state.problem(),
+            fully_checked_at_ms: state.fully_checked_at_ms(),
+            guard: state.guard().map(str::to_owned),
+        },
         disk: DiskStatus { free_bytes, total_bytes, packages_bytes },
         broker: broker(&app),
         listeners: app.facts.listeners.clone(),
@@ -82,7 +90,7 @@ async fn slow_figures(app: &App) -> Result<Slow, ApiError> {
     {
         return Ok(slow.clone());
     }
-    let packages_bytes = app.blobs.used_bytes().await.map_err(|error| ApiError::internal(&error))?;
+    let packages_bytes = app.blobs.used_bytes().await?;
     let slow = Slow { database: app.store.size().await?, packages_bytes };
     *known = Some((Instant::now(), slow.clone()));
     Ok(slow)

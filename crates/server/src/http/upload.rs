@@ -277,12 +277,7 @@ fn refused(error: UploadError) -> ApiError {
         | UploadError::Package(PackageError::Io { source, .. })
         | UploadError::Disk(source) => source,
     };
-    match source.kind() {
-        io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {
-            ApiError::new(StatusCode::INSUFFICIENT_STORAGE, "disk_full", "the server's disk is full")
-        }
-        _ => ApiError::internal(&error),
-    }
+    ApiError::disk(&error, source)
 }
 
 fn too_large(message: String) -> ApiError {

@@ -14,6 +14,9 @@ use sqlx::{AnyConnection, AssertSqlSafe, Connection as _, Either, Error, Execute
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::timeout;
 
+use super::fault::Fault;
+use super::state::DatabaseState;
+
 /// What the connections of one set have in common.
 pub(super) struct Terms {
     /// The database's URL.
@@ -28,8 +31,12 @@ pub(super) struct Terms {
     pub(super) answer: Duration,
     /// How long an idle connection may take to show that it is alive.
     pub(super) greeting: Duration,
-    /// How long a new connection, or another's to become free, is waited for.
+    /// How long a new connection may take.
+    pub(super) connect: Duration,
+    /// How long another's connection is waited for to become free.
     pub(super) wait: Duration,
+    /// Where the outcome of statements is noted. Nothing is lent before the database is open.
+    pub(super) state: DatabaseState,
 }
 
 tokio::task_local! {
@@ -44,7 +51,7 @@ pub async fn with_shared_reads<F: Future>(future: F) -> F::Output {
 }
 
 /// A set of connections to one database, each lent to one user at a time. Clones share them.
-#[derive(Clone)]
+#[derive(Debug, Clone)]
 pub(super) struct Connections {
     terms: Arc<Terms>,
     places: Arc<Semaphore>,
@@ -57,7 +64,7 @@ pub(super) struct Connections {
 pub(super) struct Lent {
     /// `None` once it was given back.
     held: Option<Held>,
-    answer: Duration,
+    terms: Arc<Terms>,
     in_transaction: bool,
 }
 
@@ -70,26 +77,27 @@ struct Held {
     _shared: Option<OwnedSemaphorePermit>,
 }
 
-impl fmt::Debug for Connections {
+impl fmt::Debug for Terms {
     /// The URL may hold a password.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Connections").finish_non_exhaustive()
+        f.debug_struct("Terms").field("count", &self.count).finish_non_exhaustive()
     }
 }
 
 impl Connections {
-    /// The first is made now.
-    pub(super) async fn open(terms: Terms) -> Result<Self, Error> {
+    /// None is made yet.
+    pub(super) fn new(terms: Terms) -> Self {
         let places = Arc::new(Semaphore::new(terms.count as usize));
         let shared = Arc::new(Semaphore::new(terms.shared as usize));
-        let connections = Self { terms: Arc::new(terms), places, shared, idle: Arc::default() };
-        connections.lend().await?;
-        Ok(connections)
+        Self { terms: Arc::new(terms), places, shared, idle: Arc::default() }
     }
 
     /// Lends a connection that has just answered.
     pub(super) async fn lend(&self) -> Result<Lent, Error> {
-        let Terms { answer, greeting, wait, .. } = *self.terms;
+        let Terms { greeting, wait, connect, ref state, .. } = *self.terms;
+        if !state.is_open() {
+            return Err(Error::Io(io::Error::new(io::ErrorKind::NotConnected, "the database is not open yet")));
+        }
         let shared = match SHARES_READS.try_with(|()| ()) {
             Ok(()) => Some(timeout(wait, self.shared.clone().acquire_owned()).await.map_err(|_| Error::PoolTimedOut)?),
             Err(_) => None,
@@ -98,14 +106,17 @@ impl Connections {
         let place = timeout(wait, self.places.clone().acquire_owned()).await.map_err(|_| Error::PoolTimedOut)?;
         let place = place.map_err(|_| Error::PoolClosed)?;
         let connection = loop {
-            let Some(mut known) = lock(&self.idle).pop() else { break bounded(wait, self.connect()).await? };
+            let Some(mut known) = lock(&self.idle).pop() else {
+                break bounded(connect, self.connect()).await.inspect_err(|error| state.note(error))?;
+            };
             match bounded(greeting, known.ping()).await {
                 Ok(()) => break known,
-                Err(error) => tracing::warn!(%error, "a connection to the database is given up"),
+                Err(error) => tracing::debug!(%error, "a connection to the database is given up"),
             }
         };
+        state.answers();
         let held = Held { connection, is_sound: true, idle: self.idle.clone(), _place: place, _shared: shared };
-        Ok(Lent { held: Some(held), answer, in_transaction: false })
+        Ok(Lent { held: Some(held), terms: self.terms.clone(), in_transaction: false })
     }
 
     async fn connect(&self) -> Result<AnyConnection, Error> {
@@ -132,7 +143,7 @@ impl Lent {
     /// Where the next statement runs.
     pub(super) fn connection(&mut self) -> Statement<'_> {
         let held = self.held.as_mut().expect("it is given back when it is dropped");
-        Statement { connection: &mut held.connection, is_sound: &mut held.is_sound, answer: self.answer }
+        Statement { connection: &mut held.connection, is_sound: &mut held.is_sound, terms: &self.terms }
     }
 
     pub(super) async fn begin(&mut self) -> Result<(), Error> {
@@ -143,6 +154,7 @@ impl Lent {
     pub(super) async fn commit(mut self) -> Result<(), Error> {
         sqlx::raw_sql("COMMIT").execute(self.connection()).await?;
         self.in_transaction = false;
+        self.terms.state.committed();
         Ok(())
     }
 }
@@ -153,7 +165,7 @@ impl Drop for Lent {
         if !self.in_transaction {
             return held.give_back();
         }
-        let answer = self.answer;
+        let answer = self.terms.answer;
         tokio::spawn(async move {
             if held.is_sound && bounded(answer, sqlx::raw_sql("ROLLBACK").execute(&mut held.connection)).await.is_ok() {
                 held.give_back();
@@ -176,7 +188,15 @@ impl Held {
 pub(super) struct Statement<'c> {
     connection: &'c mut AnyConnection,
     is_sound: &'c mut bool,
-    answer: Duration,
+    terms: &'c Terms,
+}
+
+impl Statement<'_> {
+    /// Takes note of an error. A connection whose database is away is not used again.
+    fn failed(terms: &Terms, is_sound: &mut bool, error: &Error) {
+        terms.state.note(error);
+        *is_sound &= is_refusal(error);
+    }
 }
 
 impl<'c> Executor<'c> for Statement<'c> {
@@ -187,14 +207,14 @@ impl<'c> Executor<'c> for Statement<'c> {
         'c: 'e,
         E: 'q + Execute<'q, Any>,
     {
-        let Self { connection, is_sound, answer } = self;
+        let Self { connection, is_sound, terms } = self;
         let rest = Some((connection.fetch_many(query), is_sound));
         let answers = stream::unfold(rest, move |rest| async move {
             let (mut rows, is_sound) = rest?;
-            match bounded(answer, rows.try_next()).await {
+            match bounded(terms.answer, rows.try_next()).await {
                 Ok(row) => row.map(|row| (Ok(row), Some((rows, is_sound)))),
                 Err(error) => {
-                    *is_sound &= is_refusal(&error);
+                    Self::failed(terms, is_sound, &error);
                     Some((Err(error), None))
                 }
             }
@@ -208,9 +228,8 @@ impl<'c> Executor<'c> for Statement<'c> {
         E: 'q + Execute<'q, Any>,
     {
         Box::pin(async move {
-            let fetched = bounded(self.answer, self.connection.fetch_optional(query)).await;
-            *self.is_sound &= fetched.as_ref().err().is_none_or(is_refusal);
-            fetched
+            let fetched = bounded(self.terms.answer, self.connection.fetch_optional(query)).await;
+            fetched.inspect_err(|error| Self::failed(self.terms, self.is_sound, error))
         })
     }
 
@@ -251,13 +270,13 @@ impl<'c> Executor<'c> for &'c Connections {
     }
 }
 
-/// Whether the connection did its part: the database refused a statement.
+/// Whether the connection did its part: the database refused a statement, and goes on.
 fn is_refusal(error: &Error) -> bool {
-    matches!(error, Error::Database(_))
+    matches!(error, Error::Database(_)) && Fault::of(error) != Some(Fault::Away)
 }
 
 /// What the database answers, if it does in time.
-async fn bounded<T>(time: Duration, answer: impl Future<Output = Result<T, Error>>) -> Result<T, Error> {
+pub(super) async fn bounded<T>(time: Duration, answer: impl Future<Output = Result<T, Error>>) -> Result<T, Error> {
     let silent = |_| Error::Io(io::Error::new(io::ErrorKind::TimedOut, "the database does not answer"));
     timeout(time, answer).await.map_err(silent)?
 }
@@ -311,8 +330,13 @@ mod tests {
             sqlx::any::install_default_drivers();
             let (few, session) = (Duration::from_secs(2), "SET idle_in_transaction_session_timeout = '60s'".to_owned());
             let wait = Duration::from_secs(60);
-            let terms = Terms { url: self.url.clone(), session, count: 1, shared: 1, answer: few, greeting: few, wait };
-            Connections::open(terms).await.expect("opens")
+            let (url, connect, state) = (self.url.clone(), wait, DatabaseState::unknown());
+            state.opened();
+            let (count, shared, answer, greeting) = (1, 1, few, few);
+            let connections =
+                Connections::new(Terms { url, session, count, shared, answer, greeting, connect, wait, state });
+            connections.lend().await.expect("opens");
+            connections
         }
 
         /// All connections that are there now.

@@ -36,5 +36,6 @@ pub(super) async fn run(connection: &mut AnyConnection) -> Result<(), MigrateErr
     let migrations = MIGRATIONS.iter().map(|&(version, name, sql)| {
         Migration::new(version, Cow::Borrowed(name), MigrationType::Simple, sql.into_sql_str(), false)
     });
-    Migrator::with_migrations(migrations.collect()).run(connection).await
+    // `run` itself does not promise a future that other threads may take over.
+    Migrator::with_migrations(migrations.collect()).run_direct(None, connection, false).await
 }

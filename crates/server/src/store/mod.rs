@@ -13,7 +13,9 @@ mod deployments;
 mod earlier;
 mod enrolments;
 mod fan_outs;
+mod fault;
 mod first_use;
+mod integrity;
 mod migrate;
 mod needs;
 mod orders;
@@ -27,11 +29,13 @@ mod robot_blobs;
 mod robot_pages;
 mod robots;
 mod rows;
+mod state;
 mod taking_back;
 mod timelines;
 mod tokens;
 mod users;
 
+use std::fmt;
 use std::fs::File;
 use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::Path;
@@ -48,11 +52,14 @@ pub use assignments::{Released, TaskOrder};
 use audit::everybodys_pace;
 pub use audit::{Act, Deed};
 pub use connections::with_shared_reads;
-use connections::{Connections, Lent, Statement, Terms};
+use connections::{Connections, Lent, Statement, Terms, bounded};
 pub use deliveries::{Decided, DeliveryOrder, RobotFacts};
 pub use deployments::{DeploymentPage, NewDeployment, OpenRobot, OpenRollout};
 pub use earlier::{EarlierPackage, Unsuccessful};
+pub use fault::Fault;
 use first_use::FirstUses;
+pub use integrity::check_at_rest;
+use integrity::{Checked, check_quickly, postgres_guard};
 pub use orders::PastOrder;
 pub use outputs::NewOutput;
 pub use package_use::{Deletion, PackageUsers};
@@ -63,6 +70,7 @@ pub use reports::{OpenAssignment, ReportedRobot};
 pub use robot_blobs::bytes_taken;
 pub use robot_pages::RobotPage;
 pub use robots::{BrokerCredential, DesiredTasks, FetchedBy, KnownRobot, Matching};
+pub use state::DatabaseState;
 pub use taking_back::Revocable;
 pub use timelines::{HistoryPage, HistoryQuery};
 pub use tokens::{Admitted, EnrolmentTerms, TokenHolder};
@@ -81,16 +89,31 @@ const READERS: u32 = 6;
 const SHARED_READERS: u32 = 4;
 /// How long a statement waits for a connection or for another process's write.
 const PATIENCE: Duration = Duration::from_secs(30);
+/// The same for a connection to Postgres: less than a request has, so that who asked is told why there is no answer.
+const POSTGRES_PATIENCE: Duration = Duration::from_secs(20);
+/// How long a connection to a database server may take; who asked has to be told in time that there is none.
+const CONNECT: Duration = Duration::from_secs(5);
+/// Part of a SQLite URL: the file belongs to this process alone, which keeps in memory what it otherwise shares by a file.
+const WITHOUT_SHARED_MEMORY: &str = "vfs=unix-excl";
 
 /// The database. Clones share its connections.
-#[derive(Debug, Clone)]
+#[derive(Clone)]
 pub struct Store {
     reads: Connections,
     writes: Connections,
     access: Access,
     first_uses: FirstUses,
     everybodys: Arc<Pace>,
+    state: DatabaseState,
+    url: Arc<str>,
     is_postgres: bool,
+}
+
+impl fmt::Debug for Store {
+    /// The URL may hold a password.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Store").field("state", &self.state).finish_non_exhaustive()
+    }
 }
 
 /// Which database it is, and how large.
@@ -129,6 +152,26 @@ pub enum StoreError {
         /// The migration that this program does not have.
         version: i64,
     },
+    /// Its pages hold something else than was written.
+    #[error(
+        "database {url} is corrupt ({finding}): stop whatever uses it and put back a copy of the data directory, or save what \
+         can be read with sqlite3's .recover; docs/server.md says how"
+    )]
+    Damaged {
+        /// Which, without its password.
+        url: String,
+        /// The first finding.
+        finding: String,
+    },
+    /// It takes a write to open it, and there is no room.
+    #[error("database {url} can't be opened on a full disk: make at least 16 MB free on its file system")]
+    NoRoom {
+        /// Which, without its password.
+        url: String,
+    },
+    /// It was found corrupt while it was in use.
+    #[error("the database is corrupt, so nothing is changed until it is mended")]
+    Corrupt,
     /// A statement failed.
     #[error("the database refused a statement")]
     Statement(#[from] sqlx::Error),
@@ -158,6 +201,28 @@ impl StoreError {
     /// Whether a unique index refused the row: someone else has the name or the key.
     pub fn is_unique_violation(&self) -> bool {
         matches!(self, Self::Statement(sqlx::Error::Database(error)) if error.is_unique_violation())
+    }
+
+    /// The fault of the database that this shows; `None` if the statement itself is wrong or refused.
+    pub fn fault(&self) -> Option<Fault> {
+        match self {
+            Self::Open { source, .. } | Self::Statement(source) => Fault::of(source),
+            Self::Migrate { source, .. } => Fault::of_migration(source),
+            Self::Together(error) => error.fault(),
+            Self::Damaged { .. } | Self::Corrupt => Some(Fault::Corrupt),
+            Self::NoRoom { .. } => Some(Fault::Full),
+            _ => None,
+        }
+    }
+
+    /// Logs that `what` was not done, unless the change of the database's state that explains it was logged already.
+    pub fn log(&self, what: &'static str) {
+        match self.fault() {
+            Some(Fault::Away | Fault::Corrupt | Fault::Full) => {
+                tracing::debug!(error = self as &dyn std::error::Error, "{what}")
+            }
+            _ => tracing::warn!(error = self as &dyn std::error::Error, "{what}"),
+        }
     }
 }
 
@@ -218,23 +283,92 @@ pub fn sqlite_url(path: &Path) -> String {
 }
 
 impl Store {
-    /// Opens the database at a `sqlite:` or `postgres:` URL and brings its tables up to date.
+    /// Opens the database at a `sqlite:` or `postgres:` URL, looks for damage and brings its tables up to date.
     pub async fn open(url: &str) -> Result<Self, StoreError> {
+        match Self::open_at(url).await {
+            Err(error) if error.fault() == Some(Fault::Full) && !is_postgres(url) => {
+                let separator = if url.contains('?') { '&' } else { '?' };
+                let store = Self::open_at(&format!("{url}{separator}{WITHOUT_SHARED_MEMORY}")).await;
+                let no_room = |error: StoreError| match error.fault() {
+                    Some(Fault::Full) => StoreError::NoRoom { url: without_password(url) },
+                    _ => error,
+                };
+                let store = store.map_err(no_room)?;
+                tracing::warn!(
+                    "the disk is full: what is there can be read; until the next start no other program can open the database"
+                );
+                Ok(store)
+            }
+            opened => opened,
+        }
+    }
+
+    async fn open_at(url: &str) -> Result<Self, StoreError> {
+        let store = Self::unopened(url);
+        store.prepare().await?;
+        Ok(store)
+    }
+
+    /// A database that refuses everything until [`Self::prepare`] has succeeded.
+    pub fn unopened(url: &str) -> Self {
         sqlx::any::install_default_drivers();
-        let open_error = |source| StoreError::Open { url: without_password(url), source };
-        make_file(url);
-        let mut first = first_connection(url).await.map_err(open_error)?;
-        migrate::run(&mut first).await.map_err(|source| match source {
-            MigrateError::VersionMissing(version) => StoreError::Newer { url: without_password(url), version },
-            source => StoreError::Migrate { url: without_password(url), source },
-        })?;
-        first.close().await.map_err(open_error)?;
-        // One writer: its transactions queue for this connection instead of failing each other.
-        let writes = Connections::open(terms(url, 1, 1, WRITER_CACHE)).await.map_err(open_error)?;
-        let reads = Connections::open(terms(url, READERS, SHARED_READERS, READER_CACHE)).await.map_err(open_error)?;
-        let is_postgres = is_postgres(url);
-        let (access, first_uses, everybodys) = (Access::default(), FirstUses::default(), Arc::new(everybodys_pace()));
-        Ok(Self { reads, writes, access, first_uses, everybodys, is_postgres })
+        let state = DatabaseState::unknown();
+        Self {
+            // One writer: its transactions queue for this connection instead of failing each other.
+            writes: Connections::new(terms(url, 1, 1, WRITER_CACHE, &state)),
+            reads: Connections::new(terms(url, READERS, SHARED_READERS, READER_CACHE, &state)),
+            access: Access::default(),
+            first_uses: FirstUses::default(),
+            everybodys: Arc::new(everybodys_pace()),
+            state,
+            url: url.into(),
+            is_postgres: is_postgres(url),
+        }
+    }
+
+    /// Looks for damage and brings the tables up to date, after which the database can be used.
+    pub async fn prepare(&self) -> Result<(), StoreError> {
+        make_file(&self.url);
+        let first = first_connection(&self.url).await.inspect_err(|error| self.state.note(error));
+        let mut first = first.map_err(|error| self.open_error(error))?;
+        let prepared = self.prepare_by(&mut first).await;
+        let closed = first.close().await;
+        prepared?;
+        self.state.opened();
+        for connections in [&self.writes, &self.reads] {
+            connections.lend().await.map_err(|error| self.open_error(error))?;
+        }
+        closed.map_err(|error| self.open_error(error))
+    }
+
+    async fn prepare_by(&self, connection: &mut AnyConnection) -> Result<(), StoreError> {
+        let url = || without_password(&self.url);
+        if self.is_postgres {
+            self.state.guarded(postgres_guard(connection).await);
+        } else {
+            match check_quickly(&self.url).await.map_err(|error| self.open_error(error))? {
+                Checked::Sound => {}
+                Checked::Damaged(finding) => return Err(StoreError::Damaged { url: url(), finding }),
+                Checked::Interrupted => tracing::info!("the database is large: the check goes on while it is served"),
+            }
+        }
+        migrate::run(connection).await.map_err(|source| match source {
+            MigrateError::VersionMissing(version) => StoreError::Newer { url: url(), version },
+            source => StoreError::Migrate { url: url(), source },
+        })
+    }
+
+    fn open_error(&self, source: sqlx::Error) -> StoreError {
+        let url = without_password(&self.url);
+        match Fault::of(&source) {
+            Some(Fault::Corrupt) => StoreError::Damaged { url, finding: source.to_string() },
+            _ => StoreError::Open { url, source },
+        }
+    }
+
+    /// What is known of the database's state.
+    pub fn state(&self) -> &DatabaseState {
+        &self.state
     }
 
     /// Ends all connections, after the writes that are under way.
@@ -269,6 +403,9 @@ impl Store {
 
     /// Begins a write that changes nobody's rights, like what robots report, or that is never committed.
     pub async fn begin_keeping_rights(&self) -> Result<Write, StoreError> {
+        if self.state.corruption().is_some() {
+            return Err(StoreError::Corrupt);
+        }
         let mut lent = self.writes.lend().await?;
         lent.begin().await?;
         let turn: i64 = sqlx::query_scalar("UPDATE write_lock SET turn = turn + 1 WHERE id = 1 RETURNING turn")
@@ -293,10 +430,17 @@ fn make_file(url: &str) {
 
 /// A connection of its own for what takes as long as it takes. It is asked for once, so that what is wrong is said at once.
 async fn first_connection(url: &str) -> Result<AnyConnection, sqlx::Error> {
-    let mut connection = AnyConnection::connect(url).await?;
+    let mut connection = match is_postgres(url) {
+        true => bounded(CONNECT, AnyConnection::connect(url)).await?,
+        false => AnyConnection::connect(url).await?,
+    };
     // SQLite reads its file no sooner.
     let first = if is_postgres(url) { POSTGRES_SESSION } else { SQLITE_SESSION };
-    sqlx::raw_sql(first).execute(&mut connection).await?;
+    if let Err(error) = sqlx::raw_sql(first).execute(&mut connection).await {
+        // Its files are closed before they are opened again in another way.
+        let _ = connection.close().await;
+        return Err(error);
+    }
     Ok(connection)
 }
 
@@ -315,16 +459,18 @@ const POSTGRES_SESSION: &str = "SET idle_in_transaction_session_timeout = '60s';
 const POSTGRES_STATEMENT: &str = "SET statement_timeout = '50s';";
 
 /// The terms of a store's connections.
-fn terms(url: &str, count: u32, shared: u32, cache: &str) -> Terms {
-    let url = url.to_owned();
+fn terms(url: &str, count: u32, shared: u32, cache: &str, state: &DatabaseState) -> Terms {
+    let (url, state) = (url.to_owned(), state.clone());
     if is_postgres(&url) {
         let session = [POSTGRES_SESSION, POSTGRES_STATEMENT].concat();
         let (answer, greeting) = (Duration::from_secs(60), Duration::from_secs(5));
-        return Terms { url, session, count, shared, answer, greeting, wait: PATIENCE };
+        let (connect, wait) = (CONNECT, POSTGRES_PATIENCE);
+        return Terms { url, session, count, shared, answer, greeting, connect, wait, state };
     }
     // A file does not fall silent: it is slow.
     let session = [SQLITE_SESSION, cache].concat();
-    Terms { url, session, count, shared, answer: Duration::MAX, greeting: Duration::MAX, wait: PATIENCE }
+    let forever = Duration::MAX;
+    Terms { url, session, count, shared, answer: forever, greeting: forever, connect: PATIENCE, wait: PATIENCE, state }
 }
 
 /// A URL as it may be shown: `user:password@` and the query, which may hold a password too, cut out.
@@ -360,7 +506,7 @@ mod tests {
         };
         std::fs::write(directory.path().join("torn"), vec![7; 8192]).expect("written");
         let torn = refused("torn").await;
-        assert!(torn.contains("/torn can't be opened") && torn.contains("not a database"), "{torn}");
+        assert!(torn.contains("/torn is corrupt") && torn.contains("not a database"), "{torn}");
         let missing = refused("no/such").await;
         assert!(missing.contains("/no/such can't be opened"), "{missing}");
         let url = sqlite_url(&directory.path().join("newer"));

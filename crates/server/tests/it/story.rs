@@ -475,7 +475,7 @@ async fn a_report_that_can_not_be_stored_is_answered_so(database: TestDatabase) 
     let mut robots = fleet.enroll(1).await;
     fleet.database.store.close().await;
     let refused = fleet.writer.submit(robots[0].next_report(), 0).await;
-    assert!(matches!(refused, Err(ReportError::NotStored)));
+    assert!(matches!(refused, Err(ReportError::NotStored(_))));
 }
 
 async fn a_restored_database_leaves_robots_alone_until_the_next_order(database: TestDatabase) {

@@ -8,13 +8,16 @@ use http::{HeaderValue, StatusCode};
 use serde_json::{Value, json};
 use task_proto::Digest;
 
-use super::super::error::ApiError;
+use super::super::error::{ApiError, DATABASE_CORRUPT};
 use crate::blobs::BlobError;
-use crate::store::StoreError;
+use crate::store::{Fault, StoreError};
 use crate::transfers::NotYet;
 
 /// When it is of use to ask again where something has to be collected first, in seconds.
 const COLLECTION_S: u64 = 300;
+
+/// What the specification has no code for: the database is corrupt.
+const CORRUPT: &str = "DATABASE_CORRUPT";
 
 /// An answer that is not the one hoped for.
 #[derive(Debug)]
@@ -151,8 +154,20 @@ impl From<StoreError> for OciError {
     fn from(error: StoreError) -> Self {
         match error {
             StoreError::RightsEnded => Self::new(StatusCode::UNAUTHORIZED, "UNAUTHORIZED", error.to_string()),
-            _ => Self::internal(&error),
+            _ => error.fault().map_or_else(|| Self::internal(&error), Self::from),
         }
+    }
+}
+
+impl From<Fault> for OciError {
+    fn from(fault: Fault) -> Self {
+        let ApiError { status, message, retry_after_s, .. } = fault.into();
+        let (code, retry_after_s) = match fault {
+            Fault::Corrupt => (CORRUPT, Some(retry_after_s)),
+            Fault::Away | Fault::Busy => ("UNAVAILABLE", Some(retry_after_s)),
+            Fault::Full => ("DENIED", None),
+        };
+        Self { retry_after_s, ..Self::new(status, code, message) }
     }
 }
 
@@ -197,6 +212,8 @@ impl From<OciError> for ApiError {
             StatusCode::INSUFFICIENT_STORAGE => "disk_full",
             StatusCode::TOO_MANY_REQUESTS => "too_many_requests",
             StatusCode::CONFLICT if error.code == "DENIED" => "package_in_use",
+            StatusCode::SERVICE_UNAVAILABLE if error.code == CORRUPT => DATABASE_CORRUPT,
+            StatusCode::SERVICE_UNAVAILABLE => "unavailable",
             StatusCode::INTERNAL_SERVER_ERROR => "internal",
             _ => "invalid_request",
         };

@@ -1,0 +1,131 @@
+//! The database beside the service: opened, waited for where its server is away, and checked in full now and then. It holds no
+//! SQL and serves nobody.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use task_proto::token::Token;
+use tokio::sync::watch;
+use tokio_util::sync::CancellationToken;
+
+use crate::clock::Clock;
+use crate::store::{Fault, Store, StoreError};
+
+/// The first and the longest pause before a database that is away is tried again.
+const PAUSES: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(5)];
+
+/// A database and the token of the first operator, which opens it.
+pub struct Database {
+    store: Store,
+    token: Token,
+    /// The file with the token.
+    token_path: PathBuf,
+    /// The database knows the token.
+    is_registered: bool,
+    clock: Clock,
+    /// Why the database can't be used, once it is known.
+    unusable: watch::Sender<Option<String>>,
+}
+
+impl Database {
+    /// Opens the database at `url`. One that is away is left to [`Self::attend`].
+    pub async fn open(url: &str, token: Token, token_path: PathBuf, clock: Clock) -> Result<Self, StoreError> {
+        let store = match Store::open(url).await {
+            Err(error) if error.fault() == Some(Fault::Away) => {
+                let error = &error as &dyn std::error::Error;
+                tracing::warn!(error, "the database does not answer; the server waits for it");
+                Store::unopened(url)
+            }
+            opened => opened?,
+        };
+        let unusable = watch::Sender::default();
+        let mut database = Self { store, token, token_path, is_registered: false, clock, unusable };
+        match database.register_operator().await {
+            Err(error) if error.fault() == Some(Fault::Away) => {}
+            registered => registered?,
+        }
+        Ok(database)
+    }
+
+    /// The database.
+    pub fn store(&self) -> &Store {
+        &self.store
+    }
+
+    /// Becomes the reason when the database was waited for and then can't be used.
+    pub fn unusable(&self) -> watch::Receiver<Option<String>> {
+        self.unusable.subscribe()
+    }
+
+    /// Waits for the database whenever it is away, until `stop`.
+    pub async fn attend(mut self, stop: CancellationToken) {
+        tokio::select! {
+            () = stop.cancelled() => {}
+            () = self.wait_whenever_away() => {}
+        }
+    }
+
+    async fn wait_whenever_away(&mut self) {
+        let [first, longest] = PAUSES;
+        loop {
+            let mut pause = first;
+            while !self.store.state().is_there() || !self.is_registered {
+                tokio::time::sleep(pause).await;
+                pause = longest.min(pause * 2);
+                let Err(error) = self.bring_up().await else { continue };
+                if !matches!(error.fault(), Some(Fault::Away | Fault::Busy)) {
+                    let error = anyhow::Error::new(error);
+                    self.unusable.send_replace(Some(format!("{error:#}")));
+                    return;
+                }
+            }
+            self.store.state().away().await;
+        }
+    }
+
+    /// Asks the database whether it is there; does what is to be done once, if that was not done yet.
+    async fn bring_up(&mut self) -> Result<(), StoreError> {
+        if !self.store.state().is_open() {
+            self.store.prepare().await?;
+        }
+        if !self.is_registered {
+            return self.register_operator().await;
+        }
+        // Whatever else it answers, it is there.
+        match self.store.ping().await {
+            Err(error) if error.fault() == Some(Fault::Away) => Err(error),
+            _ => Ok(()),
+        }
+    }
+
+    /// Makes sure that the token in the directory opens this database, which may be new or restored.
+    async fn register_operator(&mut self) -> Result<(), StoreError> {
+        let now_ms = self.clock.now_ms();
+        if self.store.token_holder(&self.token, now_ms).await?.is_none() {
+            match self.store.create_operator_token(&self.token, now_ms).await {
+                Err(error) if error.is_unique_violation() => {
+                    tracing::warn!("the token in {} was revoked and stays so", self.token_path.display());
+                }
+                created => created?,
+            }
+        }
+        self.is_registered = true;
+        Ok(())
+    }
+}
+
+/// Checks the database in full at once and then at this interval, until `stop`.
+pub async fn keep_checked(store: Store, clock: Clock, interval: Duration, stop: CancellationToken) {
+    let mut ticks = tokio::time::interval(interval);
+    ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    loop {
+        tokio::select! {
+            () = stop.cancelled() => return,
+            _ = ticks.tick() => {}
+        }
+        // Ends soon after `stop`.
+        if let Err(error) = store.check(clock.now_ms(), stop.clone()).await {
+            error.log("the database could not be checked");
+        }
+    }
+}

@@ -12,10 +12,13 @@ mod intake;
 mod offered;
 mod part_map;
 mod pushed;
+mod repair;
+mod verified;
 
 use std::collections::{HashMap, HashSet};
 use std::fs;
 use std::io;
+use std::ops::Range;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, Weak};
 use std::time::Duration;
@@ -242,16 +245,7 @@ impl Fetcher {
         let content = package.content;
         pushed::hand_over(&self.data, content)
             .map_err(|source| FetchError::disk(&self.data.blob_parts(&content.digest), source))?;
-        let resumed = self.present(package)? > 0;
-        let result = self.pull_content(package, manifest, progress, cancel, turn.clone()).await;
-        let result = match result {
-            // Perhaps only what a power cut left of the `.part` was wrong.
-            Err(FetchError::DigestMismatch { .. }) if resumed => {
-                self.discard(package)?;
-                self.pull_content(package, manifest, progress, cancel, turn).await
-            }
-            result => result,
-        };
+        let result = self.pull_until_verified(package, manifest, progress, cancel, turn).await;
         match &result {
             Ok(()) => {
                 self.offered.forget(&content.digest);
@@ -298,21 +292,6 @@ impl Fetcher {
         }
         let pulled = cancel.run_until_cancelled(self.pull_whole(repository, blob)).await;
         pulled.ok_or(FetchError::Cancelled)?
-    }
-
-    async fn pull_whole(&self, repository: &RepositoryName, blob: BlobRef) -> Result<Vec<u8>, FetchError> {
-        let request = self.request(repository, blob)?;
-        let mut download = Download::start(request, repository, blob, 0, self.settings().stall_timeout).await?;
-        let mut bytes = Vec::with_capacity(blob.size as usize);
-        while let Some(chunk) = download.next().await? {
-            bytes.extend_from_slice(&chunk);
-        }
-        let found = Digest::of(&bytes);
-        if found != blob.digest {
-            let reason = format!("they hash to {found}");
-            return Err(FetchError::DigestMismatch { digest: blob.digest, reason });
-        }
-        Ok(bytes)
     }
 
     async fn pull_content(
@@ -420,10 +399,38 @@ impl Fetcher {
     }
 
     async fn download_content(&self, package: &PackageRef, offset: u64) -> Result<Download, FetchError> {
-        let repository = RepositoryName::of_package(&package.name);
+        let range = offset..package.content.size;
+        self.download_range(&RepositoryName::of_package(&package.name), package.content, range).await
+    }
+
+    /// Asks for a range of a blob, over a connection of its own.
+    async fn download_range(
+        &self,
+        repository: &RepositoryName,
+        blob: BlobRef,
+        range: Range<u64>,
+    ) -> Result<Download, FetchError> {
         // Nothing is asked for after it.
-        let request = self.request(&repository, package.content)?.header(CONNECTION, "close");
-        Download::start(request, &repository, package.content, offset, self.settings().stall_timeout).await
+        let request = || Ok(self.request(repository, blob)?.header(CONNECTION, "close"));
+        self.start(request, repository, blob, range).await
+    }
+
+    /// Sends a request. That a blob is not to be had ends an order, and is believed once it was said twice: a byte that
+    /// flips on its way to the server makes the digest another one.
+    async fn start(
+        &self,
+        request: impl Fn() -> Result<reqwest::RequestBuilder, FetchError>,
+        repository: &RepositoryName,
+        blob: BlobRef,
+        range: Range<u64>,
+    ) -> Result<Download, FetchError> {
+        let stall_timeout = self.settings().stall_timeout;
+        match Download::start(request()?, repository, blob, range.clone(), stall_timeout).await {
+            Err(FetchError::Unavailable { .. }) => {
+                Download::start(request()?, repository, blob, range, stall_timeout).await
+            }
+            answer => answer,
+        }
     }
 
     fn request(&self, repository: &RepositoryName, blob: BlobRef) -> Result<reqwest::RequestBuilder, FetchError> {

@@ -110,6 +110,12 @@ pub enum OutputError {
         /// What it said.
         text: String,
     },
+    /// The server keeps receiving other bytes than were sent.
+    #[error("the server receives other bytes than are sent: {text}")]
+    Garbled {
+        /// What it said.
+        text: String,
+    },
     /// The order was taken back.
     #[error("it was interrupted")]
     Cancelled,
@@ -121,7 +127,7 @@ impl OutputError {
         match self {
             Self::Unreachable(_) | Self::Note { .. } | Self::Cancelled => Some(Duration::ZERO),
             // What can't be read now may be readable once a file system is back.
-            Self::Read { .. } | Self::User(_) => Some(Duration::from_secs(30)),
+            Self::Read { .. } | Self::User(_) | Self::Garbled { .. } => Some(Duration::from_secs(30)),
             Self::Busy { retry_after, .. } => Some(retry_after.unwrap_or_default()),
             // A robot that is enrolled anew, or replaces its token, is known again.
             Self::NotTheServer { .. } | Self::Refused { status: 401, .. } => Some(Duration::from_secs(30)),

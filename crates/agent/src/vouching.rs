@@ -171,7 +171,7 @@ impl Vouching {
             let bytes = match self.fetcher.small(&repository, blob, MAX_LIST_BYTES, cancel).await {
                 Ok(bytes) => bytes,
                 Err(error) => {
-                    if !error.is_retryable() {
+                    if !error.is_retryable() || matches!(error, FetchError::DigestMismatch { .. }) {
                         let text = format!("the list of publishers {} can't be had: {}", blob.digest, chain(&error));
                         if self.told().refused.replace(text.clone()) != Some(text) {
                             self.epoch.fetch_add(1, Ordering::AcqRel);

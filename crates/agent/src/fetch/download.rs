@@ -1,9 +1,9 @@
-//! One HTTP answer with a blob's bytes: asks from an offset, judges what answered, and yields no more than the blob's
-//! size. It never touches the disk.
+//! One HTTP answer with a blob's bytes: asks for a range, judges what answered, and yields no more than that. It never touches the disk.
 //!
 //! There is no If-Range: the URL names the bytes by their digest, so they can't change between two requests, and a
 //! cache in between with entity tags of its own would only make every resumption start over.
 
+use std::ops::Range;
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -28,7 +28,8 @@ pub(crate) const MAX_RETRY_AFTER: Duration = Duration::from_secs(3600);
 /// An answer that is being read.
 pub(super) struct Download {
     response: reqwest::Response,
-    size: u64,
+    /// Where the last byte asked for ends.
+    end: u64,
     /// Where the next byte handed out lies in the blob.
     position: u64,
     /// Bytes at the answer's start that are there already: the server did not honour the range.
@@ -42,22 +43,24 @@ pub(super) struct Download {
 }
 
 impl Download {
-    /// Asks for `blob` from `offset` on, which is less than its size unless both are 0.
+    /// Asks for a range of `blob`, which is empty only if the blob is.
     pub(super) async fn start(
         request: reqwest::RequestBuilder,
         repository: &RepositoryName,
         blob: BlobRef,
-        offset: u64,
+        range: Range<u64>,
         stall_timeout: Duration,
     ) -> Result<Self, FetchError> {
         let mut request = request.timeout(REQUEST_TIMEOUT);
-        if offset > 0 {
-            request = request.header(RANGE, format!("bytes={offset}-"));
+        if range.end < blob.size {
+            request = request.header(RANGE, format!("bytes={}-{}", range.start, range.end.saturating_sub(1)));
+        } else if range.start > 0 {
+            request = request.header(RANGE, format!("bytes={}-", range.start));
         }
         let asked_at = Instant::now();
         let answer = tokio::time::timeout(stall_timeout, request.send()).await;
         let mut response = answer.map_err(|_| FetchError::Stalled(stall_timeout))?.map_err(FetchError::Unreachable)?;
-        let skip = match judge(&response, repository, blob, offset) {
+        let skip = match judge(&response, repository, blob, &range) {
             Err(FetchError::Unavailable { .. }) if !has_registrys_words(&mut response, stall_timeout).await => {
                 let status = response.status().as_u16();
                 return Err(FetchError::NotTheServer(format!("status {status} without a registry's error")));
@@ -66,8 +69,8 @@ impl Download {
         };
         Ok(Self {
             response,
-            size: blob.size,
-            position: offset,
+            end: range.end,
+            position: range.start,
             skip,
             stall_timeout,
             waited: Duration::ZERO,
@@ -86,7 +89,7 @@ impl Download {
         self.asked_at
     }
 
-    /// Sends all that comes to `sender`, until the whole blob has passed or nobody takes it any more.
+    /// Sends all that comes to `sender`, until all that was asked for has passed or nobody takes it any more.
     pub(super) async fn pass_on(&mut self, sender: &mpsc::Sender<Bytes>) -> Result<(), FetchError> {
         while let Some(chunk) = self.next().await? {
             if sender.send(chunk).await.is_err() {
@@ -96,15 +99,27 @@ impl Download {
         Ok(())
     }
 
-    /// The next bytes; `None` when the whole blob has been handed out, whatever the server would still send.
+    /// The next `length` bytes, which are held in memory.
+    pub(super) async fn collect(mut self, length: u64) -> Result<Vec<u8>, FetchError> {
+        let mut bytes = Vec::with_capacity(length as usize);
+        while (bytes.len() as u64) < length
+            && let Some(chunk) = self.next().await?
+        {
+            let missing = length as usize - bytes.len();
+            bytes.extend_from_slice(&chunk[..missing.min(chunk.len())]);
+        }
+        Ok(bytes)
+    }
+
+    /// The next bytes; `None` when all that was asked for has been handed out, whatever the server would still send.
     pub(super) async fn next(&mut self) -> Result<Option<Bytes>, FetchError> {
-        while self.position < self.size {
+        while self.position < self.end {
             let began = Instant::now();
             let left = self.stall_timeout.saturating_sub(self.waited);
             let chunk = tokio::time::timeout(left, self.response.chunk()).await;
             let chunk = chunk.map_err(|_| FetchError::Stalled(self.stall_timeout))?;
             let Some(mut chunk) = chunk.map_err(FetchError::Unreachable)? else {
-                return Err(FetchError::Interrupted { received: self.position, size: self.size });
+                return Err(FetchError::Interrupted { received: self.position, size: self.end });
             };
             self.waited += began.elapsed();
             self.progressed += chunk.len() as u64;
@@ -114,7 +129,7 @@ impl Download {
             let skipped = self.skip.min(chunk.len() as u64);
             self.skip -= skipped;
             let _ = chunk.split_to(skipped as usize);
-            chunk.truncate((self.size - self.position).min(chunk.len() as u64) as usize);
+            chunk.truncate((self.end - self.position).min(chunk.len() as u64) as usize);
             self.position += chunk.len() as u64;
             if !chunk.is_empty() {
                 return Ok(Some(chunk));
@@ -129,8 +144,9 @@ fn judge(
     response: &reqwest::Response,
     repository: &RepositoryName,
     blob: BlobRef,
-    offset: u64,
+    range: &Range<u64>,
 ) -> Result<u64, FetchError> {
+    let (offset, is_range) = (range.start, range.start > 0 || range.end < blob.size);
     let (status, headers) = (response.status(), response.headers());
     // A captive portal may answer with any status.
     if header(headers, &CONTENT_TYPE)
@@ -138,13 +154,13 @@ fn judge(
     {
         return Err(FetchError::NotTheServer(format!("an HTML page with status {}", status.as_u16())));
     }
-    let start = match status {
-        StatusCode::OK => 0,
-        StatusCode::PARTIAL_CONTENT if offset > 0 => match content_range(headers) {
-            Some((start, total)) if start == offset && total.is_none_or(|total| total == blob.size) => offset,
+    let offered = match status {
+        StatusCode::OK => 0..blob.size,
+        StatusCode::PARTIAL_CONTENT if is_range => match content_range(headers) {
+            Some((start, total)) if start == offset && total.is_none_or(|total| total == blob.size) => range.clone(),
             _ => return Err(other_bytes(blob, "its Content-Range is not the one asked for".to_owned())),
         },
-        StatusCode::RANGE_NOT_SATISFIABLE if offset > 0 => {
+        StatusCode::RANGE_NOT_SATISFIABLE if is_range => {
             return Err(other_bytes(blob, format!("it has none from byte {offset} on")));
         }
         StatusCode::UNAUTHORIZED => return Err(FetchError::Unauthorized),
@@ -167,11 +183,11 @@ fn judge(
         }
         _ => {}
     }
-    if let Some(length) = response.content_length().filter(|&length| length != blob.size - start) {
-        let reason = format!("{length} bytes are offered from byte {start} on, {} were ordered", blob.size);
+    if let Some(length) = response.content_length().filter(|&length| length != offered.end - offered.start) {
+        let reason = format!("{length} bytes are offered from byte {} on, {} were ordered", offered.start, blob.size);
         return Err(other_bytes(blob, reason));
     }
-    Ok(offset - start)
+    Ok(offset - offered.start)
 }
 
 /// Whether a refusal is the server's own. A proxy in front of one that restarts refuses as well, and passes.

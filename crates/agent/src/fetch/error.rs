@@ -10,6 +10,9 @@ use task_proto::{Digest, RepositoryName};
 
 use crate::disk::{self, DiskFull, Need};
 
+/// How long a server is left alone whose bytes stay others than the ordered ones.
+const OTHER_BYTES_PAUSE: Duration = Duration::from_secs(60);
+
 /// Why a pull did not end with the package in its place.
 #[derive(Debug, thiserror::Error)]
 pub enum FetchError {
@@ -64,7 +67,7 @@ pub enum FetchError {
         /// What is possible.
         most: u64,
     },
-    /// The bytes are not the ordered ones.
+    /// The bytes are not the ordered ones, also when they were fetched again.
     #[error("the server's bytes for {digest} are others: {reason}")]
     DigestMismatch {
         /// The ordered digest.
@@ -114,12 +117,20 @@ impl FetchError {
     /// Whether the same pull may succeed later without anyone's doing.
     pub fn is_retryable(&self) -> bool {
         self.is_cut()
-            || matches!(self, Self::NotTheServer(_) | Self::Busy { .. } | Self::Unauthorized | Self::DiskFull(_))
+            || matches!(
+                self,
+                Self::NotTheServer(_)
+                    | Self::Busy { .. }
+                    | Self::Unauthorized
+                    | Self::DigestMismatch { .. }
+                    | Self::DiskFull(_)
+            )
     }
 
     /// Whether what was gathered is to go: it is of no use, or takes up the room that is missing.
     pub(super) fn spoils_gathered(&self) -> bool {
-        matches!(self, Self::DiskFull(_)) || !self.is_retryable() && !matches!(self, Self::Cancelled)
+        matches!(self, Self::DiskFull(_) | Self::DigestMismatch { .. })
+            || !self.is_retryable() && !matches!(self, Self::Cancelled)
     }
 
     /// How long the server wants this robot to stay away, if all that is wrong is that it has no room for it now.
@@ -134,6 +145,7 @@ impl FetchError {
     pub fn retry_after(&self) -> Option<Duration> {
         match self {
             Self::Busy { retry_after, .. } => *retry_after,
+            Self::DigestMismatch { .. } => Some(OTHER_BYTES_PAUSE),
             Self::DiskFull(_) => Some(disk::FULL_PAUSE),
             _ => None,
         }
@@ -142,6 +154,21 @@ impl FetchError {
     /// Whether it is the connection that failed, and not an answer.
     pub(super) fn is_cut(&self) -> bool {
         matches!(self, Self::Unreachable(_) | Self::Interrupted { .. } | Self::Stalled(_))
+    }
+
+    pub(super) fn other_bytes(digest: Digest, found: Digest) -> Self {
+        Self::DigestMismatch { digest, reason: format!("they hash to {found}") }
+    }
+
+    /// A mismatch that is left after all that heals one on the way says so: what the server has is damaged.
+    pub(super) fn confirmed(self) -> Self {
+        match self {
+            Self::DigestMismatch { digest, reason } => {
+                let reason = format!("{reason}, also when fetched again; the server's copy is damaged");
+                Self::DigestMismatch { digest, reason }
+            }
+            other => other,
+        }
     }
 
     pub(crate) fn disk(path: &Path, source: io::Error) -> Self {

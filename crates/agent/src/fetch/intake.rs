@@ -64,10 +64,8 @@ impl Intake {
         let (part, staging) = (self.part.clone(), self.staging.clone());
         let result = self.unpack(facts).and_then(|()| place(&staging, src));
         let cleaned = match &result {
-            // The bytes have done their work, or are worth nothing.
-            Ok(()) | Err(FetchError::DigestMismatch { .. } | FetchError::ArchiveRefused(_)) => {
-                durable::remove_file(&part)
-            }
+            // The bytes have done their work, or are worth nothing. Those with another digest may be mended.
+            Ok(()) | Err(FetchError::ArchiveRefused(_)) => durable::remove_file(&part),
             Err(_) => Ok(()),
         };
         if let Err(error) = cleaned.and_then(|()| durable::remove_dir_all(&staging)) {
@@ -96,7 +94,7 @@ impl Intake {
         }
         let found = Digest::from_sha256(bytes.hasher.finalize().into());
         if found != blob.digest {
-            return Err(FetchError::DigestMismatch { digest: blob.digest, reason: format!("they hash to {found}") });
+            return Err(FetchError::other_bytes(blob.digest, found));
         }
         match unpacked {
             Ok(()) => Ok(()),

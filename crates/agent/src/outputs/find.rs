@@ -118,7 +118,7 @@ where
 }
 
 /// The digest of a file as long as it was when it was found: something may still write to it, without end.
-fn hash(root: &Directory, path: &Path, found: u64) -> io::Result<BlobRef> {
+pub(super) fn hash(root: &Directory, path: &Path, found: u64) -> io::Result<BlobRef> {
     let mut file = root.file(path)?.take(found);
     let (mut hash, mut size) = (Sha256::new(), 0);
     let mut buffer = vec![0; 256 * 1024];

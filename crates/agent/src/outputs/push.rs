@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use bytes::Bytes;
 use http::header::{CONTENT_RANGE, CONTENT_TYPE, LOCATION, RANGE, RETRY_AFTER};
 use reqwest::{Method, RequestBuilder, Response, StatusCode, Url};
 use task_proto::Digest;
@@ -16,7 +17,7 @@ use task_proto::output::OutputSet;
 use task_proto::report::Progress;
 use tokio::sync::{Semaphore, watch};
 
-use super::{OutputError, OutputOrder};
+use super::{OutputError, OutputOrder, find};
 use crate::credential::Credential;
 use crate::fetch::MAX_RETRY_AFTER;
 use crate::foreign_file::Directory;
@@ -31,8 +32,12 @@ const FILES_MISSING: &str = "MANIFEST_BLOB_UNKNOWN";
 const OTHER_BYTES: &str = "DIGEST_INVALID";
 /// How long one request may take.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(180);
-/// How often an upload that the server has forgotten is begun again in one go.
+/// How often an upload is begun again in one go that the server has forgotten, or received as other bytes.
 const MAX_BEGINNINGS: u32 = 3;
+/// How often a request whose body the server received as other bytes is sent again in one go.
+const MAX_SENT_AGAIN: u32 = 3;
+/// The registry's words for a manifest that can't be read: ours can.
+const OTHER_MANIFEST: &str = "MANIFEST_INVALID";
 
 /// The server's registry, as this robot may use it.
 #[derive(Clone)]
@@ -65,6 +70,29 @@ impl Registry {
     async fn store(&self, what: &str, digest: Digest, request: RequestBuilder) -> Result<(), OutputError> {
         let response = self.send(what, request).await?;
         if is_of(&response, digest) { Ok(()) } else { Err(not_the_server(&response)) }
+    }
+
+    /// The same for bytes that are held in memory and known to be those of the digest: where the server received others,
+    /// they are sent again.
+    async fn store_exactly(
+        &self,
+        what: &str,
+        digest: Digest,
+        request: impl Fn() -> RequestBuilder,
+    ) -> Result<(), OutputError> {
+        let mut again = 0;
+        loop {
+            match self.store(what, digest, request()).await {
+                Err(OutputError::Refused { code, text, .. }) if code == OTHER_BYTES || code == OTHER_MANIFEST => {
+                    if again == MAX_SENT_AGAIN {
+                        return Err(OutputError::Garbled { text });
+                    }
+                    again += 1;
+                    tracing::warn!(what, text, again, "the server received other bytes; they are sent again");
+                }
+                stored => return stored,
+            }
+        }
     }
 
     /// Sends what begins or goes on with an upload; gives its answer and where it goes on.
@@ -115,13 +143,15 @@ pub(super) async fn push(
     };
     let config = serde_json::to_vec(output).map_err(|error| note_error(&order.notes, error.into()))?;
     let config_ref = BlobRef { digest: Digest::of(&config), size: config.len() as u64 };
-    push.small(config_ref.digest, config).await?;
+    push.small(config_ref.digest, config.into()).await?;
     let manifest =
         serde_json::to_vec(&output.manifest(config_ref)).map_err(|error| note_error(&order.notes, error.into()))?;
     let list = async || {
-        let put = registry.request(Method::PUT, &format!("/v2/{repository}/manifests/{tag}"));
-        let put = put.header(CONTENT_TYPE, MANIFEST_TYPE).body(manifest.clone());
-        registry.store("the output", Digest::of(&manifest), put).await
+        let put = || {
+            let put = registry.request(Method::PUT, &format!("/v2/{repository}/manifests/{tag}"));
+            put.header(CONTENT_TYPE, MANIFEST_TYPE).body(manifest.clone())
+        };
+        registry.store_exactly("the output", Digest::of(&manifest), put).await
     };
     // What the server would not list need not travel.
     match list().await {
@@ -161,31 +191,55 @@ impl Push<'_> {
         let mut beginnings = 0;
         loop {
             let sent = match blob.size <= CHUNK_BYTES {
-                true => self.small(blob.digest, read_part(self.order, path, 0, blob.size).await?).await,
+                true => {
+                    let bytes = read_part(self.order, path, 0, blob.size).await?;
+                    if Digest::of(&bytes) != blob.digest {
+                        return Err(self.changed(path));
+                    }
+                    self.small(blob.digest, bytes.into()).await
+                }
                 false => self.large(path, blob).await,
             };
+            let is_first = beginnings < MAX_BEGINNINGS;
             match sent {
                 // The server has collected the upload, or took a chunk whose answer was lost.
-                Err(OutputError::Refused { status: 404 | 416, .. }) if beginnings < MAX_BEGINNINGS => {
-                    beginnings += 1;
+                Err(OutputError::Refused { status: 404 | 416, .. }) if is_first => self.note(blob.digest, None)?,
+                Err(OutputError::Refused { code, text, .. }) if code == OTHER_BYTES => {
                     self.note(blob.digest, None)?;
-                }
-                // A task that runs again writes where it wrote before.
-                Err(OutputError::Refused { code, .. }) if code == OTHER_BYTES => {
-                    self.note(blob.digest, None)?;
-                    let source = std::io::Error::other("it was changed while it was sent");
-                    return Err(OutputError::Read { path: self.order.directory.join(path), source });
+                    // A task that runs again writes where it wrote before. Otherwise the way there is at fault.
+                    if !self.is_unchanged(path, blob).await? {
+                        return Err(self.changed(path));
+                    }
+                    if !is_first {
+                        return Err(OutputError::Garbled { text });
+                    }
                 }
                 done => return done,
             }
+            beginnings += 1;
         }
     }
 
     /// Pushes what fits into one request.
-    async fn small(&self, digest: Digest, bytes: Vec<u8>) -> Result<(), OutputError> {
-        let post = self.registry.request(Method::POST, &format!("{}/blobs/uploads/?digest={digest}", self.base));
-        let post = post.header(CONTENT_TYPE, "application/octet-stream").body(bytes);
-        self.registry.store("a file", digest, post).await
+    async fn small(&self, digest: Digest, bytes: Bytes) -> Result<(), OutputError> {
+        let post = || {
+            let post = self.registry.request(Method::POST, &format!("{}/blobs/uploads/?digest={digest}", self.base));
+            post.header(CONTENT_TYPE, "application/octet-stream").body(bytes.clone())
+        };
+        self.registry.store_exactly("a file", digest, post).await
+    }
+
+    async fn is_unchanged(&self, path: &str, blob: BlobRef) -> Result<bool, OutputError> {
+        let (root, file, size) = (self.order.directory.clone(), PathBuf::from(path), blob.size);
+        let hash = move || find::hash(&Directory::open(&root)?, &file, size);
+        let hashed = task_user::do_as(self.order.user.as_ref(), hash).await.map_err(OutputError::User)?;
+        let hashed = hashed.map_err(|source| OutputError::Read { path: self.order.directory.join(path), source })?;
+        Ok(hashed == blob)
+    }
+
+    fn changed(&self, path: &str) -> OutputError {
+        let source = std::io::Error::other("it was changed while it was sent");
+        OutputError::Read { path: self.order.directory.join(path), source }
     }
 
     async fn large(&mut self, path: &str, blob: BlobRef) -> Result<(), OutputError> {

@@ -1,6 +1,7 @@
 //! Pulls against a real HTTP server that misbehaves in every way a network or a server can.
 
 use std::fs;
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use axum::body::Bytes;
@@ -13,6 +14,7 @@ use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 use crate::archive::{Tar, compress, noise, tar};
+use crate::flips::Fault;
 use crate::site::{Answer, Site, TOKEN, client, settings};
 
 #[tokio::test]
@@ -155,13 +157,81 @@ async fn wrong_bytes_are_never_used_nor_kept() {
     let size = tar().compressed().len() as u64;
     for answer in [Answer::OtherBytes, Answer::Endless, Answer::Length(size - 1), Answer::Length(size + 1)] {
         let site = Site::new(&tar()).await;
-        site.answers([answer.clone()]);
+        site.answers(vec![answer.clone(); 200]);
         let error = site.pull().await.unwrap_err();
         assert!(matches!(error, FetchError::DigestMismatch { .. }), "{answer:?}: {error:?}");
-        assert_eq!((error.code(), error.is_retryable()), (Some(FailureCode::DIGEST_MISMATCH), false));
+        assert_eq!((error.code(), error.is_retryable()), (Some(FailureCode::DIGEST_MISMATCH), true));
+        assert_eq!(error.retry_after(), Some(Duration::from_secs(60)));
+        assert!(error.to_string().ends_with("the server's copy is damaged"), "{error}");
         assert!(!site.part().exists() && !site.version().src().exists());
         site.assert_nothing_staged();
     }
+}
+
+#[tokio::test]
+async fn content_heals_whose_first_transfer_has_a_flipped_byte() {
+    let mut site = Site::new(&tar()).await;
+    let flipped = site.behind_flips(|connection| (connection == 0).then_some(1 << 20)).await;
+    site.pull().await.unwrap();
+    site.assert_in_place();
+    assert_eq!((flipped.load(Ordering::Relaxed), site.asked()), (1, vec![0, 0]));
+}
+
+#[tokio::test]
+async fn content_heals_where_every_long_transfer_has_a_flipped_byte() {
+    // Once at another place each time, once always at the same.
+    for fault in [|connection| Some(600_000 + 1013 * connection), |_| Some(600_000)] as [Fault; 2] {
+        let mut site = Site::new(&tar()).await;
+        let flipped = site.behind_flips(fault).await;
+        site.pull().await.unwrap();
+        site.assert_in_place();
+        assert_eq!(flipped.load(Ordering::Relaxed), 3, "each transfer of the whole, and none of a range");
+    }
+}
+
+#[tokio::test]
+async fn content_heals_where_ranges_have_flipped_bytes_as_well() {
+    let mut site = Site::new(&tar()).await;
+    let flipped = site.behind_flips(|_| Some(100_000)).await;
+    site.pull().await.unwrap();
+    site.assert_in_place();
+    assert!(flipped.load(Ordering::Relaxed) > 20);
+}
+
+#[tokio::test]
+async fn content_whose_pushed_bytes_are_wrong_is_pulled() {
+    let site = Site::new(&tar()).await;
+    let mut parts = site.content.clone();
+    parts[100] ^= 1;
+    site.put_part(&parts);
+    site.pull().await.unwrap();
+    site.assert_in_place();
+    assert_eq!(site.asked(), [0]);
+}
+
+#[tokio::test]
+async fn manifest_heals_whose_first_transfers_have_a_flipped_byte() {
+    let cancel = CancellationToken::new();
+    let first_two: Fault = |connection| (connection < 2).then_some(10);
+    let mut site = Site::new(&tar()).await;
+    let flipped = site.behind_flips(first_two).await;
+    let manifest = site.fetcher.manifest(&site.package, &cancel).await.unwrap();
+    assert_eq!(manifest, site.manifest);
+    assert!(flipped.load(Ordering::Relaxed) > 0);
+
+    let site = Site::new(&tar()).await;
+    site.answers(vec![Answer::OtherBytes; 100]);
+    let error = site.fetcher.manifest(&site.package, &cancel).await.unwrap_err();
+    assert_eq!((error.code(), error.is_retryable()), (Some(FailureCode::DIGEST_MISMATCH), true), "{error}");
+    assert!(!site.version().manifest().exists());
+}
+
+#[tokio::test]
+async fn blob_that_is_said_once_not_to_be_there_is_asked_for_again() {
+    let site = Site::new(&tar()).await;
+    site.answers([Answer::Refused(404)]);
+    site.pull().await.unwrap();
+    assert_eq!(site.asked(), [0, 0]);
 }
 
 #[tokio::test]
@@ -203,7 +273,7 @@ async fn statuses_say_whether_to_come_back() {
     }
     for status in [403, 404, 410] {
         let site = Site::new(&tar()).await;
-        site.answers([Answer::Refused(status)]);
+        site.answers(vec![Answer::Refused(status); 2]);
         let error = site.pull().await.unwrap_err();
         assert_eq!((error.code(), error.is_retryable()), (Some(FailureCode::PACKAGE_UNAVAILABLE), false), "{status}");
     }

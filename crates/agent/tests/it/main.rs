@@ -8,6 +8,7 @@ mod build;
 mod contain;
 mod doctor;
 mod fetch;
+mod flips;
 mod gate;
 mod graph;
 mod harness;

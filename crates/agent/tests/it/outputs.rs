@@ -2,6 +2,8 @@
 //! tests of the whole.
 
 use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
 use axum::Router;
 use axum::body::{Body, to_bytes};
@@ -81,6 +83,44 @@ async fn what_is_not_the_server_takes_no_files_and_loses_none() {
             let error = left.bring_to(Router::new().fallback(portal)).await.unwrap_err();
             assert!(matches!(error, OutputError::NotTheServer { .. }), "{status} {kind}: {error:?}");
             assert!(error.retry_after().is_some(), "{error}");
+        }
+    }
+}
+
+#[tokio::test]
+async fn file_that_arrives_as_other_bytes_is_sent_again_while_it_is_unchanged() {
+    for (faults, is_brought) in [(2, true), (1000, false)] {
+        let left = Left::new();
+        let (faults, listed) = (Arc::new(AtomicU32::new(faults)), Arc::<AtomicU32>::default());
+        let garbles = move || faults.fetch_update(Relaxed, Relaxed, |left| left.checked_sub(1)).is_ok();
+        // A registry that has nothing, and receives another byte in the first bodies.
+        let registry = move |request: Request| {
+            let (garbles, listed) = (garbles.clone(), listed.clone());
+            async move {
+                let (method, path) = (request.method().clone(), request.uri().to_string());
+                let mut body = to_bytes(request.into_body(), 1 << 20).await.unwrap().to_vec();
+                if !body.is_empty() && garbles() {
+                    body[0] ^= 0x10;
+                }
+                let created = || answer(201, &[("docker-content-digest", Digest::of(&body).to_string())], "");
+                match method {
+                    Method::POST if path.ends_with(&format!("?digest={}", Digest::of(&body))) => created(),
+                    Method::POST => refusal(400, "DIGEST_INVALID"),
+                    Method::PUT if serde_json::from_slice::<serde_json::Value>(&body).is_err() => {
+                        refusal(400, "MANIFEST_INVALID")
+                    }
+                    Method::PUT if listed.fetch_add(1, Relaxed) > 0 => created(),
+                    _ => refusal(404, "MANIFEST_BLOB_UNKNOWN"),
+                }
+            }
+        };
+        let brought = left.bring_to(Router::new().fallback(registry)).await;
+        match brought {
+            Ok(count) => assert_eq!((count, is_brought), (1, true)),
+            Err(error) => {
+                assert!(!is_brought && matches!(error, OutputError::Garbled { .. }), "{error:?}");
+                assert!(error.retry_after().is_some(), "{error}");
+            }
         }
     }
 }

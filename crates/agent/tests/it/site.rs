@@ -2,6 +2,7 @@
 
 use std::fs;
 use std::path::PathBuf;
+use std::sync::atomic::AtomicU64;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -21,6 +22,7 @@ use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 use crate::archive::{Tar, noise};
+use crate::flips::{self, Fault};
 
 const CHUNK_BYTES: usize = 64 * 1024;
 /// A refusal in a registry's words.
@@ -117,6 +119,15 @@ impl Site {
         self.fetcher = Fetcher::new(client(), self.server.clone(), TOKEN.to_owned(), self.data.clone(), settings);
     }
 
+    /// Pulls by way of a proxy that flips bytes; gives how many it has.
+    pub async fn behind_flips(&mut self, fault: Fault) -> Arc<AtomicU64> {
+        let server = self.server.socket_addrs(|| None).unwrap()[0];
+        let (proxy, flipped) = flips::proxy(server, fault).await;
+        self.server = format!("http://{proxy}/").parse().unwrap();
+        self.restart(settings());
+        flipped
+    }
+
     pub fn answers(&self, answers: impl IntoIterator<Item = Answer>) {
         self.script.lock().unwrap().answers = answers.into_iter().collect();
     }
@@ -181,9 +192,11 @@ async fn answer(
     headers: HeaderMap,
 ) -> Response<Body> {
     assert_eq!((name.as_str(), headers["authorization"].to_str().unwrap()), ("plain", "Bearer the robot's token"));
-    let offset: usize = headers.get("range").map_or(0, |range| {
-        range.to_str().unwrap().strip_prefix("bytes=").unwrap().strip_suffix('-').unwrap().parse().unwrap()
+    let range = headers.get("range").map(|range| {
+        let (first, last) = range.to_str().unwrap().strip_prefix("bytes=").unwrap().split_once('-').unwrap();
+        (first.parse::<usize>().unwrap(), last.parse::<usize>().ok())
     });
+    let (offset, last) = range.unwrap_or_default();
     let (blob, answer) = {
         let mut script = script.lock().unwrap();
         script.asked.push(offset as u64);
@@ -194,11 +207,12 @@ async fn answer(
     let total = blob.len();
     let start = if matches!(answer, Answer::IgnoreRange) { 0 } else { offset };
     let mut response = Response::builder().header("docker-content-digest", &digest);
-    if start > 0 {
-        let range = format!("bytes {start}-{}/{total}", total - 1);
+    let end = last.filter(|_| !matches!(answer, Answer::IgnoreRange)).map_or(total, |last| last + 1);
+    if start > 0 || end < total {
+        let range = format!("bytes {start}-{}/{total}", end - 1);
         response = response.status(StatusCode::PARTIAL_CONTENT).header("content-range", range);
     }
-    let bytes = blob[start..].to_vec();
+    let bytes = blob[start..end].to_vec();
     let length = bytes.len();
     let exact = |response: axum::http::response::Builder| response.header("content-length", length);
     match answer {

@@ -54,6 +54,7 @@ pub(super) fn outputs_code(error: &OutputError) -> FailureCode {
         OutputError::Unreachable(_) | OutputError::NotTheServer { .. } | OutputError::Busy { .. } => {
             FailureCode::SERVER_UNREACHABLE
         }
+        OutputError::Garbled { .. } => FailureCode::DIGEST_MISMATCH,
         OutputError::Read { .. } | OutputError::User(_) | OutputError::Note { .. } => FailureCode::IO_ERROR,
         OutputError::Cancelled => FailureCode::INTERRUPTED,
         OutputError::Pattern { .. } | OutputError::TooMuch(_) | OutputError::Refused { .. } => {

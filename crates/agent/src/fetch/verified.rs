@@ -1,0 +1,85 @@
+//! Pulls until the bytes have the ordered digest: a way that flips a byte is a fault of the network like a cut, and TCP does
+//! not notice all of them. Other bytes are pulled again as a whole, a few times, and then mended range by range. What is
+//! wrong even then is the server's fault, and said so.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use task_proto::desired::{BlobRef, PackageRef};
+use task_proto::manifest::TaskManifest;
+use task_proto::report::Progress;
+use task_proto::{Digest, RepositoryName};
+use tokio::sync::{OwnedMutexGuard, watch};
+use tokio_util::sync::CancellationToken;
+
+use super::{FetchError, Fetcher};
+
+/// How often bytes with another digest are fetched again as a whole. After that ranges of them are compared.
+const MAX_WHOLE_AGAIN: u32 = 2;
+
+impl Fetcher {
+    /// Pulls a content. A `.part` that a power cut spoiled, or parts that were pushed and are wrong, are pulled again as well.
+    pub(super) async fn pull_until_verified(
+        &self,
+        package: &PackageRef,
+        manifest: &TaskManifest,
+        progress: &watch::Sender<Progress>,
+        cancel: &CancellationToken,
+        turn: Arc<OwnedMutexGuard<()>>,
+    ) -> Result<(), FetchError> {
+        for again in 1..=MAX_WHOLE_AGAIN {
+            match self.pull_content(package, manifest, progress, cancel, turn.clone()).await {
+                Err(FetchError::DigestMismatch { reason, .. }) => {
+                    tracing::warn!(package = %package.name, reason, again, "other bytes came; they are pulled again");
+                }
+                ended => return ended,
+            }
+            self.discard(package)?;
+            cancel
+                .run_until_cancelled(tokio::time::sleep(self.pause_before(again)))
+                .await
+                .ok_or(FetchError::Cancelled)?;
+        }
+        match self.pull_content(package, manifest, progress, cancel, turn.clone()).await {
+            Err(FetchError::DigestMismatch { .. }) if self.present(package)? == package.content.size => {}
+            ended => return ended.map_err(FetchError::confirmed),
+        }
+        tracing::warn!(package = %package.name, "other bytes came again; ranges of them are compared");
+        let repaired = cancel.run_until_cancelled(self.repair_content(package)).await;
+        repaired.ok_or(FetchError::Cancelled)??;
+        self.pull_content(package, manifest, progress, cancel, turn).await.map_err(FetchError::confirmed)
+    }
+
+    /// Pulls a blob that is held in memory, again when the bytes have another digest, as for a content.
+    pub(super) async fn pull_whole(&self, repository: &RepositoryName, blob: BlobRef) -> Result<Vec<u8>, FetchError> {
+        let mut again = 0;
+        loop {
+            let is_last = again == MAX_WHOLE_AGAIN;
+            let error = match self.pull_once(repository, blob).await {
+                Ok(bytes) if Digest::of(&bytes) == blob.digest => return Ok(bytes),
+                Ok(bytes) if is_last => {
+                    let bytes = self.repaired(repository, blob, bytes).await.map_err(FetchError::confirmed)?;
+                    let found = Digest::of(&bytes);
+                    let is_repaired = found == blob.digest;
+                    return is_repaired.then_some(bytes).ok_or(FetchError::other_bytes(blob.digest, found).confirmed());
+                }
+                Ok(bytes) => FetchError::other_bytes(blob.digest, Digest::of(&bytes)),
+                Err(error @ FetchError::DigestMismatch { .. }) if !is_last => error,
+                Err(error) => return Err(error.confirmed()),
+            };
+            again += 1;
+            tracing::warn!(digest = %blob.digest, %error, again, "other bytes came; they are pulled again");
+            tokio::time::sleep(self.pause_before(again)).await;
+        }
+    }
+
+    async fn pull_once(&self, repository: &RepositoryName, blob: BlobRef) -> Result<Vec<u8>, FetchError> {
+        let request = || self.request(repository, blob);
+        let download = self.start(request, repository, blob, 0..blob.size).await?;
+        download.collect(blob.size).await
+    }
+
+    fn pause_before(&self, again: u32) -> Duration {
+        self.settings().reconnect_wait.mul_f64(rand::random::<f64>() * f64::from(again))
+    }
+}

@@ -56,6 +56,8 @@ pub struct Speaker {
     pub server_key: PublicKey,
     /// This start of the agent.
     pub instance: InstanceId,
+    /// Where it runs.
+    pub place: Option<Digest>,
     /// The kernel's boot id.
     pub boot_id: String,
     /// The name the robot gives itself.

@@ -37,6 +37,7 @@ pub mod orders;
 pub mod outputs;
 pub mod parts;
 pub mod permanent_address;
+pub mod place;
 pub mod plan;
 pub mod process;
 pub mod readiness;

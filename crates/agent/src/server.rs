@@ -8,11 +8,13 @@ use reqwest::{Method, StatusCode, Url};
 use rustls::ClientConfig;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
-use task_proto::RobotId;
-use task_proto::api::{EnrollRequest, EnrollResponse, ErrorBody, MqttEndpoint, ReportReply, RobotToken};
+use task_proto::api::{
+    EnrollRequest, EnrollResponse, ErrorBody, INSTANCE_HEADER, MqttEndpoint, PLACE_HEADER, ReportReply, RobotToken,
+};
 use task_proto::envelope::Envelope;
 use task_proto::report::Report;
 use task_proto::vitals::Telemetry;
+use task_proto::{Digest, InstanceId, RobotId};
 
 use crate::credential::Credential;
 
@@ -63,6 +65,8 @@ pub struct Server {
     base: Url,
     robot: RobotId,
     token: Credential,
+    /// What every request says of the agent that makes it.
+    said: HeaderMap,
 }
 
 /// A desired state as the server sent it.
@@ -93,14 +97,26 @@ pub async fn enroll(
     token: &str,
     request: &EnrollRequest,
 ) -> Result<EnrollResponse, ServerError> {
-    let answer = send(client, Method::POST, at(base, "enroll"), token, Some(request), None).await?;
+    let answer = send(client, Method::POST, at(base, "enroll"), token, Some(request), HeaderMap::new()).await?;
     parse(&answer.body)
 }
 
 impl Server {
     /// The server at `base`, for the robot with this token.
     pub fn new(client: reqwest::Client, base: Url, robot: RobotId, token: impl Into<Credential>) -> Self {
-        Self { client, base, robot, token: token.into() }
+        Self { client, base, robot, token: token.into(), said: HeaderMap::new() }
+    }
+
+    /// The same, as the agent `instance` that runs at `place`: to another one the server gives nothing for a while.
+    pub fn speaking_as(mut self, instance: &InstanceId, place: Option<Digest>) -> Self {
+        let said =
+            [(INSTANCE_HEADER, Some(instance.to_string())), (PLACE_HEADER, place.map(|place| place.to_string()))];
+        for (name, value) in said {
+            if let Some(value) = value.and_then(|value| HeaderValue::try_from(value).ok()) {
+                self.said.insert(name, value);
+            }
+        }
+        self
     }
 
     /// The same with another token.
@@ -155,9 +171,11 @@ impl Server {
         known: Option<&HeaderValue>,
     ) -> Result<Answer, ServerError> {
         let token = self.token.current();
-        match send(&self.client, method.clone(), url.clone(), &token, body, known).await {
+        let mut headers = self.said.clone();
+        headers.extend(known.map(|tag| (IF_NONE_MATCH, tag.clone())));
+        match send(&self.client, method.clone(), url.clone(), &token, body, headers.clone()).await {
             Err(ServerError::TokenRefused(_)) if self.token.current() != token => {
-                send(&self.client, method, url, &self.token.current(), body, known).await
+                send(&self.client, method, url, &self.token.current(), body, headers).await
             }
             answer => answer,
         }
@@ -182,14 +200,11 @@ async fn send<B: Serialize>(
     url: Url,
     token: &str,
     body: Option<&B>,
-    known: Option<&HeaderValue>,
+    headers: HeaderMap,
 ) -> Result<Answer, ServerError> {
-    let mut request = client.request(method, url).bearer_auth(token);
+    let mut request = client.request(method, url).bearer_auth(token).headers(headers);
     if let Some(body) = body {
         request = request.json(body);
-    }
-    if let Some(tag) = known {
-        request = request.header(IF_NONE_MATCH, tag);
     }
     let mut response = request.send().await.map_err(ServerError::Unreachable)?;
     let (status, headers) = (response.status(), response.headers().clone());

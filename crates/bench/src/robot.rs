@@ -161,7 +161,13 @@ impl Robot {
     }
 
     fn status(&self, online: bool) -> Vec<u8> {
-        json_bytes(&Status { online, start: 1, instance: self.instance.clone(), connection: self.connection })
+        json_bytes(&Status {
+            online,
+            start: 1,
+            instance: self.instance.clone(),
+            connection: self.connection,
+            place: None,
+        })
     }
 
     fn snapshot(&self, phase: Phase) -> Report {
@@ -178,6 +184,7 @@ impl Robot {
             robot_id: self.identity.enrolled.robot_id.clone(),
             start: 1,
             instance: self.instance.clone(),
+            place: None,
             boot_id: "00000000-0000-0000-0000-000000000000".to_owned(),
             seq: self.seq,
             observed_generation: self.order.as_ref().map_or(Generation(0), |(generation, _)| *generation),

@@ -123,6 +123,7 @@ async fn assemble(crew: &Crew, tls: ClientConfig, number: usize, member: &Member
         robot_id: enrolled.robot_id.clone(),
         server_key: crew.key.clone(),
         instance: instance.clone(),
+        place: None,
         boot_id: BOOT_ID.to_owned(),
         name: None,
         labels: None,
@@ -135,7 +136,7 @@ async fn assemble(crew: &Crew, tls: ClientConfig, number: usize, member: &Member
         ..HostFacts::default()
     };
     let ledger = Ledger::new(0);
-    let status = Status { online: true, start: ledger.start + 1, instance, connection: 0 };
+    let status = Status { online: true, start: ledger.start + 1, instance, connection: 0, place: None };
     let driver = Driver::new(Arc::new(Body::new(robot, facts)), speaker, shared.clone(), ledger, None).await;
     let server = server::Server::new(client, base.clone(), enrolled.robot_id.clone(), credential.clone());
     shared.endpoint.send_replace(Some(enrolled.mqtt.clone()));

@@ -54,6 +54,10 @@ use crate::{DeploymentId, Digest, Generation, MacAddress, RobotId, RobotName, Ta
 
 /// Where the API begins.
 pub const BASE: &str = "/api/v1";
+/// The header by which an agent names its instance, as in its reports.
+pub const INSTANCE_HEADER: &str = "taskd-instance";
+/// The header by which an agent says where it runs, as in its reports.
+pub const PLACE_HEADER: &str = "taskd-place";
 /// Request header that makes an order safe to retry: the same key gives the same deployment. 1 to 128 visible characters.
 pub const IDEMPOTENCY_KEY: &str = "idempotency-key";
 

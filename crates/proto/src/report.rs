@@ -28,6 +28,10 @@ pub struct Report {
     pub start: u64,
     /// This start of the agent. Two instances alive at once are a cloned identity.
     pub instance: InstanceId,
+    /// Where this start runs: one data directory, during one boot of one machine. Of two starts in the same place the
+    /// second has begun after the first had ended. Absent: an agent that is too old to say.
+    #[serde(default, skip_serializing_if = "Option::is_none", deserialize_with = "tolerant")]
+    pub place: Option<Digest>,
     /// The kernel's boot id.
     pub boot_id: String,
     /// Counts this instance's reports from 1.
@@ -507,6 +511,9 @@ pub struct Status {
     pub instance: InstanceId,
     /// Counts this instance's connections from 1; a status with a lower one is out of date.
     pub connection: u64,
+    /// Where it runs, as in [`Report::place`].
+    #[serde(default, skip_serializing_if = "Option::is_none", deserialize_with = "tolerant")]
+    pub place: Option<Digest>,
 }
 
 #[cfg(test)]

@@ -2,6 +2,7 @@
 //! SQL and serves nobody.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Duration;
 
 use task_proto::token::Token;
@@ -9,19 +10,28 @@ use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 use crate::clock::Clock;
-use crate::store::{Fault, Store, StoreError};
+use crate::presence::{Claim, Presence};
+use crate::store::{Fault, ReportedBy, Store, StoreError};
 
 /// The first and the longest pause before a database that is away is tried again.
 const PAUSES: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(5)];
 
-/// A database and the token of the first operator, which opens it.
+/// The first operator, whose token every server has.
+pub struct FirstOperator {
+    /// The token.
+    pub token: Token,
+    /// The file with the token.
+    pub path: PathBuf,
+}
+
+/// A database, and the steps between its opening and its first use.
 pub struct Database {
     store: Store,
-    token: Token,
-    /// The file with the token.
-    token_path: PathBuf,
-    /// The database knows the token.
-    is_registered: bool,
+    operator: FirstOperator,
+    /// Learns from the database which agent each robot had last.
+    presence: Arc<Presence>,
+    /// The database knows the first operator, and the presence the agents.
+    is_ready: bool,
     clock: Clock,
     /// Why the database can't be used, once it is known.
     unusable: watch::Sender<Option<String>>,
@@ -29,7 +39,12 @@ pub struct Database {
 
 impl Database {
     /// Opens the database at `url`. One that is away is left to [`Self::attend`].
-    pub async fn open(url: &str, token: Token, token_path: PathBuf, clock: Clock) -> Result<Self, StoreError> {
+    pub async fn open(
+        url: &str,
+        operator: FirstOperator,
+        presence: Arc<Presence>,
+        clock: Clock,
+    ) -> Result<Self, StoreError> {
         let store = match Store::open(url).await {
             Err(error) if error.fault() == Some(Fault::Away) => {
                 let error = &error as &dyn std::error::Error;
@@ -39,10 +54,10 @@ impl Database {
             opened => opened?,
         };
         let unusable = watch::Sender::default();
-        let mut database = Self { store, token, token_path, is_registered: false, clock, unusable };
-        match database.register_operator().await {
+        let mut database = Self { store, operator, presence, is_ready: false, clock, unusable };
+        match database.make_ready().await {
             Err(error) if error.fault() == Some(Fault::Away) => {}
-            registered => registered?,
+            made => made?,
         }
         Ok(database)
     }
@@ -69,7 +84,7 @@ impl Database {
         let [first, longest] = PAUSES;
         loop {
             let mut pause = first;
-            while !self.store.state().is_there() || !self.is_registered {
+            while !self.store.state().is_there() || !self.is_ready {
                 tokio::time::sleep(pause).await;
                 pause = longest.min(pause * 2);
                 let Err(error) = self.bring_up().await else { continue };
@@ -88,8 +103,8 @@ impl Database {
         if !self.store.state().is_open() {
             self.store.prepare().await?;
         }
-        if !self.is_registered {
-            return self.register_operator().await;
+        if !self.is_ready {
+            return self.make_ready().await;
         }
         // Whatever else it answers, it is there.
         match self.store.ping().await {
@@ -98,19 +113,30 @@ impl Database {
         }
     }
 
-    /// Makes sure that the token in the directory opens this database, which may be new or restored.
-    async fn register_operator(&mut self) -> Result<(), StoreError> {
+    /// Does, once, the steps that precede the first use.
+    async fn make_ready(&mut self) -> Result<(), StoreError> {
+        self.register_operator().await?;
         let now_ms = self.clock.now_ms();
-        if self.store.token_holder(&self.token, now_ms).await?.is_none() {
-            match self.store.create_operator_token(&self.token, now_ms).await {
-                Err(error) if error.is_unique_violation() => {
-                    tracing::warn!("the token in {} was revoked and stays so", self.token_path.display());
-                }
-                created => created?,
-            }
+        for (robot, ReportedBy { instance, place }) in self.store.last_agents().await? {
+            self.presence.remember(&robot, Claim { instance, place }, now_ms);
         }
-        self.is_registered = true;
+        self.is_ready = true;
         Ok(())
+    }
+
+    /// Makes sure that the token in the directory opens this database, which may be new or restored.
+    async fn register_operator(&self) -> Result<(), StoreError> {
+        let (now_ms, FirstOperator { token, path }) = (self.clock.now_ms(), &self.operator);
+        if self.store.token_holder(token, now_ms).await?.is_some() {
+            return Ok(());
+        }
+        match self.store.create_operator_token(token, now_ms).await {
+            Err(error) if error.is_unique_violation() => {
+                tracing::warn!("the token in {} was revoked and stays so", path.display());
+                Ok(())
+            }
+            created => created,
+        }
     }
 }
 

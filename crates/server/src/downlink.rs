@@ -98,7 +98,8 @@ impl Downlink {
     }
 
     fn is_to_be_told(&self, robot: &RobotId) -> bool {
-        self.broker.may_reach(robot) && !self.presence.is_duplicate(robot, self.clock.now_ms())
+        let is_known = self.presence.may_be_told(robot) || self.broker.is_external();
+        self.broker.may_reach(robot) && is_known && !self.presence.is_duplicate(robot, self.clock.now_ms())
     }
 
     async fn ring(&self, robots: &[RobotId], riders: &mut Riders) {
@@ -118,7 +119,14 @@ impl Downlink {
             for blob in &desired.along {
                 self.fetch(blob, riders).await;
             }
-            match payload(&desired, riders) {
+            let payload = match self.presence.may_be_told(&robot) {
+                true => payload(&desired, riders),
+                // Who is there at another broker is found out by ringing; over HTTP it has to say so to get more.
+                false if self.broker.is_external() => notice(&desired),
+                // Another agent has come meanwhile, and has not said yet which it is.
+                false => continue,
+            };
+            match payload {
                 // It may have left meanwhile.
                 Ok(payload) => drop(self.broker.ring(&robot, payload)),
                 Err(error) => tracing::error!(%robot, %error, "a desired state could not be written"),
@@ -151,6 +159,10 @@ fn payload(desired: &Desired, riders: &Riders) -> Result<Bytes, serde_json::Erro
             serde_json::to_vec(&doorbell(inline)).map(Bytes::from)
         };
     }
+    notice(desired)
+}
+
+fn notice(desired: &Desired) -> Result<Bytes, serde_json::Error> {
     serde_json::to_vec(&Doorbell::Notice { generation: desired.generation }).map(Bytes::from)
 }
 

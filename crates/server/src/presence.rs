@@ -5,10 +5,15 @@ use std::collections::{HashMap, VecDeque};
 use std::net::SocketAddr;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use task_proto::{InstanceId, RobotId};
+use task_proto::{Digest, InstanceId, RobotId};
 
 /// Within this time two returns of a displaced instance mean a duplicate, and after this much quiet it is over.
 pub const DUPLICATE_WINDOW_MS: u64 = 10 * 60 * 1000;
+/// For so long the start of an agent that has its robot's work must not have been heard before another one gets it. An MQTT
+/// session without a sign of life ends by then, and an agent without one polls more often.
+pub const HANDOVER_SILENCE_MS: u64 = 30 * 1000;
+/// For so long it is shown that another start has come and waits.
+const WAITING_SHOWN_MS: u64 = 60 * 1000;
 /// Robots remembered at most; beyond it whoever was silent for longest is forgotten.
 const MAX_ROBOTS: usize = 100_000;
 /// Changes of instance remembered for each robot.
@@ -37,15 +42,43 @@ pub struct Sighting {
     pub last_seen_ms: u64,
     /// Two instances of it keep displacing each other.
     pub duplicate: bool,
+    /// Another instance has come lately, and waits for the one that is known to fall silent.
+    pub waits: bool,
 }
 
+/// What an agent says of itself.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Claim {
+    /// Its start.
+    pub instance: InstanceId,
+    /// Where it runs; an older agent does not say.
+    pub place: Option<Digest>,
+}
+
+/// What follows from what an agent said of itself.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Standing {
+    /// Whether it has its robot's work; otherwise it waits.
+    pub is_served: bool,
+    /// Whether that begins now, or begins to be known of its session: it is to be told of its state.
+    pub is_news: bool,
+}
+
+#[derive(Default)]
 struct Sightings {
     address: Option<SocketAddr>,
     connection: Option<Connection>,
-    last_seen_ms: u64,
+    /// `None`: it is only remembered.
+    last_seen_ms: Option<u64>,
     /// When it was last heard over HTTP. The end of a connection takes it back: who hangs up is away until it asks.
     polled_ms: Option<u64>,
     instances: InstanceHistory,
+    /// The instance that has the robot's work, and when it was last heard.
+    served: Option<(Claim, u64)>,
+    /// Which instance has the MQTT session, once it has said so.
+    speaker: Option<InstanceId>,
+    /// When another instance was told last to wait.
+    waited_ms: Option<u64>,
 }
 
 #[derive(Clone, Copy)]
@@ -65,6 +98,7 @@ impl Presence {
         let mut robots = self.robots();
         let sightings = heard(&mut robots, robot, address, now_ms);
         if sightings.connection.is_none_or(|known| known.number < connection) {
+            sightings.session_ended(now_ms);
             sightings.connection = Some(Connection { number: connection, since_ms: now_ms });
             sightings.address = address.or(sightings.address);
         }
@@ -75,9 +109,10 @@ impl Presence {
         if let Some(sightings) = self.robots().get_mut(robot)
             && sightings.connection.is_some_and(|known| known.number == connection)
         {
+            sightings.session_ended(now_ms);
             sightings.connection = None;
             sightings.polled_ms = None;
-            sightings.last_seen_ms = sightings.last_seen_ms.max(now_ms);
+            sightings.last_seen_ms = sightings.last_seen_ms.max(Some(now_ms));
         }
     }
 
@@ -86,28 +121,56 @@ impl Presence {
         heard(&mut self.robots(), robot, Some(address), now_ms).polled_ms = Some(now_ms);
     }
 
-    /// The robot named its instance. Returns whether it is a duplicate identity now.
-    pub fn instance_seen(
+    /// The robot's agent said which it is, in the MQTT session number `connection` if in any. Another one than that which
+    /// has the robot's work waits for that one's end, or for its silence.
+    pub fn claimed(
         &self,
         robot: &RobotId,
         address: Option<SocketAddr>,
-        instance: &InstanceId,
+        connection: Option<u64>,
+        claim: Claim,
         now_ms: u64,
-    ) -> bool {
+    ) -> Standing {
         let mut robots = self.robots();
         let sightings = heard(&mut robots, robot, address, now_ms);
-        sightings.instances.observe(instance, now_ms);
-        sightings.instances.is_duplicate(now_ms)
+        sightings.instances.observe(&claim.instance, now_ms);
+        let is_its_session = connection.is_some() && connection == sightings.connection.map(|known| known.number);
+        let is_first_word = is_its_session && sightings.speaker.as_ref() != Some(&claim.instance);
+        if is_its_session {
+            sightings.speaker = Some(claim.instance.clone());
+        }
+        if !sightings.gives_way_to(&claim, now_ms) {
+            sightings.waited_ms = Some(now_ms);
+            return Standing { is_served: false, is_news: false };
+        }
+        let is_known = sightings.served.as_ref().is_some_and(|(served, _)| served.instance == claim.instance);
+        sightings.served = Some((claim, now_ms));
+        Standing { is_served: true, is_news: is_first_word || !is_known }
     }
 
-    /// The start of its agent that was heard last.
+    /// An agent that was heard before this process was started, and may be heard again.
+    pub fn remember(&self, robot: &RobotId, claim: Claim, now_ms: u64) {
+        entry(&mut self.robots(), robot).served.get_or_insert((claim, now_ms));
+    }
+
+    /// Whether what asks in the robot's name has to say which agent it is: its agent does.
+    pub fn takes_a_claim(&self, robot: &RobotId) -> bool {
+        self.robots().get(robot).is_some_and(Sightings::takes_a_claim)
+    }
+
+    /// Whether the robot's MQTT session is that of the agent which has its work, as far as its agents say.
+    pub fn may_be_told(&self, robot: &RobotId) -> bool {
+        self.robots().get(robot).is_none_or(|sightings| !sightings.takes_a_claim() || sightings.has_session())
+    }
+
+    /// The start of its agent that has its work.
     pub fn instance(&self, robot: &RobotId) -> Option<InstanceId> {
-        self.robots().get(robot)?.instances.changes.back().map(|last| last.instance.clone())
+        self.robots().get(robot)?.served.as_ref().map(|(served, _)| served.instance.clone())
     }
 
     /// What is known of the robot; `None` if it was not seen by this process.
     pub fn get(&self, robot: &RobotId, now_ms: u64) -> Option<Sighting> {
-        self.robots().get(robot).map(|sightings| sightings.view(self.window_ms, now_ms))
+        self.robots().get(robot)?.view(self.window_ms, now_ms)
     }
 
     /// Whether the robot is online.
@@ -154,6 +217,7 @@ impl Presence {
     pub fn ended_others(&self, robot: &RobotId) {
         if let Some(sightings) = self.robots().get_mut(robot) {
             sightings.instances = InstanceHistory::default();
+            (sightings.served, sightings.speaker, sightings.waited_ms) = (None, None, None);
         }
     }
 
@@ -174,28 +238,26 @@ fn heard<'a>(
     address: Option<SocketAddr>,
     now_ms: u64,
 ) -> &'a mut Sightings {
-    if robots.len() >= MAX_ROBOTS && !robots.contains_key(robot) {
-        make_room(robots);
-    }
-    let sightings = robots.entry(robot.clone()).or_insert_with(|| Sightings {
-        address,
-        connection: None,
-        last_seen_ms: now_ms,
-        polled_ms: None,
-        instances: InstanceHistory::default(),
-    });
+    let sightings = entry(robots, robot);
     let is_elsewhere = address.map(|address| address.ip()) != sightings.address.map(|address| address.ip());
     // While there is a session its port is the robot's: each HTTP request may have another one.
     if address.is_some() && (sightings.connection.is_none() || is_elsewhere) {
         sightings.address = address;
     }
-    sightings.last_seen_ms = sightings.last_seen_ms.max(now_ms);
+    sightings.last_seen_ms = sightings.last_seen_ms.max(Some(now_ms));
     sightings
+}
+
+fn entry<'a>(robots: &'a mut HashMap<RobotId, Sightings>, robot: &RobotId) -> &'a mut Sightings {
+    if robots.len() >= MAX_ROBOTS && !robots.contains_key(robot) {
+        make_room(robots);
+    }
+    robots.entry(robot.clone()).or_default()
 }
 
 /// Forgets the sixteenth that was silent for longest, so that the next scan is far off.
 fn make_room(robots: &mut HashMap<RobotId, Sightings>) {
-    let mut silent: Vec<(bool, u64, RobotId)> = robots
+    let mut silent: Vec<(bool, Option<u64>, RobotId)> = robots
         .iter()
         .map(|(robot, sightings)| (sightings.connection.is_some(), sightings.last_seen_ms, robot.clone()))
         .collect();
@@ -206,16 +268,47 @@ fn make_room(robots: &mut HashMap<RobotId, Sightings>) {
 }
 
 impl Sightings {
-    fn view(&self, window_ms: u64, now_ms: u64) -> Sighting {
-        Sighting {
+    /// Whether the robot's work is this agent's. That is so for the agent that has it, for one that could only begin after
+    /// that one had ended, and once that one was silent for long. An older agent does not say where it runs, so that a
+    /// restart of it can't be told from a copy: the next one follows at once, as it always did.
+    fn gives_way_to(&self, claim: &Claim, now_ms: u64) -> bool {
+        let Some((served, heard_ms)) = &self.served else { return true };
+        let Some(place) = served.place else { return true };
+        let is_silent = !self.has_session() && now_ms.saturating_sub(*heard_ms) >= HANDOVER_SILENCE_MS;
+        served.instance == claim.instance || claim.place == Some(place) || is_silent
+    }
+
+    fn takes_a_claim(&self) -> bool {
+        self.served.as_ref().is_some_and(|(served, _)| served.place.is_some())
+    }
+
+    /// Whether the agent that has the robot's work has its session as well.
+    fn has_session(&self) -> bool {
+        let speaks = |(served, _): &(Claim, u64)| self.speaker.as_ref() == Some(&served.instance);
+        self.connection.is_some() && self.served.as_ref().is_some_and(speaks)
+    }
+
+    /// Whoever had the session was there until now.
+    fn session_ended(&mut self, now_ms: u64) {
+        if self.has_session()
+            && let Some((_, heard_ms)) = &mut self.served
+        {
+            *heard_ms = now_ms;
+        }
+        self.speaker = None;
+    }
+
+    fn view(&self, window_ms: u64, now_ms: u64) -> Option<Sighting> {
+        Some(Sighting {
             online: self.connection.is_some()
                 || self.polled_ms.is_some_and(|polled_ms| now_ms.saturating_sub(polled_ms) < window_ms),
             address: self.address,
             connected_since_ms: self.connection.map(|connection| connection.since_ms),
             connection: self.connection.map(|connection| connection.number),
-            last_seen_ms: self.last_seen_ms,
+            last_seen_ms: self.last_seen_ms?,
             duplicate: self.instances.is_duplicate(now_ms),
-        }
+            waits: self.waited_ms.is_some_and(|at_ms| now_ms.saturating_sub(at_ms) < WAITING_SHOWN_MS),
+        })
     }
 }
 
@@ -361,11 +454,91 @@ mod tests {
         let presence = Presence::new(1000, 0);
         let (robot, a, b) = (RobotId::random(), InstanceId::random(), InstanceId::random());
         for instance in [&a, &b, &a, &b] {
-            presence.instance_seen(&robot, None, instance, 1);
+            presence.claimed(&robot, None, None, Claim { instance: instance.clone(), place: None }, 1);
         }
         assert!(presence.is_duplicate(&robot, 2));
         presence.ended_others(&robot);
-        assert!(!presence.instance_seen(&robot, None, &InstanceId::random(), 2));
+        presence.claimed(&robot, None, None, claim(1), 2);
+        assert!(!presence.is_duplicate(&robot, 2));
+    }
+
+    /// A new start in this place.
+    fn claim(place: u8) -> Claim {
+        Claim { instance: InstanceId::random(), place: Some(Digest::of(&[place])) }
+    }
+
+    #[test]
+    fn another_instance_waits_until_the_one_that_is_served_was_silent() {
+        let (presence, robot, original, copy) = (Presence::new(1000, 0), RobotId::random(), claim(1), claim(2));
+        let polls = |claim: &Claim, now_ms| presence.claimed(&robot, None, None, claim.clone(), now_ms);
+        assert!(!presence.takes_a_claim(&robot), "nothing is known of it");
+        let first = polls(&original, 0);
+        assert!(first.is_served && first.is_news && presence.takes_a_claim(&robot));
+        assert!(!polls(&original, 5).is_news);
+        assert!(!polls(&copy, 10).is_served);
+        assert_eq!(presence.instance(&robot).as_ref(), Some(&original.instance));
+        assert!(presence.get(&robot, 10).expect("seen").waits);
+        assert!(!polls(&copy, 4 + HANDOVER_SILENCE_MS).is_served);
+        assert!(polls(&original, 4 + HANDOVER_SILENCE_MS).is_served, "it was only away");
+        assert!(!polls(&copy, 5 + HANDOVER_SILENCE_MS).is_served);
+        let silent_ms = 4 + 2 * HANDOVER_SILENCE_MS;
+        assert!(polls(&copy, silent_ms).is_news, "as a robot that was started again");
+        assert!(!polls(&original, silent_ms + 1).is_served);
+    }
+
+    #[test]
+    fn restart_in_the_same_place_is_served_at_once() {
+        let (presence, robot) = (Presence::new(1000, 0), RobotId::random());
+        for now_ms in 0..5 {
+            assert!(presence.claimed(&robot, None, None, claim(1), now_ms).is_news);
+        }
+        presence.remember(&robot, claim(2), 6);
+        assert!(presence.claimed(&robot, None, None, claim(1), 6).is_served, "what is known is newer");
+    }
+
+    #[test]
+    fn instance_that_was_known_before_a_restart_of_the_server_is_waited_for() {
+        let (presence, robot, original, copy) = (Presence::new(1000, 0), RobotId::random(), claim(1), claim(2));
+        presence.remember(&robot, original.clone(), 1000);
+        assert_eq!(presence.get(&robot, 1000), None, "it was not seen by this process");
+        assert!(!presence.claimed(&robot, None, None, copy, 1001).is_served);
+        assert!(presence.claimed(&robot, None, None, original, 1002).is_served);
+    }
+
+    #[test]
+    fn session_is_told_once_its_agent_has_said_that_it_is_the_one() {
+        let (presence, robot, original, copy) = (Presence::new(1000, 0), RobotId::random(), claim(1), claim(2));
+        let says = |claim: &Claim, connection, now_ms| {
+            presence.claimed(&robot, None, Some(connection), claim.clone(), now_ms).is_served
+        };
+        presence.connected(&robot, None, 1, 0);
+        assert!(presence.may_be_told(&robot), "nobody has said yet that it says so");
+        assert!(says(&original, 1, 0) && presence.may_be_told(&robot));
+        // A copy takes the session over. What was there all the time was heard when it ended.
+        let later_ms = 10 * MINUTE_MS;
+        presence.disconnected(&robot, 1, later_ms);
+        presence.connected(&robot, None, 2, later_ms);
+        assert!(!presence.may_be_told(&robot), "it has not said who it is");
+        assert!(!says(&copy, 2, later_ms) && !presence.may_be_told(&robot));
+        assert!(!says(&original, 1, later_ms + 1) || !presence.may_be_told(&robot), "said in a session that is over");
+        presence.disconnected(&robot, 2, later_ms + 2);
+        presence.connected(&robot, None, 3, later_ms + 2);
+        assert!(says(&original, 3, later_ms + 3) && presence.may_be_told(&robot));
+        // As long as its session is up it is not silent.
+        assert!(!presence.claimed(&robot, None, None, copy, later_ms + MINUTE_MS).is_served);
+    }
+
+    #[test]
+    fn older_agents_follow_each_other_at_once() {
+        let (presence, robot) = (Presence::new(1000, 0), RobotId::random());
+        for now_ms in 0..5 {
+            let older = Claim { instance: InstanceId::random(), place: None };
+            assert!(presence.claimed(&robot, None, None, older, now_ms).is_served);
+            assert!(!presence.takes_a_claim(&robot));
+        }
+        assert!(presence.claimed(&robot, None, None, claim(1), 6).is_served, "an agent that was brought up to date");
+        let older = Claim { instance: InstanceId::random(), place: None };
+        assert!(!presence.claimed(&robot, None, None, older, 7).is_served);
     }
 
     #[test]

@@ -29,7 +29,7 @@ use crate::collector;
 use crate::conduct::Conduct;
 use crate::config::{Config, TlsSettings};
 use crate::data_directory::{Addresses, DataDirectory, DataError, room};
-use crate::database::{Database, keep_checked};
+use crate::database::{Database, FirstOperator, keep_checked};
 use crate::downlink::Downlink;
 use crate::fan_out::FanOutWorker;
 use crate::feed::{Feed, FeedSource};
@@ -50,7 +50,7 @@ use crate::requests::Requests;
 use crate::robot_logs::RobotLogs;
 use crate::robot_vitals::RobotVitals;
 use crate::server_facts::ServerFacts;
-use crate::store::{Store, StoreError, sqlite_url};
+use crate::store::{ReportedBy, Store, StoreError, sqlite_url};
 use crate::tls::{Tls, TlsError};
 use crate::transfers::Transfers;
 use crate::uplink::Uplink;
@@ -135,13 +135,13 @@ impl Server {
         let key = data.signing_key()?;
         let public_key = key.public_key();
         let tls = config.encrypts().then(|| Tls::open(tls_settings(&config), &data, clock.clone())).transpose()?;
-        let database = open_database(&config, &data, clock.clone()).await?;
+        let presence = Arc::new(Presence::new(milliseconds(config.presence_timeout), clock.now_ms()));
+        let database = open_database(&config, &data, presence.clone(), clock.clone()).await?;
         let (store, unusable) = (database.store().clone(), database.unusable());
         let blobs = Blobs::open(data.path(), blob_settings(&config))?;
         let http = listen(config.http).map_err(|source| ServeError::Listen { address: config.http, source })?;
         let http_address = http.local_addr().map_err(|source| ServeError::Listen { address: config.http, source })?;
 
-        let presence = Arc::new(Presence::new(milliseconds(config.presence_timeout), clock.now_ms()));
         let changes = Changes::new();
         let (load, http_connections) = (Arc::<ServerLoad>::default(), Arc::<HttpConnections>::default());
         let chooser = Chooser::new(&config.delivery, presence.clone(), load.clone());
@@ -435,9 +435,15 @@ async fn next_tick(ticks: &mut Interval, stop: &CancellationToken) -> bool {
     }
 }
 
-async fn open_database(config: &Config, data: &DataDirectory, clock: Clock) -> Result<Database, ServeError> {
+async fn open_database(
+    config: &Config,
+    data: &DataDirectory,
+    presence: Arc<Presence>,
+    clock: Clock,
+) -> Result<Database, ServeError> {
     let url = config.database.clone().unwrap_or_else(|| sqlite_url(&data.path().join("taskd.sqlite")));
-    Ok(Database::open(&url, data.operator_token()?, data.operator_token_path(), clock).await?)
+    let operator = FirstOperator { token: data.operator_token()?, path: data.operator_token_path() };
+    Ok(Database::open(&url, operator, presence, clock).await?)
 }
 
 /// Tells programs on this machine where the server listens, if there is room for that.

@@ -20,7 +20,7 @@ use crate::broker::{Inbox, NotStored, RobotMessage};
 use crate::changes::{Change, Changes};
 use crate::clock::Clock;
 use crate::happening::Happening;
-use crate::presence::Presence;
+use crate::presence::{Claim, Presence};
 use crate::report_writer::{ReportError, ReportWriter};
 use crate::requests::Requests;
 use crate::robot_logs::RobotLogs;
@@ -68,7 +68,10 @@ impl Uplink {
             tracing::warn!(robot = %message.robot, "a report that no token vouches for is dropped");
             return Ok(());
         };
-        self.saw_instance(message, &report.instance);
+        if !self.hear_claim(message, Claim { instance: report.instance.clone(), place: report.place }) {
+            // It waits for the agent that is known, whose reports these are not.
+            return Err(NotStored);
+        }
         let observed = report.observed_generation;
         // While the database is away its sessions stay, for as long as the broker lets this take.
         self.reports.database_there().await;
@@ -94,7 +97,7 @@ impl Uplink {
         let Some(status) = parsed::<Status>(message, MAX_STATUS_BYTES) else { return };
         // Going offline is noticed by the connection's end, which can't be forged or late.
         if status.online {
-            self.saw_instance(message, &status.instance);
+            self.hear_claim(message, Claim { instance: status.instance, place: status.place });
         }
     }
 
@@ -126,12 +129,10 @@ impl Uplink {
         }
     }
 
-    fn saw_instance(&self, message: &RobotMessage, instance: &task_proto::InstanceId) {
-        let now_ms = self.clock.now_ms();
-        let was_duplicate = self.presence.is_duplicate(&message.robot, now_ms);
-        if self.presence.instance_seen(&message.robot, message.peer, instance, now_ms) != was_duplicate {
-            self.changes.announce(Change::Robot(message.robot.clone()));
-        }
+    /// Which agent speaks in the session. Says whether it has its robot's work.
+    fn hear_claim(&self, message: &RobotMessage, claim: Claim) -> bool {
+        let (robot, connection) = (&message.robot, Some(message.connection));
+        claimed(&self.presence, &self.changes, robot, (message.peer, connection), claim, self.clock.now_ms())
     }
 
     fn remind(&self, robot: &RobotId) {
@@ -186,6 +187,27 @@ impl Inbox for Uplink {
     fn everyone_may_be_there(&self) {
         self.changes.ring_everyone();
     }
+}
+
+/// An agent said which it is, in a session if in any; says whether it has its robot's work, and tells it of that.
+pub fn claimed(
+    presence: &Presence,
+    changes: &Changes,
+    robot: &RobotId,
+    (peer, connection): (Option<SocketAddr>, Option<u64>),
+    claim: Claim,
+    now_ms: u64,
+) -> bool {
+    let shown = || presence.get(robot, now_ms).map(|sighting| (sighting.duplicate, sighting.waits)).unwrap_or_default();
+    let before = shown();
+    let standing = presence.claimed(robot, peer, connection, claim, now_ms);
+    if shown() != before {
+        changes.announce(Change::Robot(robot.clone()));
+    }
+    if standing.is_news {
+        changes.ring([robot.clone()]);
+    }
+    standing.is_served
 }
 
 /// A robot was heard over HTTP; if it was away, that is news.

@@ -35,7 +35,7 @@ use crate::outputs::Registry;
 use crate::rotation::Rotation;
 use crate::server::{self, Server};
 use crate::vitals::{self, Gauge, Places};
-use crate::{clock, confinement, endpoint, process};
+use crate::{clock, confinement, endpoint, place, process};
 
 /// Messages from the link that the driver has not taken yet.
 const QUEUED_MESSAGES: usize = 16;
@@ -66,7 +66,8 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
     let data = Layout::new(&arguments.data.data)?;
     let identity = Identity::read(&data.identity())?;
     let config = Config::load(data.root(), std::env::vars_os())?;
-    let _lock = lock(&data)?;
+    let lock = lock(&data)?;
+    let place = Some(place::of(&lock).context("cannot look at the lock file")?);
     let (ledger, lost) = open_ledger(&data)?;
     if let Err(error) = data.clean_leftovers() {
         tracing::warn!(%error, "cannot remove all that an earlier agent left half done");
@@ -93,16 +94,18 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
         robot_id: identity.robot_id.clone(),
         server_key: identity.server_key.clone(),
         instance: instance.clone(),
+        place,
         boot_id: process::boot_id().context("cannot read the kernel's boot id")?,
         name: config.name.clone(),
         labels: config.labels.clone(),
     };
-    let status = Status { online: true, start: ledger.start + 1, instance, connection: 0 };
+    let status = Status { online: true, start: ledger.start + 1, instance: instance.clone(), connection: 0, place };
     let driver = Driver::new(robot.clone(), speaker, shared.clone(), ledger, lost).await;
     tracing::info!(robot = %identity.robot_id, server = %base, "task-agent runs");
 
     let (heard, messages) = mpsc::channel(QUEUED_MESSAGES);
     let server = Server::new(client, base.clone(), identity.robot_id.clone(), credential.clone());
+    let server = server.speaking_as(&instance, place);
     let intervals = Intervals { slow: config.poll_interval, fast: config.poll_interval_without_mqtt };
     tokio::spawn(link::over_http(server.clone(), shared.clone(), intervals, heard.clone()));
     let rotation = Rotation {

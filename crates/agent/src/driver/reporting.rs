@@ -39,6 +39,7 @@ impl<E: Effects> Driver<E> {
             robot_id: self.speaker.robot_id.clone(),
             start: self.ledger.start,
             instance: self.speaker.instance.clone(),
+            place: self.speaker.place,
             boot_id: self.speaker.boot_id.clone(),
             seq: self.seq + 1,
             observed_generation: self.observed,

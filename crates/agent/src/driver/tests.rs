@@ -58,6 +58,7 @@ impl Bench {
             robot_id: robot.clone(),
             server_key: key.public_key(),
             instance: InstanceId::random(),
+            place: None,
             boot_id: "boot".to_owned(),
             name: Some("atlas".parse().expect("valid")),
             labels: None,

@@ -207,6 +207,7 @@ async fn a_report_is_sent_again_until_it_is_stored() {
         robot_id: robot.clone(),
         start: 1,
         instance: InstanceId::random(),
+        place: None,
         boot_id: "boot".to_owned(),
         seq: 1,
         observed_generation: Generation(0),

@@ -61,7 +61,7 @@ impl Rig {
             prefix: TopicPrefix::default(),
             robot: RobotId::random(),
             token: Credential::from("token".to_owned()),
-            status: Status { online: true, start: 1, instance: InstanceId::random(), connection: 0 },
+            status: Status { online: true, start: 1, instance: InstanceId::random(), connection: 0, place: None },
             message_bytes: mqtt::MESSAGE_BYTES,
             ways: Ways::new(&"http://127.0.0.1".parse().unwrap(), Arc::new(tls), MqttTransport::Tcp),
         };

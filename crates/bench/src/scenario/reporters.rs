@@ -70,6 +70,7 @@ fn report(robot: &EnrollResponse, deployment: &DeploymentId) -> anyhow::Result<R
         robot_id: robot.robot_id.clone(),
         start: 1,
         instance: InstanceId::random(),
+        place: None,
         boot_id: "00000000-0000-0000-0000-000000000000".to_owned(),
         seq: 0,
         observed_generation: Generation(1),

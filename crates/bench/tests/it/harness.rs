@@ -366,6 +366,15 @@ impl Robot {
         thief
     }
 
+    /// A whole copy of this robot's data, as it is now. Its agent does not run yet.
+    pub fn copied(&self, dir: &Path, name: &str) -> Self {
+        let data = dir.join(name);
+        let copied = Command::new("cp").arg("-a").arg(&self.data).arg(&data).status().expect("cp runs");
+        assert!(copied.success(), "the data directory is copied");
+        let (environment, id) = (self.environment.clone(), self.id.clone());
+        Self { process: None, data, environment, name: self.name.clone(), id }
+    }
+
     /// One that enrols by itself in the directory `name` below `dir`. Its agent does not run yet.
     pub fn enrolled(dir: &Path, name: &str, id: RobotId, environment: &[(&str, &str)]) -> Self {
         let environment = environment.iter().map(|(k, v)| ((*k).to_owned(), (*v).to_owned())).collect();

@@ -4,6 +4,7 @@
 use std::collections::HashMap;
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, MutexGuard};
+use std::time::{Duration, Instant};
 
 use axum::Router;
 use axum::extract::{Path, State};
@@ -11,12 +12,12 @@ use axum::http::StatusCode;
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
 use serde_json::{Value, json};
-use task_proto::DeploymentId;
-use task_proto::api::{DeploymentView, RobotView};
+use task_proto::api::{DeploymentView, INSTANCE_HEADER, PLACE_HEADER, RobotView};
 use task_proto::desired::{BlobRef, DesiredState, PackageRef};
 use task_proto::digest::unhex;
 use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
 use task_proto::report::{FailureCode, Phase, Report, TaskReport};
+use task_proto::{DeploymentId, InstanceId};
 use tokio::task::JoinHandle;
 
 use crate::harness::{Server, eventually, open_directory, write_package};
@@ -84,6 +85,10 @@ async fn desired_by(server: &Server, data: &std::path::Path) -> reqwest::Respons
     let text = |key: &str| identity[key].as_str().expect("text");
     let desired = server.url(&format!("/api/v1/robots/{}/desired", text("robot_id")));
     let request = reqwest::Client::new().get(desired).bearer_auth(text("token"));
+    // As an agent that was started again there would ask.
+    let place = std::fs::File::open(data.join("lock")).and_then(|lock| task_agent::place::of(&lock)).expect("a place");
+    let request = request.header(INSTANCE_HEADER, InstanceId::random().as_str());
+    let request = request.header(PLACE_HEADER, place.to_string());
     request.send().await.expect("an answer")
 }
 
@@ -243,4 +248,57 @@ async fn a_robots_identity_used_elsewhere_is_shown_gets_no_work_and_ends_with_th
     assert!(!has(&view, "duplicate_identity"));
     assert!(!thief.data().join("tasks/worker").exists(), "the thief got work");
     assert_eq!(desired_by(&site.server, thief.data()).await.status(), StatusCode::UNAUTHORIZED);
+}
+
+/// A server with a robot that it has heard of.
+async fn with_a_known_robot() -> (Site, Vec<(String, String)>) {
+    let (site, keys) = Site::start(1, &["ada.key"]).await;
+    let is_known = |view: &RobotView| view.online && view.host.is_some();
+    eventually("the robot to be known", async || site.server.robot("robot-1").await.filter(is_known)).await;
+    (site, keys)
+}
+
+/// Waits until the server shows that another agent has come with the robot's identity.
+async fn is_noticed(site: &Site) {
+    let noticed = |view: &RobotView| has(view, "instance_waits") || has(view, "duplicate_identity");
+    eventually("the copy to be noticed", async || site.server.robot("robot-1").await.filter(noticed)).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn copy_of_a_robots_data_gets_no_order_while_the_original_is_there() {
+    let (site, keys) = with_a_known_robot().await;
+    let mut copy = site.robot.copied(site.dir.path(), "copy");
+    let order = site.push("1.0", &["--sign", &keys[0].0]).await;
+    site.wait(&order, Phase::Running).await;
+    copy.restart();
+    is_noticed(&site).await;
+    // By then it has come back, and would have been told of the order again.
+    let both = |view: &RobotView| has(view, "duplicate_identity");
+    eventually("both to be seen", async || site.server.robot("robot-1").await.filter(both)).await;
+    assert!(!copy.data().join("tasks/worker").exists(), "the copy got the order");
+    assert_eq!(desired_by(&site.server, copy.data()).await.status(), StatusCode::CONFLICT);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn copy_of_a_robots_data_gets_no_order_while_the_original_is_briefly_away() {
+    let (mut site, keys) = with_a_known_robot().await;
+    let sign = ["--sign", keys[0].0.as_str()];
+    let mut copy = site.robot.copied(site.dir.path(), "copy");
+    site.robot.freeze();
+    let order = site.push("1.0", &sign).await;
+    copy.restart();
+    is_noticed(&site).await;
+    assert_eq!(desired_by(&site.server, copy.data()).await.status(), StatusCode::CONFLICT);
+    copy.kill();
+    assert!(!copy.data().join("tasks/worker").exists(), "the copy got the order");
+    site.robot.thaw();
+    site.wait(&order, Phase::Running).await;
+
+    // Its own restart is not held up.
+    site.robot.kill();
+    site.robot.restart();
+    let restarted = Instant::now();
+    let order = site.push("2.0", &sign).await;
+    site.wait(&order, Phase::Running).await;
+    assert!(restarted.elapsed() < Duration::from_secs(25), "it waited for itself to fall silent");
 }

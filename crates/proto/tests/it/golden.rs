@@ -84,6 +84,7 @@ fn report() -> Report {
         robot_id: robot(),
         start: 3,
         instance: parsed("i00000000000000c3"),
+        place: None,
         boot_id: "5f0c6a55-5a0f-4f7c-9d59-1f3c3f0f0c11".to_owned(),
         seq: 12,
         observed_generation: Generation(7),

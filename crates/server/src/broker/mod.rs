@@ -296,6 +296,11 @@ impl Broker {
         }
     }
 
+    /// Whether robots hear all that is said to them from a broker that is not the server's own.
+    pub fn is_external(&self) -> bool {
+        matches!(self.kind, Kind::External(_))
+    }
+
     /// Waits until many more may be rung.
     pub async fn room(&self) {
         match &self.kind {

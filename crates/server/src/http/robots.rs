@@ -1,13 +1,16 @@
 //! Robots: what operators see and change of them, and the two calls robots make themselves.
 
 use std::net::SocketAddr;
+use std::str::FromStr;
 
 use axum::extract::{ConnectInfo, State};
 use axum::response::{IntoResponse, NoContent, Response};
 use axum::{Extension, Json};
 use http::{HeaderMap, StatusCode, header};
 use serde::Deserialize;
-use task_proto::api::{EditRobot, FeedKind, MqttConnection, ReportReply, RobotList, RobotToken, RobotView};
+use task_proto::api::{
+    EditRobot, FeedKind, INSTANCE_HEADER, MqttConnection, PLACE_HEADER, ReportReply, RobotList, RobotToken, RobotView,
+};
 use task_proto::envelope::Envelope;
 use task_proto::report::Report;
 use task_proto::selector::Selector;
@@ -23,6 +26,7 @@ use super::views::complete_robot;
 use crate::changes::Change;
 use crate::happening::Happening;
 use crate::person::Person;
+use crate::presence::Claim;
 use crate::uplink;
 
 /// The query of `GET /robots`.
@@ -147,7 +151,7 @@ fn put_out(app: &App, robot: &RobotId) {
 #[utoipa::path(get, path = "/api/v1/robots/{robot}/desired", tag = "agent",
     responses((status = 200, description = "The state, as a DSSE envelope; its tag is in `ETag`.", body = Envelope),
         (status = 304, description = "It is still the one that `If-None-Match` names."),
-        (status = 409, description = "`duplicate_identity`: two agents use this identity; `diverged`: the robot has come further than this server.")))]
+        (status = 409, description = "`duplicate_identity`: two agents use this identity; `instance_waits`: another agent has this robot's work, and was heard lately; `diverged`: the robot has come further than this server.")))]
 pub(super) async fn desired(
     State(app): State<App>,
     ConnectInfo(peer): ConnectInfo<SocketAddr>,
@@ -156,9 +160,13 @@ pub(super) async fn desired(
 ) -> Result<Response, ApiError> {
     let now_ms = app.clock.now_ms();
     uplink::heard(&app.presence, &app.changes, &robot, peer, now_ms);
+    let is_served = is_served(&app, &robot, peer, claim_in(&headers)?);
     if app.presence.is_duplicate(&robot, now_ms) {
         let message = "two agents use this robot's identity and keep displacing each other; it gets no new work";
         return Err(ApiError::conflict("duplicate_identity", message));
+    }
+    if !is_served {
+        return Err(waits());
     }
     let desired = app.actions.desired(&robot).await?;
     let body = serde_json::to_vec(&desired.envelope).map_err(|error| ApiError::internal(&error))?;
@@ -174,7 +182,8 @@ pub(super) async fn desired(
 
 /// Stores a report of the robot; the answer comes after the commit.
 #[utoipa::path(post, path = "/api/v1/robots/{robot}/report", tag = "agent",
-    responses((status = 503, description = "Too many reports wait to be stored, or the database does not answer or is corrupt."),
+    responses((status = 409, description = "`instance_waits`, as of the desired state."),
+        (status = 503, description = "Too many reports wait to be stored, or the database does not answer or is corrupt."),
         (status = 507, description = "`disk_full`: the server's disk is, and the report is not stored.")))]
 pub(super) async fn report(
     State(app): State<App>,
@@ -188,20 +197,53 @@ pub(super) async fn report(
     }
     let now_ms = app.clock.now_ms();
     uplink::heard(&app.presence, &app.changes, &robot, peer, now_ms);
-    app.presence.instance_seen(&robot, Some(peer), &report.instance, now_ms);
+    if !is_served(&app, &robot, peer, Some(Claim { instance: report.instance.clone(), place: report.place })) {
+        return Err(waits());
+    }
     Ok(Json(app.reports.submit(report, token_number).await?))
 }
 
 /// Gives the robot a token that it may go over to; the first use of it ends the one it called with.
 #[utoipa::path(post, path = "/api/v1/robots/{robot}/token", tag = "agent",
-    responses((status = 409, description = "`enrolled_anew`: another agent has enrolled as this robot meanwhile.")))]
+    responses((status = 409, description = "`enrolled_anew`: another agent has enrolled as this robot meanwhile; `instance_waits`, as of the desired state.")))]
 pub(super) async fn next_token(
     State(app): State<App>,
+    ConnectInfo(peer): ConnectInfo<SocketAddr>,
+    headers: HeaderMap,
     Extension(TokenNumber(token_number)): Extension<TokenNumber>,
     PathParam(robot): PathParam<RobotId>,
 ) -> Result<Created<RobotToken>, ApiError> {
+    if !is_served(&app, &robot, peer, claim_in(&headers)?) {
+        return Err(waits());
+    }
     let token = app.actions.next_robot_token(&robot, token_number).await?;
     Ok(Created(RobotToken { token: token.reveal() }))
+}
+
+/// What the agent that makes a request says of itself; an older one says nothing.
+fn claim_in(headers: &HeaderMap) -> Result<Option<Claim>, ApiError> {
+    fn read<T: FromStr>(headers: &HeaderMap, name: &str) -> Result<Option<T>, ApiError> {
+        let Some(value) = headers.get(name) else { return Ok(None) };
+        let read = value.to_str().ok().and_then(|text| text.parse().ok());
+        read.map(Some).ok_or_else(|| ApiError::invalid(format!("{name}: it is no such id")))
+    }
+    let place = read(headers, PLACE_HEADER)?;
+    Ok(read(headers, INSTANCE_HEADER)?.map(|instance| Claim { instance, place }))
+}
+
+/// Whether what asks in the robot's name is the agent that has its work.
+fn is_served(app: &App, robot: &RobotId, peer: SocketAddr, claim: Option<Claim>) -> bool {
+    match claim {
+        Some(claim) => {
+            uplink::claimed(&app.presence, &app.changes, robot, (Some(peer), None), claim, app.clock.now_ms())
+        }
+        None => !app.presence.takes_a_claim(robot),
+    }
+}
+
+fn waits() -> ApiError {
+    let message = "another agent has this robot's work; this one gets it once that one has been silent for 30 s";
+    ApiError::conflict("instance_waits", message)
 }
 
 /// The robot that a person names, which must be one of theirs.

@@ -21,6 +21,11 @@ pub fn complete_robot(view: &mut RobotView, presence: &Presence, conduct: &Condu
     view.online = sighting.online;
     view.address = sighting.address.map(|address| address.to_string());
     view.last_seen_ms = view.last_seen_ms.max(Some(sighting.last_seen_ms));
+    if sighting.waits {
+        let text = "another agent came with this robot's identity, and gets no work before the one that is known was \
+                    silent for 30 s: the robot was started again, or its identity is used elsewhere";
+        view.conditions.insert(0, Condition { code: "instance_waits".to_owned(), text: text.to_owned() });
+    }
     if sighting.duplicate {
         let text = "two agents use this robot's identity and keep displacing each other; enrol one of them again";
         let condition = Condition { code: "duplicate_identity".to_owned(), text: text.to_owned() };

@@ -66,7 +66,7 @@ pub use package_use::{Deletion, PackageUsers};
 pub use packages::{NewManifest, PutManifest, Reference, StoredManifest};
 pub use publishers::SignedDocument;
 pub use referrers::ReferrersPage;
-pub use reports::{OpenAssignment, ReportedRobot};
+pub use reports::{OpenAssignment, ReportedBy, ReportedRobot};
 pub use robot_blobs::bytes_taken;
 pub use robot_pages::RobotPage;
 pub use robots::{BrokerCredential, DesiredTasks, FetchedBy, KnownRobot, Matching};

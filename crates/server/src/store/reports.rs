@@ -1,14 +1,16 @@
 //! Reports: what is known about a batch of robots, read at once, and what they said, written at once.
 
+use futures_util::TryStreamExt as _;
+use serde::Deserialize;
 use sqlx::{AssertSqlSafe, Row as _};
 use task_proto::id::Labels;
 use task_proto::manifest::TaskKind;
 use task_proto::report::{Phase, Report};
-use task_proto::{DeploymentId, Generation, RobotId, RobotName};
+use task_proto::{DeploymentId, Digest, Generation, InstanceId, RobotId, RobotName};
 
 use super::rows::{from_json, from_optional_json, from_word, groups, id, json, number, stored, values};
 use super::timelines::{grown, step};
-use super::{StoreError, Write};
+use super::{Store, StoreError, Write};
 use crate::deployment::Standing;
 
 /// Columns of where an assignment stands in a statement.
@@ -46,6 +48,32 @@ pub struct OpenAssignment {
     pub removed: Option<Generation>,
     /// Where it stands.
     pub standing: Standing,
+}
+
+/// What a stored report says of the agent that it is by.
+#[derive(Debug, Deserialize)]
+pub struct ReportedBy {
+    /// Its start.
+    pub instance: InstanceId,
+    /// Where it ran, if it said so.
+    #[serde(default)]
+    pub place: Option<Digest>,
+}
+
+impl Store {
+    /// Which agent each robot's last report is by. One that can't be read is left out.
+    pub async fn last_agents(&self) -> Result<Vec<(RobotId, ReportedBy)>, StoreError> {
+        let sql = "SELECT id, report FROM robots WHERE report IS NOT NULL AND removed_at_ms IS NULL";
+        let mut rows = sqlx::query(sql).fetch(&self.reads);
+        let mut found = Vec::new();
+        // A report may be large, and there is one of each robot.
+        while let Some(row) = rows.try_next().await? {
+            if let Ok(by) = from_json("robots.report", row.try_get("report")?) {
+                found.push((id("robots.id", row.try_get("id")?)?, by));
+            }
+        }
+        Ok(found)
+    }
 }
 
 impl Write {

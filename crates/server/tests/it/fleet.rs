@@ -203,6 +203,7 @@ impl Robot {
             robot_id: self.id.clone(),
             start: self.start,
             instance: InstanceId::random(),
+            place: None,
             boot_id: "boot".to_owned(),
             seq: self.seq,
             observed_generation: self.observed,

@@ -195,6 +195,7 @@ impl TestRobot {
             robot_id: self.id.clone(),
             start: 1,
             instance: self.instance.clone(),
+            place: None,
             boot_id: "boot".to_owned(),
             seq: self.seq,
             observed_generation: state.generation,

@@ -70,6 +70,11 @@ impl Present {
         self.robots.drain().map(|(robot, seat)| (robot, seat.number)).collect()
     }
 
+    /// The connection by which the robot is there.
+    pub(super) fn connection(&self, robot: &RobotId) -> Option<u64> {
+        self.robots.get(robot).map(|seat| seat.number)
+    }
+
     pub(super) fn contains(&self, robot: &RobotId) -> bool {
         self.robots.contains_key(robot)
     }
@@ -95,7 +100,7 @@ mod tests {
     use task_proto::InstanceId;
 
     fn status(online: bool, start: u64, connection: u64) -> Status {
-        Status { online, start, instance: InstanceId::random(), connection }
+        Status { online, start, instance: InstanceId::random(), connection, place: None }
     }
 
     fn turn(ended: impl Into<Option<u64>>, begun: impl Into<Option<u64>>) -> Turn {

@@ -258,7 +258,8 @@ impl<'a> Session<'a> {
             }
         };
         self.tell(&robot, &turn);
-        let connection = turn.begun.unwrap_or_default();
+        // The status with which it went away is of none.
+        let connection = lock(&self.external.present).connection(&robot).unwrap_or_default();
         let message =
             RobotMessage { robot, topic, payload: message.payload, peer: None, connection, token_number: None };
         // None of these topics is stored, so this answers at once.

@@ -31,6 +31,11 @@ impl Doorbell {
         self.rung.notify_one();
     }
 
+    /// Takes back what was left for the session before.
+    pub(super) fn forget_state(&self) {
+        self.waiting().state = None;
+    }
+
     /// Takes the payload, as soon as there is one. Cancel-safe: nothing is taken unless it is returned.
     pub(super) async fn answer(&self) -> Bytes {
         loop {

@@ -149,6 +149,8 @@ async fn live<S>(
 where
     S: AsyncRead + AsyncWrite + Unpin,
 {
+    // It may have been meant for whoever had the seat before. Whoever is told of this session rings again.
+    seat.doorbell().forget_state();
     let _attendance = Attendance::begin(context, &guest.visitor, peer, seat.number());
     let (reader, writer) = tokio::io::split(stream);
     let mut output = Output::default();

@@ -50,6 +50,19 @@ pub enum TaskUserError {
         /// The name.
         name: String,
     },
+    /// A directory above the agent's lets it not pass.
+    #[error(
+        "tasks run as {user:?}, which may not enter {}, where the data directory {} lies: let it pass \
+         (`chmod o+x {}`) or move the data directory, and restart the agent", dir.display(), data.display(), dir.display()
+    )]
+    ShutOut {
+        /// The account's name.
+        user: String,
+        /// The first directory that it can't enter.
+        dir: PathBuf,
+        /// The agent's data directory.
+        data: PathBuf,
+    },
     /// Only root may run things as somebody else.
     #[error("task_user is {name:?}, but the agent does not run as root and can't start anything as another user")]
     NotRoot {
@@ -96,6 +109,19 @@ impl TaskUser {
         });
         let groups = in_groups.filter(|other| *other != gid).collect();
         Some(Self { name, uid, gid, groups })
+    }
+
+    /// The account, if it can get to the data directory `data`: the agent opens that and what is in it to its tasks, but
+    /// not what lies above it, which is its administrator's.
+    pub fn admitted_to(self, data: &Path) -> Result<Self, TaskUserError> {
+        let data = std::path::absolute(data).unwrap_or_else(|_| data.to_owned());
+        // What can't be told here is seen at the first start.
+        let shut =
+            self.with_its_rights(|| data.ancestors().skip(1).filter(|dir| is_shut(dir)).last().map(Path::to_owned));
+        match shut {
+            Ok(Some(dir)) => Err(TaskUserError::ShutOut { user: self.name, dir, data }),
+            Ok(None) | Err(_) => Ok(self),
+        }
     }
 
     /// Lets the account pass through `dirs`, without seeing what is in them.
@@ -193,6 +219,11 @@ impl TaskUser {
     }
 }
 
+/// Whether the calling thread may not pass through the directory.
+fn is_shut(dir: &Path) -> bool {
+    fs::metadata(dir.join(".")).is_err_and(|error| error.kind() == io::ErrorKind::PermissionDenied)
+}
+
 /// Does blocking `work` with the rights to files that `user` has, or with the agent's where tasks run as whoever it is.
 pub async fn do_as<T: Send + 'static>(
     user: Option<&TaskUser>,
@@ -267,6 +298,27 @@ mod tests {
             assert!(read.is_err(), "only root may have another's rights");
         }
         assert!(fs::read(&own).is_ok());
+    }
+
+    #[test]
+    fn account_that_can_not_enter_a_directory_above_the_data_is_told_which() {
+        if !nix::unistd::geteuid().is_root() {
+            return eprintln!("unavailable: only root may take another's rights");
+        }
+        let temp = tempfile::tempdir().expect("temp dir");
+        let (home, data) = (temp.path().join("home"), temp.path().join("home/agent/data"));
+        fs::create_dir_all(&data).expect("made");
+        let let_all = |dir: &Path, mode| fs::set_permissions(dir, fs::Permissions::from_mode(mode)).expect("set");
+        let_all(temp.path(), 0o711);
+        let_all(&home, 0o700);
+        let_all(&data, 0o700);
+        let user = || TaskUser { name: "4711".to_owned(), uid: 4711, gid: 4711, groups: Vec::new() };
+        let refused = user().admitted_to(&data).expect_err("shut out");
+        assert!(matches!(&refused, TaskUserError::ShutOut { dir, .. } if *dir == home), "{refused}");
+        let chmod = format!("chmod o+x {}`", home.display());
+        assert!(refused.to_string().contains(&chmod), "{refused}");
+        let_all(&home, 0o711);
+        assert_eq!(user().admitted_to(&data), Ok(user()), "the data directory itself is the agent's to open");
     }
 
     #[test]

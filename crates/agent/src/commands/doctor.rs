@@ -29,7 +29,7 @@ use crate::layout::DataDir as Layout;
 use crate::ledger::Ledger;
 use crate::server::{self, Server, ServerError};
 use crate::settings::settle;
-use crate::task_user::TaskUser;
+use crate::task_user::{TaskUser, TaskUserError};
 use crate::underlay::{self, UnderlayError};
 use crate::{admission, clock, disk};
 
@@ -93,7 +93,7 @@ async fn check(data: &Path) -> anyhow::Result<Checkup> {
     machine(&mut checkup, data, config.as_ref());
     if let Some(config) = &config {
         ros(&mut checkup, config);
-        tasks(&mut checkup, config);
+        tasks(&mut checkup, data, config);
     }
     Ok(checkup)
 }
@@ -405,7 +405,7 @@ fn own_programs(installation: &Installation) -> Vec<PathBuf> {
 }
 
 /// What tasks run in, and as whom.
-fn tasks(checkup: &mut Checkup, config: &Config) {
+fn tasks(checkup: &mut Checkup, data: &Path, config: &Config) {
     let mend = "tasks run all the same, without limits that hold; use a kernel with cgroup v2 and let systemd delegate \
                 (Delegate=yes in the agent's unit)";
     match cgroup::outlook() {
@@ -413,9 +413,15 @@ fn tasks(checkup: &mut Checkup, config: &Config) {
         Outlook::Counts => checkup.notice("cgroups", "v2, without the controllers memory and pids", mend),
         Outlook::Nothing => checkup.notice("cgroups", "no cgroup v2", mend),
     }
-    match TaskUser::find(config.task_user.as_deref()) {
+    let found = TaskUser::find(config.task_user.as_deref());
+    let user = found.and_then(|user| user.map(|user| user.admitted_to(data)).transpose());
+    match &user {
         Ok(Some(user)) => checkup.good("task user", format!("tasks run as {}", user.name)),
         Ok(None) => checkup.good("task user", "tasks run as whoever the agent is"),
+        Err(error @ TaskUserError::ShutOut { dir, .. }) => {
+            let mend = format!("chmod o+x {}, or move the data directory", dir.display());
+            checkup.bad("task user", error.to_string(), mend);
+        }
         Err(error) => checkup.bad("task user", error.to_string(), "make the user, or set task_user in agent.toml"),
     }
 }

@@ -102,6 +102,11 @@ impl Robot {
             let trust = Trust::open(settings, data.publishers());
             Arc::new(Vouching::new(trust, fetcher.clone(), data.clone()))
         });
+        let task_user = TaskUser::find(config.task_user.as_deref())
+            .and_then(|user| user.map(|user| user.admitted_to(data.root())).transpose());
+        if let Err(error) = &task_user {
+            tracing::warn!(%error, "nothing can be run");
+        }
         let gate = config.gate.clone().map(|gate| Gate::new(gate, robot.clone(), data.root()));
         Self {
             data,
@@ -115,7 +120,7 @@ impl Robot {
             graph,
             supervisor: Supervisor::of_this_program(cgroups.clone()),
             cgroups,
-            task_user: TaskUser::find(config.task_user.as_deref()),
+            task_user,
             ros: RwLock::new(held.installations()),
             own: config.clone(),
             forward: watch::Sender::new(config.forward),

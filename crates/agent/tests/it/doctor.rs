@@ -1,5 +1,6 @@
 //! `task-agent doctor` where no server is needed to be found wanting, and its man pages.
 
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::Path;
 use std::process::Stdio;
 
@@ -67,6 +68,22 @@ fn a_robot_that_is_not_set_up_is_told_what_is_missing() {
     assert!(checks.iter().all(|check| (check["verdict"] == "good") == check["mend"].is_null()), "{checks:?}");
     let ran = agent(&["doctor", "--data", dir.path().to_str().unwrap()], &[]);
     assert!(ran.stdout.contains("✗ identity ") && ran.stdout.contains("→ enrol: task-agent enroll"), "{}", ran.stdout);
+}
+
+#[test]
+fn data_that_the_tasks_account_can_not_get_to_is_named_with_the_directory_in_the_way() {
+    if !nix::unistd::geteuid().is_root() {
+        return eprintln!("unavailable: only root runs tasks under another account");
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let data = dir.path().join("data");
+    std::fs::create_dir(&data).unwrap();
+    std::fs::set_permissions(dir.path(), std::fs::Permissions::from_mode(0o700)).unwrap();
+    let checks = doctor(&data, &[("TASK_AGENT_TASK_USER", "4711")]);
+    assert_found(&checks, "task user", "bad", &format!("which may not enter {}, where", dir.path().display()));
+    std::fs::set_permissions(dir.path(), std::fs::Permissions::from_mode(0o711)).unwrap();
+    let checks = doctor(&data, &[("TASK_AGENT_TASK_USER", "4711")]);
+    assert_found(&checks, "task user", "good", "tasks run as 4711");
 }
 
 #[test]

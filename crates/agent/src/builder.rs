@@ -64,6 +64,8 @@ pub struct BuildLimits {
     pub memory_bytes: Option<u64>,
     /// The processes and threads it may have.
     pub pids: Option<u64>,
+    /// Whether system calls are denied that only an administrator needs.
+    pub filter_calls: bool,
     /// The output that is kept.
     pub log_bytes: u64,
 }
@@ -146,7 +148,13 @@ impl BuildLimits {
     /// out-of-memory killer.
     pub fn of_this_machine() -> Self {
         let memory_bytes = process::total_memory_bytes().ok().map(|total| total / 4 * 3);
-        Self { timeout: Duration::from_secs(30 * 60), memory_bytes, pids: None, log_bytes: 8 * 1024 * 1024 }
+        Self {
+            timeout: Duration::from_secs(30 * 60),
+            memory_bytes,
+            pids: None,
+            filter_calls: false,
+            log_bytes: 8 * 1024 * 1024,
+        }
     }
 }
 
@@ -218,7 +226,8 @@ async fn run(order: &BuildOrder, containment: &Containment, cancel: &Cancellatio
     environment.insert(RUN_DIR_VARIABLE.to_owned(), root.display().to_string());
     let log = File::create(&order.log).map_err(failed(&order.log))?;
     let (reader, writer) = io::pipe().map_err(failed(&script))?;
-    let limits = RunLimits { memory_bytes: order.limits.memory_bytes, cpu_weight: None, pids: order.limits.pids };
+    let BuildLimits { memory_bytes, pids, filter_calls, .. } = order.limits;
+    let limits = RunLimits { memory_bytes, cpu_weight: None, pids, filter_calls };
     let cgroup = order.cgroups.as_ref().map(|cgroups| cgroups.create(root, &limits)).transpose();
     let cgroup = cgroup.map_err(failed(root))?;
     let confined = Confinement::new(&script, cgroup.as_ref(), &limits, order.user.as_ref()).map_err(failed(&script))?;

@@ -49,6 +49,9 @@ pub struct RunLimits {
     /// Processes and threads.
     #[serde(default)]
     pub pids: Option<u64>,
+    /// Whether system calls are denied that only an administrator needs.
+    #[serde(default)]
+    pub filter_calls: bool,
 }
 
 /// The place where groups are made.

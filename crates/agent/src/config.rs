@@ -18,6 +18,7 @@ use task_proto::publisher::{InvalidRole, Role};
 use task_proto::settings::{MAX_ROS_DOMAIN_ID, RobotLimits};
 use toml::{Table, Value};
 
+use crate::call_filter::Seccomp;
 use crate::durable;
 use crate::trust::TrustSettings;
 
@@ -75,6 +76,10 @@ pub struct Settings {
     /// Whom an agent that is root builds and runs tasks as, by name or number; absent: `taskd-task`. `root` must be said.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub task_user: Option<String>,
+    /// Whether builds and tasks are denied system calls that only an administrator needs; absent: where they run under an
+    /// account of their own.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub seccomp: Option<Seccomp>,
     /// The labels the robot gives itself; the server's win.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub labels: Option<Labels>,
@@ -230,6 +235,8 @@ pub struct Config {
     pub vitals_interval: Duration,
     /// Whom tasks run as, if the settings say.
     pub task_user: Option<String>,
+    /// Whether they are denied system calls, if the settings say.
+    pub seccomp: Option<Seccomp>,
     /// What tasks may use.
     pub limits: RobotLimits,
     /// Which log lines go to the server by themselves.
@@ -343,6 +350,7 @@ impl Config {
             vitals_interval: Duration::from_secs(settings.vitals_interval_s.unwrap_or(60)),
             parallel_tasks: limits.parallel_tasks.map_or(2, count),
             task_user: settings.task_user,
+            seccomp: settings.seccomp,
             task_pids: limits.task_pids.unwrap_or(4096),
             limits,
             gate: settings.gate.map(gate).transpose()?,
@@ -425,7 +433,7 @@ pub fn parse_server(text: &str) -> Result<reqwest::Url, ConfigError> {
 fn override_by(table: &mut Table, name: &str, text: &str) -> Result<(), ConfigError> {
     let key = name[VARIABLE_PREFIX.len()..].to_ascii_lowercase();
     let value = match key.as_str() {
-        "server" | "name" | "task_user" | "mqtt_transport" | "workspace" => Value::String(text.to_owned()),
+        "server" | "name" | "task_user" | "seccomp" | "mqtt_transport" | "workspace" => Value::String(text.to_owned()),
         "gate_command" => Value::Array(vec![Value::String(text.to_owned())]),
         "trusted_publishers_keys" | "trusted_publishers_keeper_keys" => {
             let keys = text.split(',').map(str::trim).filter(|key| !key.is_empty());

@@ -1,4 +1,5 @@
-//! What a build or a task is put into between fork and exec: its control group, its limits, its account. [`Confinement`]
+//! What a build or a task is put into between fork and exec: its control group, its limits, its account, its filter of
+//! system calls. [`Confinement`]
 //! is made ready before the fork, by whoever may look things up; entering it makes system calls only. It never starts
 //! anything.
 
@@ -16,6 +17,7 @@ use nix::sys::resource::{Resource, setrlimit};
 use nix::sys::stat::Mode;
 use nix::unistd::{AccessFlags, Gid, Uid, access};
 
+use crate::call_filter::CallFilter;
 use crate::cgroup::{Cgroup, RunLimits};
 use crate::task_user::TaskUser;
 
@@ -33,6 +35,7 @@ pub struct Confinement {
     data_bytes: Option<u64>,
     user_processes: Option<u64>,
     user: Option<Account>,
+    calls: Option<CallFilter>,
     script: CString,
 }
 
@@ -71,6 +74,7 @@ impl Confinement {
             data_bytes: limits.memory_bytes.filter(|_| !keeps_memory),
             user_processes,
             user: user.map(account),
+            calls: limits.filter_calls.then(CallFilter::of_tasks).flatten(),
             script: CString::new(script.as_os_str().as_bytes())?,
         })
     }
@@ -94,7 +98,8 @@ impl Confinement {
         if let Some(user) = &self.user {
             user.become_it()?;
         }
-        Ok(access(self.script.as_c_str(), AccessFlags::R_OK)?)
+        access(self.script.as_c_str(), AccessFlags::R_OK)?;
+        self.calls.as_ref().map_or(Ok(()), CallFilter::install)
     }
 }
 

@@ -4,6 +4,7 @@ pub mod admission;
 pub mod answers;
 pub mod battery;
 pub mod builder;
+pub mod call_filter;
 pub mod cgroup;
 pub mod clock;
 pub mod commands;

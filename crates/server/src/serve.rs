@@ -50,7 +50,7 @@ use crate::requests::Requests;
 use crate::robot_logs::RobotLogs;
 use crate::robot_vitals::RobotVitals;
 use crate::server_facts::ServerFacts;
-use crate::store::{ReportedBy, Store, StoreError, sqlite_url};
+use crate::store::{Store, StoreError, sqlite_url};
 use crate::tls::{Tls, TlsError};
 use crate::transfers::Transfers;
 use crate::uplink::Uplink;

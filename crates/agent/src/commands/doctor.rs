@@ -18,6 +18,7 @@ use tokio::time::timeout;
 
 use super::status::agent_runs;
 use super::{DataDir, Output, refuse_plain_text, say, tls};
+use crate::call_filter::{self, CallFilter};
 use crate::cgroup::{self, Outlook};
 use crate::config::{Config, ConfigError, MqttTransport, parse_server};
 use crate::credential::Credential;
@@ -423,6 +424,19 @@ fn tasks(checkup: &mut Checkup, data: &Path, config: &Config) {
             checkup.bad("task user", error.to_string(), mend);
         }
         Err(error) => checkup.bad("task user", error.to_string(), "make the user, or set task_user in agent.toml"),
+    }
+    let has_account = !matches!(&user, Ok(None));
+    match (call_filter::is_wanted(config.seccomp, has_account), CallFilter::of_tasks()) {
+        (true, Some(_)) => checkup.good("seccomp", "tasks are denied system calls that only an administrator needs"),
+        (true, None) => {
+            let mend = "use a kernel with CONFIG_SECCOMP_FILTER on x86_64, aarch64 or armv7, or set seccomp = \"off\"";
+            checkup.notice("seccomp", "this kernel or architecture has no filter of system calls", mend);
+        }
+        (false, _) => checkup.notice(
+            "seccomp",
+            "tasks may make all system calls",
+            "set seccomp = \"default\" in agent.toml, or run the agent as root and tasks under an account of their own",
+        ),
     }
 }
 

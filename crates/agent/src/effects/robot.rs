@@ -20,7 +20,7 @@ use self::held::Held;
 pub(crate) use self::outcomes::chain;
 use self::outcomes::{build_failure, fetch_failure, later, millis, outputs_code, pulled};
 use super::{Effects, Now};
-use crate::builder::{self, BuildOrder};
+use crate::builder::{self, BuildLimits, BuildOrder};
 use crate::cgroup::{Cgroups, RunLimits};
 use crate::config::{Config, ForwardSettings};
 use crate::disk::Need;
@@ -42,7 +42,7 @@ use crate::task_user::{TaskUser, TaskUserError};
 use crate::trust::{Trust, Use};
 use crate::vouching::Vouching;
 use crate::watcher::{Watched, Watcher};
-use crate::{battery, clock, disk, durable, environment, installation, launch, logs, script};
+use crate::{battery, call_filter, clock, disk, durable, environment, installation, launch, logs, script};
 
 mod graph;
 mod held;
@@ -80,6 +80,8 @@ pub struct Robot {
     forward: watch::Sender<ForwardSettings>,
     cgroups: Option<Cgroups>,
     task_user: Result<Option<TaskUser>, TaskUserError>,
+    /// Whether tasks and builds are denied system calls.
+    filter_calls: bool,
     mac: MacAddress,
 }
 
@@ -120,6 +122,7 @@ impl Robot {
             graph,
             supervisor: Supervisor::of_this_program(cgroups.clone()),
             cgroups,
+            filter_calls: call_filter::is_wanted(config.seccomp, matches!(&task_user, Ok(Some(_)))),
             task_user,
             ros: RwLock::new(held.installations()),
             own: config.clone(),
@@ -174,6 +177,7 @@ impl Robot {
             memory_bytes: limits.memory_mb.map(|megabytes| megabytes << 20).or(settings.memory_bytes),
             cpu_weight: limits.cpu_weight,
             pids: limits.pids.map(u64::from).or(settings.pids),
+            filter_calls: self.filter_calls,
         }
     }
 }
@@ -372,7 +376,7 @@ impl Effects for Robot {
             underlays: self.setup_files(&manifest)?,
             environment,
             log: self.data.task(&package.name).build_log(),
-            limits: self.held().build_limits,
+            limits: BuildLimits { filter_calls: self.filter_calls, ..self.held().build_limits },
             version: version.clone(),
             user,
             cgroups: self.cgroups.clone(),

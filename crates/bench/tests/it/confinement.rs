@@ -23,7 +23,7 @@ async fn a_task_runs_as_the_task_user_in_a_home_of_its_own() {
     open_directory(&found);
     let identity = fleet.robots[0].data().join("identity.json");
     let script = format!(
-        "id -u > {0}/user; cat {1} > {0}/identity; touch \"$HOME/log\" written && echo \"$HOME\" > {0}/home\n",
+        "id -u > {0}/user; cat {1} > {0}/identity; grep ^Seccomp: /proc/self/status > {0}/calls; touch \"$HOME/log\" written && echo \"$HOME\" > {0}/home\n",
         found.display(),
         identity.display()
     );
@@ -34,6 +34,7 @@ async fn a_task_runs_as_the_task_user_in_a_home_of_its_own() {
     assert_eq!(read("home"), own_home(&fleet.robots[0]));
     if nix::unistd::geteuid().is_root() {
         assert_eq!((read("user").as_str(), read("identity").as_str()), (TASK_USER, ""));
+        assert_eq!(read("calls"), "Seccomp:\t2", "its system calls are filtered");
     } else {
         eprintln!("unavailable: only root can run a task as another user");
     }

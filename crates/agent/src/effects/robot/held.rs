@@ -53,7 +53,7 @@ impl Held {
             set,
             environment: environment::of_this_robot(&variables),
             build_limits,
-            task_limits: RunLimits { memory_bytes, cpu_weight: None, pids: Some(config.task_pids) },
+            task_limits: RunLimits { memory_bytes, pids: Some(config.task_pids), ..RunLimits::default() },
             output_bytes: config.limits.output_bytes.unwrap_or(OUTPUT_BYTES),
             config,
             effective,

@@ -34,6 +34,10 @@ const TICKS_PER_SECOND: u64 = 100;
 /// The most that is read of an environment. Linux starts nothing with more than 6 MiB of it: a larger one was made up later.
 const MAX_ENVIRONMENT_BYTES: u64 = 6 << 20;
 
+/// What process 1 passes on to the agent.
+const PASSED_ON: [Signal; 6] =
+    [Signal::SIGTERM, Signal::SIGINT, Signal::SIGHUP, Signal::SIGQUIT, Signal::SIGUSR1, Signal::SIGUSR2];
+
 /// A process that can be told from every other, also from a later one with the same pid.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct ProcessIdentity {
@@ -351,6 +355,54 @@ pub fn become_shim() -> io::Result<()> {
     Ok(nix::sys::signal::sigprocmask(SigmaskHow::SIG_BLOCK, Some(&blocked), None)?)
 }
 
+/// Where the calling process is process 1, as in a container, orphans of its namespace become its children, and nobody else
+/// collects them. It then goes on as a child of its own (`None`), and what was called is left with that: it collects
+/// whatever ends, passes signals on to the child, and returns with it how that ended. So no wait of the agent's for what it
+/// has started can be taken from it. Call it before any other thread exists.
+pub fn collect_orphans_as_init() -> io::Result<Option<ExitStatus>> {
+    if std::process::id() != 1 {
+        return Ok(None);
+    }
+    let mut signals = SigSet::empty();
+    for signal in PASSED_ON.into_iter().chain([Signal::SIGCHLD]) {
+        signals.add(signal);
+    }
+    // Process 1 gets no signal that it neither handles nor blocks.
+    let before = signals.thread_swap_mask(SigmaskHow::SIG_BLOCK)?;
+    // SAFETY: there is one thread, so the child may do whatever its parent might.
+    match unsafe { nix::unistd::fork()? } {
+        nix::unistd::ForkResult::Child => {
+            before.thread_set_mask()?;
+            Ok(None)
+        }
+        nix::unistd::ForkResult::Parent { child } => collect_until_end_of(child, &signals).map(Some),
+    }
+}
+
+fn collect_until_end_of(child: Pid, signals: &SigSet) -> io::Result<ExitStatus> {
+    loop {
+        match waitpid(Pid::from_raw(-1), Some(WaitPidFlag::WNOHANG)) {
+            Ok(WaitStatus::Exited(pid, code)) if pid == child => return Ok(ExitStatus::Code(code)),
+            Ok(WaitStatus::Signaled(pid, signal, _)) if pid == child => return Ok(ExitStatus::Signal(signal as i32)),
+            Ok(WaitStatus::StillAlive) => {
+                // SAFETY: all zeros is a siginfo.
+                let mut told: libc::siginfo_t = unsafe { std::mem::zeroed() };
+                // SAFETY: the set and the answer outlive the call.
+                let number = unsafe { libc::sigwaitinfo(signals.as_ref(), &raw mut told) };
+                // What a terminal sends goes to the child as well.
+                if let Ok(signal) = Signal::try_from(number)
+                    && signal != Signal::SIGCHLD
+                    && told.si_code != libc::SI_KERNEL
+                {
+                    let _ = nix::sys::signal::kill(child, signal);
+                }
+            }
+            Ok(_) | Err(Errno::EINTR) => {}
+            Err(errno) => return Err(errno.into()),
+        }
+    }
+}
+
 /// Puts `/dev/null` in the place of standard input and output, which lets go of what they were.
 pub fn close_standard_streams() -> io::Result<()> {
     let null = File::options().read(true).write(true).open("/dev/null")?;
@@ -433,6 +485,17 @@ fn number(pid: Pid) -> u32 {
 impl AsFd for PidFd {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.0.as_fd()
+    }
+}
+
+impl ExitStatus {
+    /// As a shell gives it: of a signal 128 and its number.
+    pub fn as_shell_code(self) -> u8 {
+        let code = match self {
+            Self::Code(code) => code,
+            Self::Signal(signal) => 128 + signal,
+        };
+        u8::try_from(code).unwrap_or(u8::MAX)
     }
 }
 

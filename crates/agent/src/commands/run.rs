@@ -54,6 +54,9 @@ pub struct Arguments {
 /// Runs the agent until SIGINT or SIGTERM.
 pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     start_logging();
+    if let Some(status) = process::collect_orphans_as_init().context("cannot start as process 1")? {
+        return Ok(ExitCode::from(status.as_shell_code()));
+    }
     confinement::protect_this_process();
     // Two, also on one core: writing the ledger to a slow card must not keep the link from being served.
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;

@@ -43,7 +43,7 @@ fn assert_found(checks: &[Value], check: &str, verdict: &str, words: &str) {
     assert!(checks.iter().any(|found| matches(&found)), "{check}: {verdict} with {words:?} is not in {checks:?}");
 }
 
-fn write_identity(data: &Path, server: &str) {
+pub fn write_identity(data: &Path, server: &str) {
     write_identity_with(data, server, json!({}));
 }
 

@@ -12,6 +12,7 @@ mod flips;
 mod gate;
 mod graph;
 mod harness;
+mod init;
 mod launch;
 mod logs;
 mod outputs;

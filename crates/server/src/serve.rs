@@ -202,12 +202,8 @@ impl Server {
         }
         tasks.spawn(watch_load(app.clone(), load));
         tasks.spawn(database.attend(stop.clone()));
-        let service = listener::Service {
-            router: crate::http::router(app),
-            tls: tls.clone(),
-            connections: http_connections,
-            traffic: http_traffic,
-        };
+        let (router, connections, traffic) = (crate::http::router(app), http_connections, http_traffic);
+        let service = listener::Service { router, tls: tls.clone(), connections, traffic };
         let http = listener::serve(http, service, http_limits(&config), stop.clone(), REQUEST_PATIENCE);
         let addresses = publish(&data, http_address, &broker, tls.as_ref().map(Tls::pin))?;
         Ok(Self { data, addresses, store, unusable, broker, tls, stop, tasks, http: tokio::spawn(http), reports })

@@ -380,8 +380,11 @@ mod tests {
         let directory = tempfile::tempdir().expect("a directory");
         let (url, session) = (super::super::sqlite_url(&directory.path().join("database")), String::new());
         let long = Duration::from_secs(60);
-        let terms = Terms { url, session, count: 3, shared: 1, answer: long, greeting: long, wait: long };
-        let connections = Connections::open(terms).await.expect("opens");
+        let state = DatabaseState::unknown();
+        state.opened();
+        let (answer, greeting, connect, wait) = (long, long, long, long);
+        let terms = Terms { url, session, count: 3, shared: 1, answer, greeting, connect, wait, state };
+        let connections = Connections::new(terms);
         let shared = with_shared_reads(connections.lend()).await.expect("lent");
         let mut next = Box::pin(with_shared_reads(connections.lend()));
         assert!(poll!(next.as_mut()).is_pending());

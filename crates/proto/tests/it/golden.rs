@@ -241,7 +241,10 @@ fn documents_between_server_and_robot() {
     check("doorbell_inline.json", &Doorbell::State { envelope: envelope.clone(), inline });
     check("doorbell_notice.json", &Doorbell::Notice { generation: Generation(8) });
     check("report.json", &report());
-    check("status.json", &Status { online: true, start: 3, instance: parsed("i00000000000000c3"), connection: 2 });
+    check(
+        "status.json",
+        &Status { online: true, start: 3, instance: parsed("i00000000000000c3"), connection: 2, place: None },
+    );
     let reply = ReportReply {
         generation: Generation(7),
         name: parsed("atlas"),
@@ -433,6 +436,7 @@ fn documents_of_the_api() {
             batch: Some(10),
             max_failures: Some(1),
             expires_in_s: None,
+            restart: false,
             dry_run: false,
         },
     );

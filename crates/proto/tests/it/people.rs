@@ -27,7 +27,10 @@ fn people_and_their_tokens() {
     check("user_view_of_provider.json", &UserView { has_password: false, subject, ..user });
     let provider =
         ProviderView { title: "the lab".to_owned(), url: "https://fleet.example.org/api/v1/oidc".to_owned() };
-    check("session_view.json", &SessionView { expires_at_ms: Some(1_800_000_000_000), provider: Some(provider) });
+    check(
+        "session_view.json",
+        &SessionView { expires_at_ms: Some(1_800_000_000_000), provider: Some(provider), ended_by_restart: false },
+    );
     check_tolerance::<SessionView>("session_view.json");
     let token = TokenView {
         id: parsed("0123456789ab"),

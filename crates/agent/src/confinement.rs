@@ -124,6 +124,11 @@ impl Account {
     }
 }
 
+/// Lets no other process of this account look into this one.
+pub fn hide_this_process() {
+    let _ = prctl::set_dumpable(false);
+}
+
 /// Keeps what an agent that is root knows to itself, and lets it be the last to go when memory runs out. The shims inherit
 /// the second and call this for the first.
 pub fn protect_this_process() {

@@ -1,9 +1,14 @@
-//! The agent's own ROS 2 node: it says what the graph shows, and performs calls. It decides nothing about tasks.
+//! The robot's ROS 2 graph: what it shows, calls to nodes, what nodes say. It decides nothing about tasks.
 //!
-//! This is the only place that names `ros2-client`. Of it the graph uses the message types and the DDS library below it
-//! (RustDDS), not its `Node`, `Spinner` and `Client`: those fix the length of a gid when they are compiled, so one agent
-//! could not serve Humble and newer robots, keep 8 events and lose the rest, never take back an endpoint they announced,
-//! and take whatever a stranger says about its nodes.
+//! Everybody on the network may send to whatever takes part in a ROS graph, and the bytes are read by a large library. So
+//! the agent, which may be root, does not take part itself: it starts a program for it ([`program`]) that has no rights
+//! and little memory, and speaks with it over pipes ([`protocol`], [`connection`]). This program is the agent itself
+//! ([`serve`]) with a DDS participant ([`participant`]).
+//!
+//! These modules are the only place that names `ros2-client`. Of it the graph uses the message types and the DDS library
+//! below it (RustDDS), not its `Node`, `Spinner` and `Client`: those fix the length of a gid when they are compiled, so one
+//! agent could not serve Humble and newer robots, keep 8 events and lose the rest, never take back an endpoint they
+//! announced, and take whatever a stranger says about its nodes.
 //!
 //! It costs no C library. What it cannot do: see participants that speak neither UDP nor RTPS (Zenoh), or DDS Security.
 
@@ -12,54 +17,49 @@ pub mod feeds;
 pub mod names;
 pub mod owners;
 pub mod parameters;
+pub mod program;
+pub mod protocol;
 pub mod rate;
+pub mod serve;
 pub mod snapshot;
 
+mod connection;
 mod endpoint;
 mod lifecycle;
 mod observer;
 mod own;
+mod participant;
 mod services;
 
 use std::collections::BTreeSet;
-use std::error::Error;
-use std::net::{IpAddr, Ipv4Addr};
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use ros2_client::dds::rustdds::{DomainParticipant, DomainParticipantBuilder};
+use serde::{Deserialize, Serialize};
 use task_proto::ros::{GraphName, LifecycleState, Transition};
-use tokio::runtime::Handle;
 use tokio::sync::{broadcast, watch};
-use tokio_util::sync::CancellationToken;
+use tokio_util::sync::{CancellationToken, DropGuard};
 use tokio_util::task::TaskTracker;
 
-use self::endpoint::{Cdr, Delivery, Endpoints};
-use self::entities::GidForm;
-use self::feeds::Feeds;
+use self::connection::Connection;
 pub use self::feeds::{DiagnosticLevel, DiagnosticStatus, RosoutLine};
 use self::names::Role;
-use self::observer::{Matches, Observer};
-use self::own::OwnNode;
 pub use self::owners::Owners;
 pub use self::parameters::{ParameterValue, SetResult};
+pub use self::program::GraphProgram;
+use self::protocol::{Answer, Call, Feed, Request};
 pub use self::rate::{Rate, RateMeter};
-use self::services::Clients;
 pub use self::snapshot::{EndpointId, Node, Participant, ParticipantId, Snapshot};
 
 /// The highest domain id whose ports exist.
 pub const MAX_DOMAIN_ID: u16 = 232;
-/// Of each participant's list of nodes only the last counts; this many wait to be read.
-const DISCOVERY_DEPTH: i32 = 200;
-/// The kernel's buffers for each socket of the participant.
-const SOCKET_BUFFER_BYTES: usize = 1024 * 1024;
 
 /// How the agent takes part in the graph. It reads no environment: whoever opens the graph has.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct GraphSettings {
     /// `ROS_DOMAIN_ID`, at most [`MAX_DOMAIN_ID`].
     pub domain_id: u16,
-    /// Whether only this host's nodes are met.
+    /// Whether only this host's nodes are met. Then nothing from another host is read.
     pub localhost_only: bool,
     /// The agent's node. Two agents on one host, or in one domain, need two names.
     pub node_name: GraphName,
@@ -69,26 +69,33 @@ pub struct GraphSettings {
 }
 
 /// What can go wrong with the graph.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, Clone, PartialEq, thiserror::Error, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum GraphError {
     /// No such domain.
     #[error("ros_domain_id: {0} is not from 0 to {MAX_DOMAIN_ID}")]
     DomainId(u16),
+    /// The program that takes part could not be started.
+    #[error("cannot start the program that takes part in the ROS graph: {reason}")]
+    Start {
+        /// Why.
+        reason: String,
+    },
     /// The agent could not take part.
-    #[error("cannot take part in ROS domain {domain_id}")]
+    #[error("cannot take part in ROS domain {domain_id}: {reason}")]
     Join {
         /// The domain.
         domain_id: u16,
         /// Why.
-        source: Box<dyn Error + Send + Sync>,
+        reason: String,
     },
     /// A reader or writer could not be made.
-    #[error("cannot make a reader or writer for {topic}")]
+    #[error("cannot make a reader or writer for {topic}: {reason}")]
     Endpoint {
         /// The DDS topic.
         topic: String,
         /// Why.
-        source: Box<dyn Error + Send + Sync>,
+        reason: String,
     },
     /// Not a type's name.
     #[error("{0:?} is not a type like std_srvs/srv/Trigger")]
@@ -99,11 +106,14 @@ pub enum GraphError {
         /// The node.
         node: GraphName,
         /// The service.
-        service: &'static str,
+        service: String,
     },
     /// A message could not be put into bytes.
-    #[error("cannot encode the request")]
-    Encode(#[source] Box<dyn Error + Send + Sync>),
+    #[error("cannot encode the request: {reason}")]
+    Encode {
+        /// Why.
+        reason: String,
+    },
     /// A message could not be sent.
     #[error("cannot send the request: {reason}")]
     Write {
@@ -116,6 +126,7 @@ pub enum GraphError {
         /// The service.
         service: GraphName,
         /// How long was waited.
+        #[serde(rename = "within_ms", with = "milliseconds")]
         within: Duration,
     },
     /// There is a server, but no answer.
@@ -124,6 +135,7 @@ pub enum GraphError {
         /// The service.
         service: GraphName,
         /// How long was waited.
+        #[serde(rename = "within_ms", with = "milliseconds")]
         within: Duration,
     },
     /// An answer that is none.
@@ -136,21 +148,18 @@ pub enum GraphError {
     #[error("{node}: {found} {what} are too many")]
     TooMany {
         /// Of what.
-        what: &'static str,
+        what: String,
         /// The node.
         node: GraphName,
         /// How many.
         found: usize,
     },
-    /// The graph was closed, or the DDS library has ended.
+    /// More calls than can be under way at a time.
+    #[error("too many calls to nodes are under way")]
+    Busy,
+    /// The graph was closed, or the program that takes part in it has ended.
     #[error("the graph is closed")]
     Closed,
-}
-
-impl GraphError {
-    fn endpoint(topic: impl Into<String>, source: impl Error + Send + Sync + 'static) -> Self {
-        Self::Endpoint { topic: topic.into(), source: Box::new(source) }
-    }
 }
 
 /// A handle on the graph; when the last one is dropped the agent's node leaves.
@@ -160,66 +169,35 @@ pub struct Graph {
 }
 
 struct Shared {
+    connection: Arc<Connection>,
     snapshot: watch::Receiver<Arc<Snapshot>>,
-    clients: Clients,
-    endpoints: Arc<Endpoints>,
-    feeds: Feeds,
-    tasks: Tasks,
-}
-
-/// What runs for the graph. It ends when this is dropped.
-struct Tasks {
     closing: CancellationToken,
     tracker: TaskTracker,
-    /// Taken when it is dropped, for that blocks until the library's threads have ended.
-    participant: Option<DomainParticipant>,
+    _closes_with_this: DropGuard,
+}
+
+impl GraphSettings {
+    fn check(&self) -> Result<(), GraphError> {
+        if self.domain_id > MAX_DOMAIN_ID { Err(GraphError::DomainId(self.domain_id)) } else { Ok(()) }
+    }
+}
+
+impl GraphError {
+    fn endpoint(topic: impl Into<String>, source: impl std::error::Error) -> Self {
+        Self::Endpoint { topic: topic.into(), reason: source.to_string() }
+    }
 }
 
 impl Graph {
-    /// Takes part in the domain.
-    pub async fn open(settings: &GraphSettings) -> Result<Self, GraphError> {
-        if settings.domain_id > MAX_DOMAIN_ID {
-            return Err(GraphError::DomainId(settings.domain_id));
-        }
-        let settings = settings.clone();
-        let opened = tokio::task::spawn_blocking(move || Self::join(&settings)).await;
-        opened.unwrap_or(Err(GraphError::Closed))
-    }
-
-    /// Opens sockets and starts the library's threads; it must run inside the runtime, on a thread that may block.
-    fn join(settings: &GraphSettings) -> Result<Self, GraphError> {
-        let domain_id = settings.domain_id;
-        let mut builder = DomainParticipantBuilder::new(domain_id)
-            .socket_receive_buffer_size(SOCKET_BUFFER_BYTES)
-            .socket_send_buffer_size(SOCKET_BUFFER_BYTES);
-        if settings.localhost_only {
-            builder = builder.with_only_networks([IpAddr::V4(Ipv4Addr::LOCALHOST)]);
-        }
-        let participant = builder.build().map_err(|source| GraphError::Join { domain_id, source: Box::new(source) })?;
-        let tasks = Tasks {
-            closing: CancellationToken::new(),
-            tracker: TaskTracker::new(),
-            participant: Some(participant.clone()),
-        };
-        let endpoints = Arc::new(Endpoints::of(&participant)?);
-        let lasting = |depth| Delivery::Lasting { depth };
-        let announcer = endpoints.writer(names::DISCOVERY_TOPIC, names::DISCOVERY_TYPE, lasting(1))?;
-        let discovery =
-            endpoints.reader::<Cdr>(names::DISCOVERY_TOPIC, names::DISCOVERY_TYPE, lasting(DISCOVERY_DEPTH))?;
-        let form = GidForm::of_distro(settings.distro.as_deref());
-        let own = Arc::new(OwnNode::new(settings.node_name.clone(), form, announcer));
-        own.add(&[], &[]);
-        let (snapshots, snapshot) = watch::channel(Arc::new(Snapshot::empty(Instant::now())));
-        let (matches, _) = watch::channel(Matches::default());
-        let observer = Observer::new(participant, snapshots, matches.clone());
-        let closing = tasks.closing.clone();
-        tasks.tracker.spawn(async move {
-            // Without it nothing would ever change or match again.
-            let _closed = closing.clone().drop_guard();
-            observer.run(discovery, closing).await;
-        });
-        let clients = Clients::new(endpoints.clone(), own, matches);
-        Ok(Self { shared: Arc::new(Shared { snapshot, clients, endpoints, feeds: Feeds::default(), tasks }) })
+    /// Takes part in the domain, by a program that is started for it.
+    pub async fn open(settings: &GraphSettings, program: &GraphProgram) -> Result<Self, GraphError> {
+        settings.check()?;
+        let closing = CancellationToken::new();
+        let closes_with_this = closing.clone().drop_guard();
+        let tracker = TaskTracker::new();
+        let (connection, snapshot) = Connection::open(settings.clone(), program, &closing, &tracker).await?;
+        let shared = Shared { connection, snapshot, closing, tracker, _closes_with_this: closes_with_this };
+        Ok(Self { shared: Arc::new(shared) })
     }
 
     /// What the graph shows. [`Snapshot::at`] is at most a few seconds ago while the graph is open.
@@ -230,6 +208,11 @@ impl Graph {
     /// Wakes when the graph shows something else, many changes at once as one. It ends when the graph is closed.
     pub fn changes(&self) -> watch::Receiver<Arc<Snapshot>> {
         self.shared.snapshot.clone()
+    }
+
+    /// The process that takes part in the graph.
+    pub fn pid(&self) -> u32 {
+        self.shared.connection.pid()
     }
 
     /// Which of the participants in this snapshot live in these processes: only what a task started is its own.
@@ -247,8 +230,10 @@ impl Graph {
     /// Makes what [`Self::lifecycle_state`], [`Self::change_state`] and the parameter calls need for this node. A node that
     /// starts later finds it there, and answers the sooner.
     pub async fn prepare(&self, node: &GraphName) -> Result<(), GraphError> {
-        lifecycle::prepare(&self.shared.clients, node).await?;
-        parameters::prepare(&self.shared.clients, node).await
+        match self.call(Call::Prepare { node: node.clone() }, Duration::ZERO).await? {
+            Answer::Done => Ok(()),
+            _ => Err(GraphError::Malformed { service: node.clone() }),
+        }
     }
 
     /// Waits until a server of this service would hear a request, and its answer would be heard; says which participants
@@ -259,52 +244,33 @@ impl Graph {
         kind: Option<&str>,
         within: Duration,
     ) -> Result<BTreeSet<ParticipantId>, GraphError> {
-        let deadline = tokio::time::Instant::now() + within;
-        let kind = match kind {
-            Some(kind) => kind.to_owned(),
-            None => self.kind_of(service, deadline, within).await?,
-        };
-        let left = deadline.saturating_duration_since(tokio::time::Instant::now());
-        let answered = self.while_open(self.shared.clients.servers(service, &kind, left)).await;
-        answered.map_err(|error| match error {
-            GraphError::NoServer { service, .. } => GraphError::NoServer { service, within },
-            other => other,
-        })
-    }
-
-    async fn kind_of(
-        &self,
-        service: &GraphName,
-        deadline: tokio::time::Instant,
-        within: Duration,
-    ) -> Result<String, GraphError> {
-        let kind = |snapshot: &Snapshot| -> Option<String> {
-            let node = snapshot.servers_of(service).next()?;
-            node.services.iter().find(|offered| offered.name == *service).map(|offered| offered.kind.clone())
-        };
-        let mut changes = self.changes();
-        let found = tokio::time::timeout_at(deadline, changes.wait_for(|snapshot| kind(snapshot).is_some()));
-        match found.await {
-            Ok(Ok(snapshot)) => kind(&snapshot).ok_or(GraphError::Closed),
-            Ok(Err(_closed)) => Err(GraphError::Closed),
-            Err(_) => Err(GraphError::NoServer { service: service.clone(), within }),
+        let call = Call::Servers { service: service.clone(), kind: kind.map(str::to_owned) };
+        match self.call(call, within).await? {
+            Answer::Servers(participants) => Ok(participants),
+            _ => Err(GraphError::Malformed { service: service.clone() }),
         }
     }
 
     /// The state this lifecycle node is in.
     pub async fn lifecycle_state(&self, node: &GraphName, within: Duration) -> Result<LifecycleState, GraphError> {
-        self.while_open(lifecycle::state(&self.shared.clients, node, within)).await
+        match self.call(Call::LifecycleState { node: node.clone() }, within).await? {
+            Answer::State(state) => Ok(state),
+            _ => Err(GraphError::Malformed { service: node.clone() }),
+        }
     }
 
     /// Asks this lifecycle node for a transition, once; says whether it made it. After [`GraphError::NoAnswer`] it may
-    /// have: ask for its state.
+    /// have, and so after [`GraphError::Closed`]: ask for its state.
     pub async fn change_state(
         &self,
         node: &GraphName,
         transition: Transition,
         within: Duration,
     ) -> Result<bool, GraphError> {
-        self.while_open(lifecycle::change(&self.shared.clients, node, transition, within)).await
+        match self.call(Call::ChangeState { node: node.clone(), transition }, within).await? {
+            Answer::Changed(changed) => Ok(changed),
+            _ => Err(GraphError::Malformed { service: node.clone() }),
+        }
     }
 
     /// All parameters of this node. `within` is for each of the calls that takes.
@@ -313,9 +279,10 @@ impl Graph {
         node: &GraphName,
         within: Duration,
     ) -> Result<Vec<(String, ParameterValue)>, GraphError> {
-        let names = self.while_open(parameters::list(&self.shared.clients, node, within)).await?;
-        let values = self.while_open(parameters::get(&self.shared.clients, node, &names, within)).await?;
-        Ok(names.into_iter().zip(values).collect())
+        match self.call(Call::Parameters { node: node.clone() }, within).await? {
+            Answer::Parameters(parameters) => Ok(parameters),
+            _ => Err(GraphError::Malformed { service: node.clone() }),
+        }
     }
 
     /// One parameter of this node; [`ParameterValue::NotSet`] where it has none of that name.
@@ -325,8 +292,10 @@ impl Graph {
         name: &str,
         within: Duration,
     ) -> Result<ParameterValue, GraphError> {
-        let values = self.while_open(parameters::get(&self.shared.clients, node, &[name.to_owned()], within)).await?;
-        Ok(values.into_iter().next().unwrap_or(ParameterValue::NotSet))
+        match self.call(Call::Parameter { node: node.clone(), name: name.to_owned() }, within).await? {
+            Answer::Parameter(value) => Ok(value),
+            _ => Err(GraphError::Malformed { service: node.clone() }),
+        }
     }
 
     /// Sets these parameters, each for itself; says what became of each, in their order.
@@ -336,132 +305,71 @@ impl Graph {
         parameters: Vec<(String, ParameterValue)>,
         within: Duration,
     ) -> Result<Vec<SetResult>, GraphError> {
-        self.while_open(parameters::set(&self.shared.clients, node, parameters, within)).await
+        match self.call(Call::SetParameters { node: node.clone(), parameters }, within).await? {
+            Answer::Set(results) => Ok(results),
+            _ => Err(GraphError::Malformed { service: node.clone() }),
+        }
     }
 
     /// What nodes log, from now on; the first who asks also gets the last lines from before, for nodes keep them. A
     /// listener that is too slow is told how many lines it missed.
     pub fn rosout(&self) -> Result<broadcast::Receiver<Arc<RosoutLine>>, GraphError> {
-        let Shared { feeds, endpoints, snapshot, tasks, .. } = &*self.shared;
-        let (receiver, running) = feeds.rosout(endpoints, snapshot.clone(), &tasks.closing)?;
-        running.map(|running| tasks.tracker.spawn(running));
-        Ok(receiver)
+        let listener = self.shared.connection.rosout()?;
+        self.shared.connection.say(Request::Listen(Feed::Rosout))?;
+        Ok(listener)
     }
 
     /// What nodes say about the robot's parts, from now on.
     pub fn diagnostics(&self) -> Result<broadcast::Receiver<Arc<DiagnosticStatus>>, GraphError> {
-        let Shared { feeds, endpoints, tasks, .. } = &*self.shared;
-        let (receiver, running) = feeds.diagnostics(endpoints, &tasks.closing)?;
-        running.map(|running| tasks.tracker.spawn(running));
-        Ok(receiver)
+        let listener = self.shared.connection.diagnostics()?;
+        self.shared.connection.say(Request::Listen(Feed::Diagnostics))?;
+        Ok(listener)
+    }
+
+    /// How many messages of nodes came too fast to reach this handle's listeners at all.
+    pub fn missed_messages(&self) -> u64 {
+        self.shared.connection.missed_messages()
     }
 
     /// Counts the messages of this topic, whose type is `kind`, whatever its publishers' settings are.
     pub fn rate(&self, topic: &GraphName, kind: &str) -> Result<RateMeter, GraphError> {
-        let dds_kind = names::type_to_dds(Role::Topic, kind).ok_or_else(|| GraphError::Kind(kind.to_owned()))?;
-        let topic = names::to_dds(Role::Topic, topic);
-        let reader = self.shared.endpoints.reader(&topic, &dds_kind, Delivery::BestEffort)?;
-        let (meter, counting) = RateMeter::new(reader, &self.shared.tasks.closing);
-        self.shared.tasks.tracker.spawn(counting);
-        Ok(meter)
+        names::type_to_dds(Role::Topic, kind).ok_or_else(|| GraphError::Kind(kind.to_owned()))?;
+        Connection::meter(&self.shared.connection, topic, kind)
     }
 
     /// Whether it shows nothing new any more.
     pub fn is_closed(&self) -> bool {
-        self.shared.tasks.closing.is_cancelled()
+        self.shared.closing.is_cancelled()
     }
 
-    /// What `call` gives, or an error as soon as the graph is closed.
-    async fn while_open<T>(&self, call: impl Future<Output = Result<T, GraphError>>) -> Result<T, GraphError> {
-        self.shared.tasks.closing.run_until_cancelled(call).await.unwrap_or(Err(GraphError::Closed))
+    async fn call(&self, call: Call, within: Duration) -> Result<Answer, GraphError> {
+        self.shared.connection.call(call, within).await
     }
 
     /// Leaves the graph. Other handles see nothing any more.
     pub async fn close(self) {
-        self.shared.tasks.closing.cancel();
-        self.shared.tasks.tracker.close();
-        self.shared.tasks.tracker.wait().await;
-        // If this was the last handle the rest goes here, where it may block.
-        let _ = tokio::task::spawn_blocking(move || drop(self)).await;
-    }
-}
-
-impl Drop for Tasks {
-    fn drop(&mut self) {
-        self.closing.cancel();
-        let participant = self.participant.take();
-        if let Ok(runtime) = Handle::try_current() {
-            runtime.spawn_blocking(move || drop(participant));
-        }
+        self.shared.closing.cancel();
+        self.shared.tracker.close();
+        self.shared.tracker.wait().await;
     }
 }
 
 /// The name of a node's own service.
-fn service_of(node: &GraphName, service: &'static str) -> Result<GraphName, GraphError> {
-    format!("{node}/{service}").parse().map_err(|_| GraphError::Name { node: node.clone(), service })
+fn service_of(node: &GraphName, service: &str) -> Result<GraphName, GraphError> {
+    let too_long = |_| GraphError::Name { node: node.clone(), service: service.to_owned() };
+    format!("{node}/{service}").parse().map_err(too_long)
 }
 
-#[cfg(test)]
-mod tests {
+mod milliseconds {
     use std::time::Duration;
 
-    use ros2_client::dds::rustdds::RTPSEntity;
+    use serde::{Deserialize as _, Deserializer, Serializer};
 
-    use super::endpoint::Writer;
-    use super::entities::{NodeEntities, ParticipantEntities};
-    use super::*;
-
-    const DOMAIN: u16 = 96;
-
-    fn participant() -> DomainParticipant {
-        let builder = DomainParticipantBuilder::new(DOMAIN);
-        builder.with_only_networks([IpAddr::V4(Ipv4Addr::LOCALHOST)]).build().expect("participant")
+    pub fn serialize<S: Serializer>(duration: &Duration, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_u64(u64::try_from(duration.as_millis()).unwrap_or(u64::MAX))
     }
 
-    async fn open(node_name: &str) -> Graph {
-        let node_name = node_name.parse().expect("name");
-        let settings = GraphSettings { domain_id: DOMAIN, localhost_only: true, node_name, distro: None };
-        Graph::open(&settings).await.expect("graph")
-    }
-
-    async fn shows(graph: &Graph, node: &str) -> Arc<Snapshot> {
-        let node: GraphName = node.parse().expect("name");
-        let mut changes = graph.changes();
-        let found = changes.wait_for(|snapshot| snapshot.named(&node).next().is_some());
-        let found = tokio::time::timeout(Duration::from_secs(60), found).await;
-        found.unwrap_or_else(|_| panic!("not within a minute: {node}")).expect("open").clone()
-    }
-
-    fn says(writer: &Writer, participant: ParticipantId, node: &str, form: GidForm) {
-        let (name, readers, writers) = (node.parse().expect("name"), Vec::new(), Vec::new());
-        let nodes = vec![NodeEntities { name, readers, writers }];
-        let entities = ParticipantEntities { participant, nodes, misnamed: 0 };
-        writer.put(Cdr::little_endian(entities.encode(form)));
-    }
-
-    #[tokio::test(flavor = "multi_thread")]
-    async fn both_forms_are_heard_garbage_is_not_and_nobody_speaks_for_another() {
-        let graph = open("/hearer").await;
-        let victim = open("/victim").await;
-        let stolen = shows(&graph, "/victim").await.nodes[0].participant;
-        let forger = participant();
-        let own = EndpointId::of(forger.guid()).participant();
-        let endpoints = Endpoints::of(&forger).expect("endpoints");
-        let lasting = Delivery::Lasting { depth: 500 };
-        let writer = endpoints.writer(names::DISCOVERY_TOPIC, names::DISCOVERY_TYPE, lasting).expect("writer");
-        for length in (0..2000).step_by(7) {
-            let byte = |at: usize| u8::try_from((length * 31 + at * 17) % 256).expect("a byte");
-            writer.put(Cdr::little_endian((0..length).map(byte).collect()));
-        }
-        writer.put(Cdr::little_endian(vec![0xff; 2 * endpoint::MAX_MESSAGE_BYTES]));
-        says(&writer, stolen, "/stolen", GidForm::Bytes16);
-        // Messages of one writer keep their order: what came before was dealt with when this shows.
-        for (node, form) in [("/old", GidForm::Bytes24), ("/new", GidForm::Bytes16), ("/older", GidForm::Bytes24)] {
-            says(&writer, own, node, form);
-            let snapshot = shows(&graph, node).await;
-            let names: Vec<_> = snapshot.nodes.iter().map(|node| node.name.as_str()).collect();
-            assert_eq!(names, if node < "/victim" { [node, "/victim"] } else { ["/victim", node] });
-        }
-        victim.close().await;
+    pub fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Duration, D::Error> {
+        u64::deserialize(deserializer).map(Duration::from_millis)
     }
 }

@@ -39,6 +39,9 @@ enum Command {
         #[arg(long)]
         dir: PathBuf,
     },
+    /// Take part in the ROS graph for the agent; only the agent itself calls this
+    #[command(hide = true)]
+    Graph,
 }
 
 fn main() -> ExitCode {
@@ -52,6 +55,7 @@ fn main() -> ExitCode {
         Command::Doctor(arguments) => commands::doctor::run(arguments),
         Command::Man(arguments) => commands::man::run(&arguments, CommandLine::command()),
         Command::Shim { dir } => commands::shim::run(&dir),
+        Command::Graph => commands::graph::run(),
     };
     outcome.unwrap_or_else(|error| {
         commands::print_error(&error);

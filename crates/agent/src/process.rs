@@ -17,6 +17,7 @@ use std::time::Duration;
 
 use nix::errno::Errno;
 use nix::sys::prctl;
+use nix::sys::resource::{Resource, setrlimit};
 use nix::sys::signal::{SigHandler, SigSet, SigmaskHow, Signal};
 use nix::sys::wait::{WaitPidFlag, WaitStatus, waitpid};
 use nix::unistd::Pid;
@@ -337,6 +338,34 @@ pub fn spawn_gate(
     // SAFETY: `enter_session` only makes async-signal-safe system calls and allocates nothing.
     unsafe { command.pre_exec(enter_session) };
     tokio::process::Command::from(command).spawn()
+}
+
+/// Starts `program graph`, confined, in its own session, `nice`, with at most `data_bytes` of memory whatever control group
+/// it is in. It is spoken with over its standard input and output, and ends with the former.
+pub fn spawn_graph(
+    program: &Path,
+    environment: &BTreeMap<String, String>,
+    nice: i32,
+    data_bytes: u64,
+    confinement: Confinement,
+) -> io::Result<tokio::process::Child> {
+    let mut command = command(program, environment);
+    command.arg0("task-agent").arg("graph").current_dir("/");
+    command.stdin(Stdio::piped()).stdout(Stdio::piped());
+    let prepare = move || {
+        enter_session()?;
+        // A courtesy to others: where it is refused it runs all the same.
+        // SAFETY: takes integers only.
+        let _ = unsafe { libc::setpriority(libc::PRIO_PROCESS, 0, nice) };
+        setrlimit(Resource::RLIMIT_DATA, data_bytes, data_bytes)?;
+        setrlimit(Resource::RLIMIT_CORE, 0, 0)?;
+        prctl::set_no_new_privs()?;
+        confinement.enter()
+    };
+    // SAFETY: `prepare` only makes async-signal-safe system calls and allocates nothing.
+    unsafe { command.pre_exec(prepare) };
+    let mut command = tokio::process::Command::from(command);
+    command.kill_on_drop(true).spawn()
 }
 
 /// Makes the caller the shim of what it starts: orphans below it become its children, signals meant for others do not

@@ -34,8 +34,8 @@ const ANSWER_TIMEOUT: Duration = Duration::from_secs(2);
 const WORK_TIMEOUT: Duration = Duration::from_secs(15);
 /// How long the names of what was just stopped may take to leave the graph.
 const LEAVE_TIMEOUT: Duration = Duration::from_secs(2);
-/// When to try again after the graph could not be opened.
-const RETRY: Duration = Duration::from_secs(10);
+/// When to ask again for a graph that could not be opened. How often it is tried is not decided here.
+const RETRY: Duration = Duration::from_secs(2);
 /// A parameter that every node has.
 const EVERYWHERE: &str = "use_sim_time";
 

@@ -15,6 +15,7 @@ mod approval;
 pub mod configure;
 pub mod doctor;
 pub mod enroll;
+pub mod graph;
 pub mod hold;
 pub mod man;
 pub mod run;

@@ -26,6 +26,7 @@ use crate::config::{Config, ForwardSettings};
 use crate::disk::Need;
 use crate::fetch::{self, Asks, FetchError, Fetcher};
 use crate::gate::Gate;
+use crate::graph::GraphProgram;
 use crate::graph_access::GraphAccess;
 use crate::installation::Installation;
 use crate::layout::{DataDir, VersionDir};
@@ -97,7 +98,10 @@ impl Robot {
     ) -> Self {
         let held = Held::of(config, RobotSettings::default());
         let cgroups = Cgroups::find();
-        let graph = GraphAccess::of_robot(mac, data.clone());
+        let task_user = TaskUser::find(config.task_user.as_deref());
+        let user = task_user.as_ref().ok().and_then(Option::as_ref);
+        let program = GraphProgram::of_this_agent(data.root(), cgroups.clone(), user);
+        let graph = GraphAccess::of_robot(mac, data.clone(), program);
         graph.limit(config.limits.log_bytes);
         let fetcher = Arc::new(fetcher);
         let vouching = config.trust.clone().map(|settings| {

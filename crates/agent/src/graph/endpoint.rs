@@ -107,7 +107,7 @@ impl Cdr {
         let mut body = header.to_vec();
         let mut message = Vec::new();
         to_writer_with_rep_id(&mut message, value, RepresentationIdentifier::CDR_LE)
-            .map_err(|source| GraphError::Encode(source.into()))?;
+            .map_err(|source| GraphError::Encode { reason: source.to_string() })?;
         body.append(&mut message);
         Ok(Self::little_endian(body))
     }

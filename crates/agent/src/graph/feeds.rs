@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use futures_util::StreamExt;
 use ros2_client::Log;
 use ros2_client::builtin_interfaces::Time;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use task_proto::log::LogLevel;
 use task_proto::ros::GraphName;
 use tokio::sync::{broadcast, watch};
@@ -24,11 +24,13 @@ pub const CAPACITY: usize = 1024;
 pub const MAX_TEXT_BYTES: usize = 8 * 1024;
 /// The most statuses of one message on `/diagnostics`, and the most values of one status.
 pub const MAX_STATUSES: usize = 256;
+/// The most bytes that the values of one status may have together: many statuses wait for a slow listener.
+const MAX_VALUES_BYTES: usize = 16 * 1024;
 /// How many writers' numbers are remembered.
 const MAX_WRITERS: usize = 4096;
 
 /// A log line of a node.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RosoutLine {
     /// When, by the node's clock: milliseconds since the Unix epoch.
     pub at_ms: u64,
@@ -51,7 +53,8 @@ pub struct RosoutLine {
 }
 
 /// How a part of the robot is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum DiagnosticLevel {
     /// Well.
     Ok,
@@ -59,12 +62,13 @@ pub enum DiagnosticLevel {
     Warn,
     /// Not well.
     Error,
-    /// Nothing was heard of it.
+    /// Nothing was heard of it, or something this version does not know.
+    #[serde(other)]
     Stale,
 }
 
 /// A status on `/diagnostics`.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DiagnosticStatus {
     /// When, by the node's clock: milliseconds since the Unix epoch.
     pub at_ms: u64,
@@ -237,7 +241,13 @@ impl DiagnosticStatus {
             2 => DiagnosticLevel::Error,
             _ => DiagnosticLevel::Stale,
         };
+        let mut left = MAX_VALUES_BYTES;
         let values = status.values.into_iter().take(MAX_STATUSES).map(|(name, value)| (cut(name), cut(value)));
+        let values = values.take_while(|(name, value)| {
+            let fits = name.len() + value.len() <= left;
+            left = left.saturating_sub(name.len() + value.len());
+            fits
+        });
         Self {
             at_ms: millis(stamp),
             level,

@@ -7,6 +7,7 @@ use ros2_client::rcl_interfaces::{
     GetParametersRequest, GetParametersResponse, ListParametersRequest, ListParametersResponse, SetParametersRequest,
     SetParametersResponse,
 };
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use serde_json::{Number, Value};
 use task_proto::ros::GraphName;
 
@@ -23,7 +24,8 @@ const GET: (&str, &str) = ("get_parameters", "rcl_interfaces/srv/GetParameters")
 const SET: (&str, &str) = ("set_parameters", "rcl_interfaces/srv/SetParameters");
 
 /// A parameter's value, as in `rcl_interfaces/msg/ParameterValue`.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum ParameterValue {
     /// Declared without a value, or not declared.
     NotSet,
@@ -32,7 +34,7 @@ pub enum ParameterValue {
     /// A whole number.
     Integer(i64),
     /// A number.
-    Double(f64),
+    Double(#[serde(with = "double")] f64),
     /// A text.
     String(String),
     /// Bytes.
@@ -42,13 +44,13 @@ pub enum ParameterValue {
     /// Whole numbers.
     Integers(Vec<i64>),
     /// Numbers.
-    Doubles(Vec<f64>),
+    Doubles(#[serde(with = "doubles")] Vec<f64>),
     /// Texts.
     Strings(Vec<String>),
 }
 
 /// What became of one parameter that was set.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SetResult {
     /// The parameter.
     pub name: String,
@@ -74,7 +76,7 @@ pub(super) async fn list(clients: &Clients, node: &GraphName, within: Duration) 
         clients.call(&service, LIST.1, &request, within, Repeat::WhileThereIsTime).await?;
     let names = answer.result.names;
     if names.len() > MAX_PARAMETERS {
-        return Err(GraphError::TooMany { what: "parameters", node: node.clone(), found: names.len() });
+        return Err(GraphError::TooMany { what: "parameters".to_owned(), node: node.clone(), found: names.len() });
     }
     Ok(names)
 }
@@ -112,7 +114,7 @@ pub(super) async fn set(
     within: Duration,
 ) -> Result<Vec<SetResult>, GraphError> {
     if parameters.len() > MAX_PARAMETERS {
-        return Err(GraphError::TooMany { what: "parameters", node: node.clone(), found: parameters.len() });
+        return Err(GraphError::TooMany { what: "parameters".to_owned(), node: node.clone(), found: parameters.len() });
     }
     let service = service_of(node, SET.0)?;
     let names: Vec<_> = parameters.iter().map(|(name, _)| name.clone()).collect();
@@ -240,6 +242,51 @@ impl ParameterValue {
             Self::Strings(values) => Library::StringArray(values),
         }
         .into()
+    }
+}
+
+/// A number in JSON, or a text where JSON has no such number.
+#[derive(Serialize, Deserialize)]
+#[serde(untagged)]
+enum Written {
+    Number(f64),
+    Text(String),
+}
+
+impl Written {
+    fn of(value: f64) -> Self {
+        if value.is_finite() { Self::Number(value) } else { Self::Text(value.to_string()) }
+    }
+
+    fn read<E: serde::de::Error>(self) -> Result<f64, E> {
+        match self {
+            Self::Number(value) => Ok(value),
+            Self::Text(text) => text.parse().map_err(E::custom),
+        }
+    }
+}
+
+mod double {
+    use super::{Deserialize, Deserializer, Serialize, Serializer, Written};
+
+    pub fn serialize<S: Serializer>(value: &f64, serializer: S) -> Result<S::Ok, S::Error> {
+        Written::of(*value).serialize(serializer)
+    }
+
+    pub fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+        Written::deserialize(deserializer)?.read()
+    }
+}
+
+mod doubles {
+    use super::{Deserialize, Deserializer, Serializer, Written};
+
+    pub fn serialize<S: Serializer>(values: &[f64], serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_seq(values.iter().map(|value| Written::of(*value)))
+    }
+
+    pub fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<f64>, D::Error> {
+        Vec::<Written>::deserialize(deserializer)?.into_iter().map(Written::read).collect()
     }
 }
 

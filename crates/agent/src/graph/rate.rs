@@ -6,6 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use futures_util::StreamExt;
+use tokio::sync::watch;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
 use super::endpoint::{Counted, Reader};
@@ -16,8 +17,14 @@ pub const WINDOW: Duration = Duration::from_secs(5);
 const MAX_SAMPLES: usize = 4096;
 
 /// Counts the messages of one topic until it is dropped.
-pub struct RateMeter {
+pub struct Counter {
     arrivals: Arc<Mutex<Arrivals>>,
+    _ends_with_this: DropGuard,
+}
+
+/// How often a topic carries a message, as it was said last, until it is dropped.
+pub struct RateMeter {
+    last: watch::Receiver<(Rate, Instant)>,
     _ends_with_this: DropGuard,
 }
 
@@ -32,6 +39,11 @@ pub struct Rate {
     pub samples: u64,
 }
 
+impl Rate {
+    /// Of a topic of which nothing is known yet.
+    pub(super) const NONE: Self = Self { hz: 0.0, since_last: None, samples: 0 };
+}
+
 #[derive(Debug)]
 struct Arrivals {
     since: Instant,
@@ -39,7 +51,7 @@ struct Arrivals {
     samples: u64,
 }
 
-impl RateMeter {
+impl Counter {
     /// Counts what this reader gets; the future does it.
     pub(super) fn new(
         reader: Reader<Counted>,
@@ -54,6 +66,19 @@ impl RateMeter {
     /// The rate now.
     pub fn rate(&self) -> Rate {
         self.arrivals.lock().unwrap_or_else(PoisonError::into_inner).rate(Instant::now())
+    }
+}
+
+impl RateMeter {
+    /// Of what `last` says, and when it was said. `ending` is cancelled when it is dropped.
+    pub(super) fn new(last: watch::Receiver<(Rate, Instant)>, ending: CancellationToken) -> Self {
+        Self { last, _ends_with_this: ending.drop_guard() }
+    }
+
+    /// The rate now.
+    pub fn rate(&self) -> Rate {
+        let (rate, at) = *self.last.borrow();
+        Rate { since_last: rate.since_last.map(|since| since + at.elapsed()), ..rate }
     }
 }
 

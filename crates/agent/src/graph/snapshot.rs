@@ -7,6 +7,7 @@ use std::net::SocketAddr;
 use std::time::Instant;
 
 use ros2_client::dds::rustdds::GUID;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use task_proto::ros::{Endpoint, GraphName};
 
 use super::entities::ParticipantEntities;
@@ -37,19 +38,23 @@ pub struct Snapshot {
 }
 
 /// A node of the graph.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct Node {
     /// Its full name.
     pub name: GraphName,
     /// The participant it is in.
     pub participant: ParticipantId,
     /// The topics it publishes.
+    #[serde(default)]
     pub publishers: Vec<Endpoint>,
     /// The topics it subscribes to.
+    #[serde(default)]
     pub subscriptions: Vec<Endpoint>,
     /// The services it offers.
+    #[serde(default)]
     pub services: Vec<Endpoint>,
     /// The services it calls.
+    #[serde(default)]
     pub clients: Vec<Endpoint>,
 }
 
@@ -226,6 +231,29 @@ impl fmt::Display for ParticipantId {
 impl fmt::Debug for ParticipantId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         fmt::Display::fmt(self, f)
+    }
+}
+
+impl Serialize for ParticipantId {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+impl<'de> Deserialize<'de> for ParticipantId {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let text = String::deserialize(deserializer)?;
+        let digits = text.as_bytes();
+        let invalid = || serde::de::Error::custom("a participant's id has 24 hexadecimal digits");
+        let mut id = [0; 12];
+        if digits.len() != 2 * id.len() || !digits.iter().all(u8::is_ascii_hexdigit) {
+            return Err(invalid());
+        }
+        for (byte, digits) in id.iter_mut().zip(digits.chunks(2)) {
+            let digits = std::str::from_utf8(digits).map_err(|_| invalid())?;
+            *byte = u8::from_str_radix(digits, 16).map_err(|_| invalid())?;
+        }
+        Ok(Self(id))
     }
 }
 

@@ -55,6 +55,7 @@ pub async fn keep(graph: Graph, data: DataDir, log_bytes: Option<u64>) {
     tokio::task::spawn_blocking(move || recorder.run(waiting));
     let mut owners = Owners { data, known: HashMap::new(), looked_at: None };
     let (mut missed, mut changes) = (0, graph.changes());
+    let mut missed_before = 0;
     loop {
         let message = tokio::select! {
             // Cancel-safe: a message stays in the channel until it is received.
@@ -81,6 +82,9 @@ pub async fn keep(graph: Graph, data: DataDir, log_bytes: Option<u64>) {
                 Err(_) => return,
             },
         };
+        let missed_so_far = graph.missed_messages();
+        let more = missed_so_far.saturating_sub(std::mem::replace(&mut missed_before, missed_so_far));
+        missed = u64::saturating_add(missed, more);
         if missed > 0 && messages.try_send(Message::Missed(missed)).is_ok() {
             missed = 0;
         }

@@ -5,7 +5,7 @@ use task_proto::log::LogLevel;
 use task_proto::ros::{Endpoint, LifecycleState, Transition};
 
 use crate::harness::{eventually, within};
-use crate::ros::{CALL, RosNode, name, open, open_as};
+use crate::ros::{CALL, RosNode, name, open, open_as, program};
 
 /// Waits until the graph shows it.
 async fn shows(graph: &Graph, what: &str, condition: impl Fn(&Snapshot) -> bool) -> std::sync::Arc<Snapshot> {
@@ -233,7 +233,7 @@ async fn domains_do_not_mix_and_two_agents_on_one_host_do_not_confuse_each_other
 #[tokio::test(flavor = "multi_thread")]
 async fn a_domain_that_does_not_exist_is_refused_by_its_key() {
     let settings = GraphSettings { domain_id: 233, localhost_only: true, node_name: name("/taskd_test"), distro: None };
-    let refused = Graph::open(&settings).await.err().expect("a refusal");
+    let refused = Graph::open(&settings, &program()).await.err().expect("a refusal");
     assert_eq!(refused.to_string(), "ros_domain_id: 233 is not from 0 to 232");
 }
 
@@ -256,7 +256,7 @@ async fn nodes_of_a_robot_with_another_distribution_see_the_agent() {
             node_name: name("/taskd_here"),
             distro: Some(distro.to_owned()),
         };
-        let graph = within("the graph to open", Graph::open(&settings)).await.unwrap();
+        let graph = within("the graph to open", Graph::open(&settings, &program())).await.unwrap();
         let other = open_as(domain_id, "/taskd_there").await;
         shows(&other, "the agent of either form", |snapshot| has(snapshot, "/taskd_here")).await;
         graph.close().await;

@@ -8,7 +8,7 @@ use task_proto::log::{LogLevel, LogLine, LogSource};
 use task_proto::report::RosFacts;
 
 use crate::harness::within;
-use crate::ros::{RosNode, open};
+use crate::ros::{RosNode, open, program};
 
 /// Longer than a look at who takes part in the graph takes, shorter than a test may.
 const PAUSE: std::time::Duration = std::time::Duration::from_millis(200);
@@ -63,7 +63,7 @@ async fn what_nodes_say_is_kept_with_their_task() {
 async fn what_nodes_say_is_kept_in_files_of_the_size_that_is_set_when_the_graph_is_opened() {
     let temp = tempfile::tempdir().unwrap();
     let data = DataDir::new(temp.path()).unwrap();
-    let access = GraphAccess::of_robot("02:00:00:00:00:01".parse().unwrap(), data.clone());
+    let access = GraphAccess::of_robot("02:00:00:00:00:01".parse().unwrap(), data.clone(), program());
     access.limit(Some(4096));
     let facts = RosFacts { distro: "jazzy".to_owned(), rmw: None, domain_id: Some(119), localhost_only: true };
     let graph = access.open(Some(&facts)).await.unwrap();

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::Duration;
 
-use task_agent::graph::{Graph, GraphSettings};
+use task_agent::graph::{Graph, GraphProgram, GraphSettings};
 use task_proto::ros::GraphName;
 use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader};
 use tokio::process::{Child, ChildStdin, ChildStdout, Command};
@@ -26,6 +26,11 @@ pub fn name(text: &str) -> GraphName {
     text.parse().expect("a ROS name")
 }
 
+/// The program that takes part in the graph, with the rights that the agent gives it.
+pub fn program() -> GraphProgram {
+    GraphProgram::at(env!("CARGO_BIN_EXE_task-agent"))
+}
+
 /// The agent's node in this domain, which stays on this host.
 pub async fn open(domain_id: u16) -> Graph {
     open_as(domain_id, "/taskd_test").await
@@ -34,7 +39,7 @@ pub async fn open(domain_id: u16) -> Graph {
 /// The same with a name of its own.
 pub async fn open_as(domain_id: u16, node_name: &str) -> Graph {
     let settings = GraphSettings { domain_id, localhost_only: true, node_name: name(node_name), distro: None };
-    within("the graph to open", Graph::open(&settings)).await.expect("the graph")
+    within("the graph to open", Graph::open(&settings, &program())).await.expect("the graph")
 }
 
 /// A script of `tests/it/ros`, running.

@@ -1,0 +1,47 @@
+//! `task-agent graph`: takes part in the ROS graph for an agent. Only the agent calls it.
+
+use std::io::IsTerminal as _;
+use std::os::fd::{AsFd as _, BorrowedFd};
+use std::process::ExitCode;
+
+use anyhow::Context as _;
+use task_proto::line::OneLineEach;
+use tokio::net::unix::pipe;
+
+use crate::confinement;
+use crate::graph::serve;
+
+/// What takes more than a moment, and so has a thread of its own: opening the graph, leaving it.
+const MAX_BLOCKING_THREADS: usize = 2;
+
+/// Does what is read on standard input until that ends.
+pub fn run() -> anyhow::Result<ExitCode> {
+    start_logging();
+    confinement::hide_this_process();
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .max_blocking_threads(MAX_BLOCKING_THREADS)
+        .enable_all()
+        .build()?;
+    let outcome = runtime.block_on(async {
+        let (input, output) = (std::io::stdin(), std::io::stdout());
+        let input = pipe::Receiver::from_owned_fd(owned(input.as_fd())?).context("standard input")?;
+        let output = pipe::Sender::from_owned_fd(owned(output.as_fd())?).context("standard output")?;
+        serve::serve(input, output).await.context("the agent")
+    });
+    // A thread of the DDS library that hangs is no reason to stay.
+    runtime.shutdown_background();
+    outcome.map(|()| ExitCode::SUCCESS)
+}
+
+fn owned(stream: BorrowedFd<'_>) -> anyhow::Result<std::os::fd::OwnedFd> {
+    stream.try_clone_to_owned().context("cannot use the pipes to the agent")
+}
+
+/// What strangers send is no reason to write a line for each of it.
+fn start_logging() {
+    let filter = tracing_subscriber::EnvFilter::try_from_env("TASK_AGENT_LOG")
+        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn,rustdds=off"));
+    let colours = std::io::stderr().is_terminal();
+    let writer = move || OneLineEach::new(std::io::stderr(), colours);
+    tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colours).with_writer(writer).init();
+}

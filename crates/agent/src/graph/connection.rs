@@ -1,0 +1,354 @@
+//! The agent's end of the pipes to the program that takes part in the graph: it passes requests on, keeps what the program
+//! said last, and ends the program when nobody wants it any more, when it hangs, or when it does not keep to the protocol.
+//! The program reads what strangers send, so whatever it says is bounded here, and decides nothing.
+
+use std::collections::HashMap;
+use std::pin::pin;
+use std::process::ExitStatus;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use task_proto::ros::GraphName;
+use tokio::io::{AsyncWriteExt as _, BufReader};
+use tokio::process::{Child, ChildStdin, ChildStdout};
+use tokio::sync::{broadcast, mpsc, oneshot, watch};
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
+
+use super::feeds::{CAPACITY, DiagnosticStatus, RosoutLine};
+use super::program::GraphProgram;
+use super::protocol::{ALIVE_INTERVAL, Answer, Call, Event, Lines, MAX_EVENT_BYTES, Request};
+use super::rate::{Rate, RateMeter};
+use super::snapshot::Snapshot;
+use super::{GraphError, GraphSettings};
+
+/// How long the program may take until it takes part.
+const JOIN_TIMEOUT: Duration = Duration::from_secs(20);
+/// How long it may be silent.
+const SILENCE_TIMEOUT: Duration = ALIVE_INTERVAL.saturating_mul(7);
+/// How much later than asked for an answer may come: a call for all parameters is several.
+const CALL_SLACK: Duration = Duration::from_secs(5);
+/// How many calls one request may need. The time of a request is for each of them.
+const CALLS_PER_REQUEST: u32 = 40;
+/// How long the program may take to leave the graph.
+const LEAVE_TIMEOUT: Duration = Duration::from_secs(5);
+/// Requests that wait to be written.
+const QUEUED_REQUESTS: usize = 512;
+/// The most calls that are under way, and the most topics that are counted.
+const MAX_CALLS: usize = 256;
+const MAX_METERS: usize = 1024;
+
+/// See the module.
+pub(super) struct Connection {
+    pid: u32,
+    requests: mpsc::Sender<Request>,
+    numbers: AtomicU64,
+    missed: AtomicU64,
+    routes: Mutex<Routes>,
+}
+
+/// Where what the program says goes to. Nothing is left of it once the program has ended.
+#[derive(Default)]
+struct Routes {
+    closed: bool,
+    calls: HashMap<u64, oneshot::Sender<Result<Answer, GraphError>>>,
+    meters: HashMap<u64, watch::Sender<(Rate, Instant)>>,
+    rosout: Option<broadcast::Sender<Arc<RosoutLine>>>,
+    diagnostics: Option<broadcast::Sender<Arc<DiagnosticStatus>>>,
+}
+
+type Events = Lines<BufReader<ChildStdout>>;
+
+impl Connection {
+    /// Starts the program and waits until it takes part. It ends with `closing`, which is cancelled if it ends before.
+    pub async fn open(
+        settings: GraphSettings,
+        program: &GraphProgram,
+        closing: &CancellationToken,
+        tracker: &TaskTracker,
+    ) -> Result<(Arc<Self>, watch::Receiver<Arc<Snapshot>>), GraphError> {
+        let failed = |error: std::io::Error| GraphError::Start { reason: error.to_string() };
+        let starting = program.clone();
+        let started = tokio::task::spawn_blocking(move || starting.start()).await;
+        let mut child = started.map_err(std::io::Error::other).flatten().map_err(failed)?;
+        let pipes = (child.stdin.take(), child.stdout.take(), child.id());
+        let (Some(mut input), Some(output), Some(pid)) = pipes else { return Err(GraphError::Closed) };
+        let mut events = Lines::new(BufReader::new(output), MAX_EVENT_BYTES);
+        let joining = join(settings, &mut input, &mut events);
+        let too_late = || GraphError::Start { reason: format!("it did not take part within {JOIN_TIMEOUT:?}") };
+        let joined = tokio::time::timeout(JOIN_TIMEOUT, joining).await;
+        if let Err(error) = joined.unwrap_or_else(|_| Err(too_late())) {
+            let _ = child.kill().await;
+            program.clean_up().await;
+            return Err(error);
+        }
+        let (requests, queued) = mpsc::channel(QUEUED_REQUESTS);
+        let (snapshots, snapshot) = watch::channel(Arc::new(Snapshot::empty(Instant::now())));
+        let connection = Arc::new(Self {
+            pid,
+            requests,
+            numbers: AtomicU64::new(1),
+            missed: AtomicU64::new(0),
+            routes: Mutex::default(),
+        });
+        let (running, closing, program) = (connection.clone(), closing.clone(), program.clone());
+        tracker.spawn(async move {
+            let spoken = running.speak(&closing, events, (input, queued), snapshots).await;
+            closing.cancel();
+            running.end();
+            leave(child, spoken).await;
+            program.clean_up().await;
+        });
+        Ok((connection, snapshot))
+    }
+
+    /// Passes messages both ways until one side ends; gives back the program's input, whose end ends it, where the program
+    /// is to leave by itself.
+    async fn speak(
+        &self,
+        closing: &CancellationToken,
+        events: Events,
+        (input, queued): (ChildStdin, mpsc::Receiver<Request>),
+        snapshots: watch::Sender<Arc<Snapshot>>,
+    ) -> Spoken {
+        let mut hearing = pin!(self.hear(events, snapshots));
+        let mut saying = pin!(write(input, queued));
+        tokio::select! {
+            // Nothing follows: what was not sent or heard is of no use any more.
+            () = closing.cancelled() => Spoken::Over,
+            why = &mut hearing => Spoken::Lost(why),
+            why = &mut saying => Spoken::Lost(why),
+        }
+    }
+
+    /// Takes in what the program says; says why it ends.
+    async fn hear(&self, mut events: Events, snapshots: watch::Sender<Arc<Snapshot>>) -> String {
+        loop {
+            match tokio::time::timeout(SILENCE_TIMEOUT, events.next::<Event>()).await {
+                Ok(Ok(Some(event))) => self.heard(event, &snapshots),
+                Ok(Ok(None)) => return "it has ended".to_owned(),
+                Ok(Err(error)) => return error.to_string(),
+                Err(_) => return format!("it has said nothing for {SILENCE_TIMEOUT:?}"),
+            }
+        }
+    }
+
+    fn heard(&self, event: Event, snapshots: &watch::Sender<Arc<Snapshot>>) {
+        match event {
+            Event::Snapshot(shown) => {
+                let now = Instant::now();
+                snapshots.send_modify(|current| *current = Arc::new(shown.received(now, current)));
+            }
+            Event::Unchanged { age_ms } => {
+                let now = Instant::now();
+                let at = now.checked_sub(Duration::from_millis(age_ms)).unwrap_or(now);
+                // Nobody is woken: it shows what it did.
+                snapshots.send_if_modified(|current| {
+                    Arc::make_mut(current).at = at;
+                    false
+                });
+            }
+            Event::Answer { id, answer } => self.answered(id, Ok(answer)),
+            Event::Refused { id, error } => self.answered(id, Err(error)),
+            Event::Rosout(line) => {
+                let listeners = self.routes().rosout.clone();
+                // Nobody listens just now: it is not for later.
+                listeners.map(|listeners| listeners.send(Arc::new(line)));
+            }
+            Event::Diagnostic(status) => {
+                let listeners = self.routes().diagnostics.clone();
+                listeners.map(|listeners| listeners.send(Arc::new(status)));
+            }
+            Event::Missed { count } => {
+                self.missed.fetch_add(count, Ordering::Relaxed);
+            }
+            Event::Rate { meter, hz, since_last_ms, samples } => {
+                let rate = Rate { hz, since_last: since_last_ms.map(Duration::from_millis), samples };
+                if let Some(known) = self.routes().meters.get(&meter) {
+                    known.send_replace((rate, Instant::now()));
+                }
+            }
+            // Said once, at the beginning.
+            Event::Joined | Event::Failed { .. } => {}
+        }
+    }
+
+    fn answered(&self, id: u64, answer: Result<Answer, GraphError>) {
+        let asked = self.routes().calls.remove(&id);
+        // Whoever asked may have gone.
+        let _ = asked.map(|asked| asked.send(answer));
+    }
+
+    /// Whoever waits for something waits no longer.
+    fn end(&self) {
+        *self.routes() = Routes { closed: true, ..Routes::default() };
+    }
+
+    /// The program's process.
+    pub fn pid(&self) -> u32 {
+        self.pid
+    }
+
+    /// How many messages of feeds the program could not pass on.
+    pub fn missed_messages(&self) -> u64 {
+        self.missed.load(Ordering::Relaxed)
+    }
+
+    /// Says this to the program, without waiting.
+    pub fn say(&self, request: Request) -> Result<(), GraphError> {
+        self.requests.try_send(request).map_err(|error| match error {
+            mpsc::error::TrySendError::Full(_) => GraphError::Busy,
+            mpsc::error::TrySendError::Closed(_) => GraphError::Closed,
+        })
+    }
+
+    /// Has the program make a call. `within` is for each of the calls to a node that this takes.
+    pub async fn call(&self, call: Call, within: Duration) -> Result<Answer, GraphError> {
+        let (id, within_ms) = (self.number(), u64::try_from(within.as_millis()).unwrap_or(u64::MAX));
+        let (answer, answered) = oneshot::channel();
+        {
+            let mut routes = self.routes();
+            // Those whose caller has gone are not waited for.
+            routes.calls.retain(|_, asked| !asked.is_closed());
+            if routes.closed {
+                return Err(GraphError::Closed);
+            }
+            if routes.calls.len() >= MAX_CALLS {
+                return Err(GraphError::Busy);
+            }
+            routes.calls.insert(id, answer);
+        }
+        self.say(Request::Call { id, within_ms, call })?;
+        let patience = within.saturating_mul(CALLS_PER_REQUEST).saturating_add(CALL_SLACK);
+        match tokio::time::timeout(patience, answered).await {
+            Ok(Ok(answer)) => answer,
+            Ok(Err(_)) => Err(GraphError::Closed),
+            Err(_) => Err(GraphError::Write { reason: "the program on the graph does not answer".to_owned() }),
+        }
+    }
+
+    /// A listener to what nodes log.
+    pub fn rosout(&self) -> Result<broadcast::Receiver<Arc<RosoutLine>>, GraphError> {
+        let mut routes = self.routes();
+        if routes.closed {
+            return Err(GraphError::Closed);
+        }
+        Ok(routes.rosout.get_or_insert_with(|| broadcast::channel(CAPACITY).0).subscribe())
+    }
+
+    /// A listener to what nodes say about the robot's parts.
+    pub fn diagnostics(&self) -> Result<broadcast::Receiver<Arc<DiagnosticStatus>>, GraphError> {
+        let mut routes = self.routes();
+        if routes.closed {
+            return Err(GraphError::Closed);
+        }
+        Ok(routes.diagnostics.get_or_insert_with(|| broadcast::channel(CAPACITY).0).subscribe())
+    }
+
+    /// Has the program count a topic's messages until the meter is dropped.
+    pub fn meter(this: &Arc<Self>, topic: &GraphName, kind: &str) -> Result<RateMeter, GraphError> {
+        let meter = this.number();
+        let (rate, last) = watch::channel((Rate::NONE, Instant::now()));
+        {
+            let mut routes = this.routes();
+            if routes.closed {
+                return Err(GraphError::Closed);
+            }
+            if routes.meters.len() >= MAX_METERS {
+                return Err(GraphError::Busy);
+            }
+            routes.meters.insert(meter, rate.clone());
+        }
+        let counting = this.say(Request::Count { meter, topic: topic.clone(), kind: kind.to_owned() });
+        if let Err(error) = counting {
+            this.routes().meters.remove(&meter);
+            return Err(error);
+        }
+        let (connection, ending) = (Arc::downgrade(this), CancellationToken::new());
+        let dropped = ending.clone();
+        // Nobody waits for it: whoever has the meter may keep it longer than there is a graph.
+        tokio::spawn(async move {
+            // Cancel-safe: either way it is over.
+            tokio::select! {
+                () = dropped.cancelled() => {}
+                () = rate.closed() => {}
+            }
+            let Some(connection) = connection.upgrade() else { return };
+            let counted = connection.routes().meters.remove(&meter).is_some();
+            if counted && connection.requests.send(Request::StopCounting { meter }).await.is_err() {
+                tracing::trace!("the graph has ended, and its meters with it");
+            }
+        });
+        Ok(RateMeter::new(last, ending))
+    }
+
+    fn number(&self) -> u64 {
+        self.numbers.fetch_add(1, Ordering::Relaxed)
+    }
+
+    fn routes(&self) -> MutexGuard<'_, Routes> {
+        // Maps of senders are sound whatever a panic left.
+        self.routes.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// How a conversation ended.
+enum Spoken {
+    /// Nobody wants the graph any more.
+    Over,
+    /// The program has ended, or must.
+    Lost(String),
+}
+
+async fn join(settings: GraphSettings, input: &mut ChildStdin, events: &mut Events) -> Result<(), GraphError> {
+    let failed = |error: std::io::Error| GraphError::Start { reason: error.to_string() };
+    let line = Request::Join(settings).line().map_err(failed)?;
+    // A program that ends at once may have said why.
+    let written = input.write_all(&line).await;
+    loop {
+        match events.next().await.map_err(failed)? {
+            Some(Event::Joined) => return Ok(()),
+            Some(Event::Failed { error }) => return Err(error),
+            Some(_) => {}
+            None => {
+                written.map_err(failed)?;
+                return Err(GraphError::Start { reason: "it ended at once".to_owned() });
+            }
+        }
+    }
+}
+
+/// Writes requests; says why it ends.
+async fn write(mut input: ChildStdin, mut queued: mpsc::Receiver<Request>) -> String {
+    while let Some(request) = queued.recv().await {
+        let written = match request.line() {
+            Ok(line) => input.write_all(&line).await,
+            Err(error) => {
+                tracing::warn!(%error, "a request to the ROS graph is not made");
+                continue;
+            }
+        };
+        if let Err(error) = written {
+            return error.to_string();
+        }
+    }
+    "nobody asks any more".to_owned()
+}
+
+/// Waits until the program has ended, which the end of its input has it do, and makes sure of it.
+async fn leave(mut child: Child, spoken: Spoken) {
+    let ended = match spoken {
+        Spoken::Over => tokio::time::timeout(LEAVE_TIMEOUT, child.wait()).await.ok(),
+        Spoken::Lost(why) => {
+            let _ = child.start_kill();
+            let ended = child.wait().await;
+            let status = ended.as_ref().map_or_else(ToString::to_string, ExitStatus::to_string);
+            tracing::warn!(%why, %status, "the program that takes part in the ROS graph is gone; it is started again");
+            Some(ended)
+        }
+    };
+    if ended.is_none() {
+        let _ = child.kill().await;
+    }
+}

@@ -1,0 +1,442 @@
+//! What the agent and the program that takes part in the ROS graph for it say to each other: one JSON object a line, on the
+//! program's standard input and output. `task-agent graph` is one such program; another need only speak the same.
+//!
+//! Both sides ignore fields and lines that they do not know, so either may be older. A line has a limit: an event that is
+//! longer ends the program, a request that is longer is refused where it is made. Times are ages in milliseconds, because
+//! two programs need not have one clock.
+//!
+//! ```text
+//! agent                                    program
+//! {"join":{"domain_id":0,…}}           ─▶
+//!                                      ◀─  "joined", or {"failed":{"error":{…}}} and its end
+//!                                      ◀─  {"snapshot":{…}} whenever the graph shows something else
+//!                                      ◀─  {"unchanged":{"age_ms":…}} every few seconds otherwise
+//! {"call":{"id":1,"within_ms":2000,…}} ─▶
+//!                                      ◀─  {"answer":{"id":1,…}} or {"refused":{"id":1,"error":{…}}}
+//! {"listen":"rosout"}                  ─▶
+//!                                      ◀─  {"rosout":{…}} for each line
+//! {"count":{"meter":1,…}}              ─▶
+//!                                      ◀─  {"rate":{"meter":1,…}} whenever it is another
+//! the end of its input                 ─▶
+//!                                      ◀─  its end
+//! ```
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::io;
+use std::net::SocketAddr;
+use std::time::{Duration, Instant};
+
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use task_proto::ros::{GraphName, LifecycleState, Transition};
+use tokio::io::{AsyncBufRead, AsyncBufReadExt as _, AsyncReadExt as _};
+
+use super::feeds::{DiagnosticStatus, RosoutLine};
+use super::parameters::{ParameterValue, SetResult};
+use super::snapshot::{MAX_NODES, Node, Participant, ParticipantId, Snapshot};
+use super::{GraphError, GraphSettings};
+
+/// The longest request, in bytes.
+pub const MAX_REQUEST_BYTES: usize = 1 << 20;
+/// The longest event, in bytes: a graph of thousands of nodes.
+pub const MAX_EVENT_BYTES: usize = 8 << 20;
+/// What a buffer for lines keeps from one to the next.
+const KEPT_BUFFER_BYTES: usize = 64 << 10;
+/// The most participants of a snapshot.
+const MAX_PARTICIPANTS: usize = 4096;
+/// How often the program says something at least. One that is silent for much longer hangs.
+pub const ALIVE_INTERVAL: Duration = Duration::from_secs(3);
+
+/// What the agent says.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Request {
+    /// Take part in the graph. It comes first, and once.
+    Join(GraphSettings),
+    /// Call a node, and say what came of it.
+    Call {
+        /// By which the answer is known.
+        id: u64,
+        /// How long it may take.
+        within_ms: u64,
+        /// The call.
+        call: Call,
+    },
+    /// Pass on what nodes say from now on.
+    Listen(Feed),
+    /// Count the messages of a topic.
+    Count {
+        /// By which the rate is known.
+        meter: u64,
+        /// The topic.
+        topic: GraphName,
+        /// Its type, `package/msg/Type`.
+        kind: String,
+    },
+    /// Count them no longer.
+    StopCounting {
+        /// The meter.
+        meter: u64,
+    },
+}
+
+/// A call to a node.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Call {
+    /// Make what the calls to this node need, before it is there.
+    Prepare {
+        /// The node.
+        node: GraphName,
+    },
+    /// Wait until a server of the service would hear a request.
+    Servers {
+        /// The service.
+        service: GraphName,
+        /// Its type; without it the one that the graph shows.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        kind: Option<String>,
+    },
+    /// Ask a lifecycle node for its state.
+    LifecycleState {
+        /// The node.
+        node: GraphName,
+    },
+    /// Ask a lifecycle node for a transition, once.
+    ChangeState {
+        /// The node.
+        node: GraphName,
+        /// The transition.
+        transition: Transition,
+    },
+    /// Ask a node for all its parameters. The time is for each of the calls that takes.
+    Parameters {
+        /// The node.
+        node: GraphName,
+    },
+    /// Ask a node for one parameter.
+    Parameter {
+        /// The node.
+        node: GraphName,
+        /// Its name.
+        name: String,
+    },
+    /// Set parameters of a node, each for itself.
+    SetParameters {
+        /// The node.
+        node: GraphName,
+        /// Names and values.
+        parameters: Vec<(String, ParameterValue)>,
+    },
+}
+
+/// What nodes say to everybody.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Feed {
+    /// Log lines.
+    Rosout,
+    /// Statuses of the robot's parts.
+    Diagnostics,
+}
+
+/// What the program says.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Event {
+    /// It takes part in the graph.
+    Joined,
+    /// It does not, and ends.
+    Failed {
+        /// Why.
+        error: GraphError,
+    },
+    /// What the graph shows.
+    Snapshot(Shown),
+    /// The graph shows what it did.
+    Unchanged {
+        /// How long ago it was looked at.
+        age_ms: u64,
+    },
+    /// A call was answered.
+    Answer {
+        /// The call's.
+        id: u64,
+        /// What was answered.
+        answer: Answer,
+    },
+    /// A call was not.
+    Refused {
+        /// The call's.
+        id: u64,
+        /// Why.
+        error: GraphError,
+    },
+    /// A node logged something.
+    Rosout(RosoutLine),
+    /// A node said how a part is.
+    Diagnostic(DiagnosticStatus),
+    /// Messages of a feed came too fast to be passed on.
+    Missed {
+        /// How many.
+        count: u64,
+    },
+    /// How often a topic carries a message.
+    Rate {
+        /// The meter.
+        meter: u64,
+        /// Messages a second.
+        hz: f64,
+        /// Since the last one; without it there was none.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        since_last_ms: Option<u64>,
+        /// Messages since the meter was made.
+        samples: u64,
+    },
+}
+
+/// What a call gave.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Answer {
+    /// Done.
+    Done,
+    /// The participants with such a server.
+    Servers(BTreeSet<ParticipantId>),
+    /// The node's state.
+    State(LifecycleState),
+    /// Whether the node made the transition.
+    Changed(bool),
+    /// Parameters with their values.
+    Parameters(Vec<(String, ParameterValue)>),
+    /// One parameter's value.
+    Parameter(ParameterValue),
+    /// What became of each parameter that was set.
+    Set(Vec<SetResult>),
+}
+
+/// A snapshot on its way.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Shown {
+    /// How long ago it was so.
+    age_ms: u64,
+    nodes: Vec<Node>,
+    participants: Vec<ShownParticipant>,
+    #[serde(default)]
+    omitted: usize,
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+struct ShownParticipant {
+    id: ParticipantId,
+    #[serde(default)]
+    locators: BTreeSet<SocketAddr>,
+    /// How long ago it was first seen.
+    seen_ms: u64,
+}
+
+impl Shown {
+    /// As it is sent `now`.
+    pub fn of(snapshot: &Snapshot, now: Instant) -> Self {
+        let participant = |(id, participant): (&ParticipantId, &Participant)| ShownParticipant {
+            id: *id,
+            locators: participant.locators.clone(),
+            seen_ms: millis(now.saturating_duration_since(participant.first_seen)),
+        };
+        Self {
+            age_ms: millis(now.saturating_duration_since(snapshot.at)),
+            nodes: snapshot.nodes.clone(),
+            participants: snapshot.participants.iter().take(MAX_PARTICIPANTS).map(participant).collect(),
+            omitted: snapshot.omitted,
+        }
+    }
+
+    /// Leaves out the second half of the nodes; false: there is only one or none.
+    fn halve(&mut self) -> bool {
+        let kept = self.nodes.len() / 2;
+        self.omitted += self.nodes.len() - kept;
+        self.nodes.truncate(kept);
+        kept > 0
+    }
+
+    /// The snapshot, as it was received `now`. `before` is the one that was received before: since when a participant has
+    /// been seen stays what it was, however long this message was on its way.
+    pub fn received(self, now: Instant, before: &Snapshot) -> Snapshot {
+        let ago = |age_ms| now.checked_sub(Duration::from_millis(age_ms)).unwrap_or(now);
+        let mut nodes = self.nodes;
+        let omitted = self.omitted.saturating_add(nodes.len().saturating_sub(MAX_NODES));
+        nodes.truncate(MAX_NODES);
+        nodes.sort();
+        let participants = self.participants.into_iter().take(MAX_PARTICIPANTS).map(|shown| {
+            let seen = ago(shown.seen_ms);
+            let known = before.participants.get(&shown.id).map(|known| known.first_seen);
+            let first_seen = known.filter(|known| seen.saturating_duration_since(*known) < ALIVE_INTERVAL);
+            (shown.id, Participant { locators: shown.locators, first_seen: first_seen.unwrap_or(seen) })
+        });
+        let participants: BTreeMap<_, _> = participants.collect();
+        Snapshot { at: ago(self.age_ms), nodes, participants, omitted }
+    }
+}
+
+impl Event {
+    /// The line that says it. A graph that is too large for one is cut.
+    pub fn line(self) -> io::Result<Vec<u8>> {
+        let mut event = self;
+        loop {
+            let line = line_of(&event)?;
+            if line.len() <= MAX_EVENT_BYTES {
+                return Ok(line);
+            }
+            let is_shorter = if let Self::Snapshot(shown) = &mut event { shown.halve() } else { false };
+            if !is_shorter {
+                return Err(io::Error::new(io::ErrorKind::InvalidData, "an event is too long"));
+            }
+        }
+    }
+}
+
+impl Request {
+    /// The line that says it.
+    pub fn line(&self) -> io::Result<Vec<u8>> {
+        line_of(self).and_then(|line| {
+            let fits = line.len() <= MAX_REQUEST_BYTES;
+            if fits { Ok(line) } else { Err(io::Error::new(io::ErrorKind::InvalidData, "a request is too long")) }
+        })
+    }
+}
+
+fn line_of(message: &impl Serialize) -> io::Result<Vec<u8>> {
+    let mut line = serde_json::to_vec(message)?;
+    line.push(b'\n');
+    Ok(line)
+}
+
+/// Reads messages from lines.
+#[derive(Debug)]
+pub struct Lines<R> {
+    from: R,
+    max_bytes: usize,
+    line: Vec<u8>,
+}
+
+impl<R: AsyncBufRead + Unpin> Lines<R> {
+    /// Lines of at most `max_bytes`.
+    pub fn new(from: R, max_bytes: usize) -> Self {
+        Self { from, max_bytes, line: Vec::new() }
+    }
+
+    /// The next message that can be read; `None`: there are no more. Not cancel-safe.
+    pub async fn next<M: DeserializeOwned>(&mut self) -> io::Result<Option<M>> {
+        loop {
+            self.line.clear();
+            self.line.shrink_to(KEPT_BUFFER_BYTES);
+            let limit = self.max_bytes as u64 + 1;
+            if (&mut self.from).take(limit).read_until(b'\n', &mut self.line).await? == 0 {
+                return Ok(None);
+            }
+            if self.line.len() > self.max_bytes {
+                return Err(io::Error::new(io::ErrorKind::InvalidData, "a line is too long"));
+            }
+            match serde_json::from_slice(&self.line) {
+                Ok(message) => return Ok(Some(message)),
+                Err(error) => tracing::debug!(%error, "a line about the ROS graph can't be read"),
+            }
+        }
+    }
+}
+
+fn millis(duration: Duration) -> u64 {
+    u64::try_from(duration.as_millis()).unwrap_or(u64::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::{Value, json};
+
+    use super::*;
+
+    fn node(name: &str) -> Node {
+        let (publishers, subscriptions, services, clients) = Default::default();
+        let participant = ParticipantId([1; 12]);
+        Node { name: name.parse().expect("a name"), participant, publishers, subscriptions, services, clients }
+    }
+
+    #[test]
+    fn messages_are_written_as_documented() {
+        let settings = GraphSettings {
+            domain_id: 7,
+            localhost_only: true,
+            node_name: "/agent".parse().expect("a name"),
+            distro: None,
+        };
+        let call = Call::Parameter { node: "/talker".parse().expect("a name"), name: "rate".to_owned() };
+        let requests = [
+            (
+                Request::Join(settings),
+                json!({"join": {"domain_id": 7, "localhost_only": true, "node_name": "/agent", "distro": null}}),
+            ),
+            (
+                Request::Call { id: 1, within_ms: 2000, call },
+                json!({"call": {"id": 1, "within_ms": 2000, "call": {"parameter": {"node": "/talker", "name": "rate"}}}}),
+            ),
+            (Request::Listen(Feed::Rosout), json!({"listen": "rosout"})),
+        ];
+        for (request, expected) in requests {
+            assert_eq!(serde_json::from_slice::<Value>(&request.line().expect("a line")).expect("JSON"), expected);
+        }
+        let value = ParameterValue::Doubles(vec![1.0, f64::NAN, f64::NEG_INFINITY]);
+        let answer = Event::Answer { id: 1, answer: Answer::Parameter(value) };
+        let line = answer.line().expect("a line");
+        let expected = json!({"answer": {"id": 1, "answer": {"parameter": {"doubles": [1.0, "NaN", "-inf"]}}}});
+        assert_eq!(serde_json::from_slice::<Value>(&line).expect("JSON"), expected);
+        let read: Event = serde_json::from_slice(&line).expect("an event");
+        let Event::Answer { answer: Answer::Parameter(ParameterValue::Doubles(read)), .. } = read else {
+            panic!("another event: {read:?}")
+        };
+        assert!(read[0] == 1.0 && read[1].is_nan() && read[2] == f64::NEG_INFINITY);
+    }
+
+    #[tokio::test]
+    async fn unknown_lines_and_fields_are_ignored_and_long_lines_end_it() {
+        let text = b"{\"sing\":{}}\nnot JSON\n{\"unchanged\":{\"age_ms\":5,\"mood\":\"good\"}}\n".to_vec();
+        let mut lines = Lines::new(&text[..], 100);
+        let read = lines.next::<Event>().await.expect("a line").expect("an event");
+        assert!(matches!(read, Event::Unchanged { age_ms: 5 }), "{read:?}");
+        assert!(lines.next::<Event>().await.expect("the end").is_none());
+        let text = [b'x'; 300];
+        let error = Lines::new(&text[..], 100).next::<Event>().await.expect_err("too long");
+        assert_eq!(error.kind(), io::ErrorKind::InvalidData);
+    }
+
+    #[test]
+    fn a_snapshot_arrives_as_it_was_and_keeps_since_when_participants_were_seen() {
+        let start = Instant::now();
+        let at = |ms| start + Duration::from_millis(ms);
+        let mut sent = Snapshot::empty(at(900));
+        sent.nodes = vec![node("/a"), node("/b")];
+        let locators = BTreeSet::from(["127.0.0.1:7411".parse().expect("an address")]);
+        sent.participants.insert(ParticipantId([1; 12]), Participant { locators, first_seen: at(400) });
+        let message = serde_json::to_vec(&Shown::of(&sent, at(1000))).expect("JSON");
+        let shown: Shown = serde_json::from_slice(&message).expect("a snapshot");
+        let first = shown.clone().received(at(1000), &Snapshot::empty(start));
+        assert!(first.shows_the_same_as(&sent) && first.at == sent.at, "{first:?}");
+        let late = shown.received(at(1500), &first);
+        assert!(late.shows_the_same_as(&first), "{late:?}");
+    }
+
+    #[test]
+    fn a_graph_that_is_too_large_is_cut() {
+        let mut snapshot = Snapshot::empty(Instant::now());
+        let kind = "x".repeat(9000);
+        for number in 0..MAX_NODES {
+            let mut node = node(&format!("/node_{number}"));
+            let name = "/topic".parse().expect("a name");
+            node.publishers.push(task_proto::ros::Endpoint { name, kind: kind.clone() });
+            snapshot.nodes.push(node);
+        }
+        let line = Event::Snapshot(Shown::of(&snapshot, Instant::now())).line().expect("a line");
+        assert!(line.len() <= MAX_EVENT_BYTES);
+        let Event::Snapshot(shown) = serde_json::from_slice(&line).expect("an event") else { panic!("another event") };
+        assert_eq!((shown.nodes.len(), shown.omitted), (MAX_NODES / 4, MAX_NODES / 4 * 3));
+    }
+}

@@ -1,0 +1,210 @@
+//! The program that takes part in the graph: it does what it reads on its input, says on its output what comes of it, and
+//! ends with its input. It has no other ties to the agent.
+
+use std::collections::HashMap;
+use std::io;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt as _, BufReader};
+use tokio::sync::broadcast::error::RecvError;
+use tokio::sync::{Semaphore, broadcast, mpsc};
+use tokio::task::JoinSet;
+use tokio::time::{MissedTickBehavior, interval, timeout};
+
+use super::GraphError;
+use super::participant::LocalGraph;
+use super::protocol::{ALIVE_INTERVAL, Answer, Call, Event, Feed, Lines, MAX_REQUEST_BYTES, Request, Shown};
+use super::rate::{Counter, Rate};
+
+/// Events that wait to be written.
+const QUEUED_EVENTS: usize = 64;
+/// Calls that are under way at a time.
+const MAX_CALLS: usize = 256;
+/// Topics that are counted.
+const MAX_COUNTERS: usize = 1024;
+/// How often rates are said while they change.
+const RATE_INTERVAL: Duration = Duration::from_millis(250);
+
+/// Does what is read from `input` until that ends, or until the graph is closed.
+pub async fn serve(input: impl AsyncRead + Unpin + Send + 'static, output: impl AsyncWrite + Unpin) -> io::Result<()> {
+    let mut requests = Lines::new(BufReader::new(input), MAX_REQUEST_BYTES);
+    let Some(Request::Join(settings)) = requests.next().await? else {
+        return Err(io::Error::new(io::ErrorKind::InvalidData, "the first line is not {\"join\":…}"));
+    };
+    let (events, queued) = mpsc::channel(QUEUED_EVENTS);
+    let serving = async move {
+        match LocalGraph::open(&settings).await {
+            Ok(graph) => take_part(graph, requests, events).await,
+            Err(error) => {
+                let _ = events.send(Event::Failed { error }).await;
+                Ok(())
+            }
+        }
+    };
+    let serving = tokio::spawn(serving);
+    // The last of what there is to say is why it could not take part; after it the queue is closed.
+    write(output, queued).await?;
+    serving.await.map_err(io::Error::other)?
+}
+
+async fn write(mut output: impl AsyncWrite + Unpin, mut queued: mpsc::Receiver<Event>) -> io::Result<()> {
+    while let Some(event) = queued.recv().await {
+        output.write_all(&event.line()?).await?;
+        output.flush().await?;
+    }
+    Ok(())
+}
+
+async fn take_part(
+    graph: LocalGraph,
+    mut requests: Lines<BufReader<impl AsyncRead + Unpin>>,
+    events: mpsc::Sender<Event>,
+) -> io::Result<()> {
+    let _ = events.send(Event::Joined).await;
+    let mut tasks = JoinSet::new();
+    let mut changes = graph.changes();
+    tasks.spawn(show(graph.clone(), events.clone()));
+    let (meters, metered) = mpsc::channel(QUEUED_EVENTS);
+    tasks.spawn(say_rates(metered, events.clone()));
+    let calls = Arc::new(Semaphore::new(MAX_CALLS));
+    let mut feeds = Vec::new();
+    let closed = async move { while changes.changed().await.is_ok() {} };
+    let serving = async {
+        while let Some(request) = requests.next().await? {
+            while tasks.try_join_next().is_some() {}
+            match request {
+                Request::Join(_) => {}
+                Request::Call { id, within_ms, call } => {
+                    let Ok(permit) = calls.clone().try_acquire_owned() else {
+                        let _ = events.send(Event::Refused { id, error: GraphError::Busy }).await;
+                        continue;
+                    };
+                    let (graph, events) = (graph.clone(), events.clone());
+                    tasks.spawn(async move {
+                        let _permit = permit;
+                        let event = match perform(&graph, call, Duration::from_millis(within_ms)).await {
+                            Ok(answer) => Event::Answer { id, answer },
+                            Err(error) => Event::Refused { id, error },
+                        };
+                        let _ = events.send(event).await;
+                    });
+                }
+                Request::Listen(feed) if feeds.contains(&feed) => {}
+                Request::Listen(feed) => {
+                    feeds.push(feed);
+                    listen(&graph, feed, &events, &mut tasks);
+                }
+                Request::Count { meter, topic, kind } => match graph.rate(&topic, &kind) {
+                    Ok(counter) => drop(meters.send((meter, Some(counter))).await),
+                    Err(error) => tracing::warn!(%topic, %error, "the messages of a topic can't be counted"),
+                },
+                Request::StopCounting { meter } => drop(meters.send((meter, None)).await),
+            }
+        }
+        Ok(())
+    };
+    let served = tokio::select! {
+        // Nothing follows.
+        served = serving => served,
+        () = closed => Ok(()),
+    };
+    tasks.shutdown().await;
+    graph.close().await;
+    served
+}
+
+/// Says what the graph shows whenever that changes, and now and then that it does not.
+async fn show(graph: LocalGraph, events: mpsc::Sender<Event>) {
+    let mut changes = graph.changes();
+    changes.mark_changed();
+    loop {
+        let event = match timeout(ALIVE_INTERVAL, changes.changed()).await {
+            Ok(Ok(())) => Event::Snapshot(Shown::of(&changes.borrow_and_update(), Instant::now())),
+            Ok(Err(_closed)) => return,
+            Err(_) => {
+                let age = changes.borrow().at.elapsed();
+                Event::Unchanged { age_ms: u64::try_from(age.as_millis()).unwrap_or(u64::MAX) }
+            }
+        };
+        if events.send(event).await.is_err() {
+            return;
+        }
+    }
+}
+
+/// Says the rates of the topics that are counted, whenever one is another than was said last.
+async fn say_rates(mut meters: mpsc::Receiver<(u64, Option<Counter>)>, events: mpsc::Sender<Event>) {
+    let mut counters: HashMap<u64, (Counter, Rate)> = HashMap::new();
+    let mut ticks = interval(RATE_INTERVAL);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    loop {
+        tokio::select! {
+            // Cancel-safe: what was not received is still in the channel.
+            meter = meters.recv() => match meter {
+                Some((meter, Some(counter))) if counters.len() < MAX_COUNTERS => {
+                    counters.insert(meter, (counter, Rate::NONE));
+                }
+                Some((_, Some(_))) => tracing::warn!("too many topics are counted"),
+                Some((meter, None)) => drop(counters.remove(&meter)),
+                None => return,
+            },
+            // Cancel-safe: a tick is not lost. Without counters nobody is woken.
+            _ = ticks.tick(), if !counters.is_empty() => {
+                for (meter, (counter, said)) in &mut counters {
+                    let rate = counter.rate();
+                    if (rate.hz, rate.samples) == (said.hz, said.samples) {
+                        continue;
+                    }
+                    *said = rate;
+                    let since_last_ms = rate.since_last.map(|since| u64::try_from(since.as_millis()).unwrap_or(u64::MAX));
+                    let event = Event::Rate { meter: *meter, hz: rate.hz, since_last_ms, samples: rate.samples };
+                    if events.send(event).await.is_err() {
+                        return;
+                    }
+                }
+            }
+        }
+    }
+}
+
+fn listen(graph: &LocalGraph, feed: Feed, events: &mpsc::Sender<Event>, tasks: &mut JoinSet<()>) {
+    let listening = match feed {
+        Feed::Rosout => graph.rosout().map(|heard| {
+            tasks.spawn(pass_on(heard, events.clone(), |line| Event::Rosout((*line).clone())));
+        }),
+        Feed::Diagnostics => graph.diagnostics().map(|heard| {
+            tasks.spawn(pass_on(heard, events.clone(), |status| Event::Diagnostic((*status).clone())));
+        }),
+    };
+    if let Err(error) = listening {
+        tracing::warn!(?feed, %error, "what nodes say can't be heard");
+    }
+}
+
+async fn pass_on<T: Clone>(mut heard: broadcast::Receiver<T>, events: mpsc::Sender<Event>, event: impl Fn(T) -> Event) {
+    loop {
+        let event = match heard.recv().await {
+            Ok(message) => event(message),
+            Err(RecvError::Lagged(count)) => Event::Missed { count },
+            Err(RecvError::Closed) => return,
+        };
+        if events.send(event).await.is_err() {
+            return;
+        }
+    }
+}
+
+async fn perform(graph: &LocalGraph, call: Call, within: Duration) -> Result<Answer, GraphError> {
+    Ok(match call {
+        Call::Prepare { node } => graph.prepare(&node).await.map(|()| Answer::Done)?,
+        Call::Servers { service, kind } => {
+            Answer::Servers(graph.service_answers(&service, kind.as_deref(), within).await?)
+        }
+        Call::LifecycleState { node } => Answer::State(graph.lifecycle_state(&node, within).await?),
+        Call::ChangeState { node, transition } => Answer::Changed(graph.change_state(&node, transition, within).await?),
+        Call::Parameters { node } => Answer::Parameters(graph.parameters(&node, within).await?),
+        Call::Parameter { node, name } => Answer::Parameter(graph.parameter(&node, &name, within).await?),
+        Call::SetParameters { node, parameters } => Answer::Set(graph.set_parameters(&node, parameters, within).await?),
+    })
+}

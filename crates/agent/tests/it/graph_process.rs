@@ -1,0 +1,239 @@
+//! The process that takes part in the ROS graph for the agent: what it may do, what strangers can do to it, and that its
+//! loss is no more than a moment without a graph.
+
+use std::net::UdpSocket;
+use std::time::{Duration, Instant};
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use task_agent::graph::program::MEMORY_BYTES;
+use task_agent::graph::{Graph, GraphError, ParameterValue};
+use task_agent::graph_access::GraphAccess;
+use task_agent::layout::DataDir;
+use task_proto::report::{FailureCode, RosFacts};
+
+use crate::harness::{eventually, lives, within};
+use crate::ros::{CALL, RosNode, name, open, program};
+use crate::rtps;
+
+/// What a process may grow by under an attack.
+const GROWTH_BYTES: u64 = 64 << 20;
+
+fn facts(domain_id: u16) -> RosFacts {
+    RosFacts { distro: "jazzy".to_owned(), rmw: None, domain_id: Some(domain_id), localhost_only: true }
+}
+
+fn status_of(pid: u32, key: &str) -> String {
+    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
+    let line = status.lines().find_map(|line| line.strip_prefix(key)).unwrap();
+    line.trim_start_matches(':').trim().to_owned()
+}
+
+async fn answers(graph: &Graph) {
+    let talker = name("/talker");
+    let shown = async { graph.changes().wait_for(|snapshot| snapshot.named(&talker).next().is_some()).await.is_ok() };
+    assert!(within("the talker", shown).await);
+    let value = graph.parameter(&talker, "rate", CALL).await.unwrap();
+    assert_eq!(value, ParameterValue::Double(1.5));
+}
+
+fn signal(pid: u32, signal: Signal) {
+    kill(Pid::from_raw(i32::try_from(pid).unwrap()), signal).unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_graph_has_a_process_without_rights_and_with_little_memory() {
+    let graph = open(98).await;
+    let pid = graph.pid();
+    assert_ne!(pid, std::process::id());
+    assert_eq!(status_of(pid, "NoNewPrivs"), "1");
+    if nix::unistd::geteuid().is_root() {
+        let ids = status_of(pid, "Uid");
+        assert!(ids.split_whitespace().all(|id| id != "0"), "{ids}");
+        assert_eq!(status_of(pid, "Groups").split_whitespace().filter(|group| *group == "0").count(), 0);
+        for set in ["CapInh", "CapPrm", "CapEff", "CapBnd", "CapAmb"] {
+            assert_eq!(status_of(pid, set), "0000000000000000", "{set}");
+        }
+    }
+    let proc = format!("/proc/{pid}");
+    let limits = std::fs::read_to_string(format!("{proc}/limits")).unwrap();
+    let data = limits.lines().find(|line| line.starts_with("Max data size")).unwrap();
+    assert!(data.contains(&MEMORY_BYTES.to_string()), "{data}");
+    let score: i32 = std::fs::read_to_string(format!("{proc}/oom_score_adj")).unwrap().trim().parse().unwrap();
+    assert!(score > 0, "{score}");
+    if nix::unistd::geteuid().is_root() {
+        assert!(std::fs::read(format!("{proc}/environ")).unwrap().is_empty());
+        // Its own: standard streams, sockets, what it waits with. None of the agent's files.
+        for file in std::fs::read_dir(format!("{proc}/fd")).unwrap() {
+            let target = std::fs::read_link(file.unwrap().path()).unwrap().display().to_string();
+            let number_of_a_kind = ["pipe:", "socket:", "anon_inode:"].iter().any(|kind| target.starts_with(kind));
+            let is_stderr = std::fs::read_link("/proc/self/fd/2").is_ok_and(|own| own.display().to_string() == target);
+            assert!(number_of_a_kind || is_stderr, "{target}");
+        }
+    }
+    graph.close().await;
+    eventually("the process to end", || (!lives(pid)).then_some(())).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn packets_that_state_gigabytes_cost_no_memory_and_the_graph_still_answers() {
+    const DOMAIN: u16 = 99;
+    let graph = open(DOMAIN).await;
+    let node = RosNode::start("talker.py", DOMAIN, &[]).await;
+    answers(&graph).await;
+    let (pid, own) = (graph.pid(), std::process::id());
+    let before = [rtps::memory_of(pid), rtps::memory_of(own)];
+    let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+    for number in 1..=300_u32 {
+        let mut prefix = *b"\x01\x0fattacker\0\0";
+        prefix[10..].copy_from_slice(&u16::try_from(number % 50).unwrap().to_le_bytes());
+        let stated = if number % 2 == 0 { 1 << 30 } else { u32::MAX };
+        let datagrams = [rtps::PARTICIPANTS, rtps::PUBLICATIONS]
+            .map(|endpoints| rtps::data_frag(prefix, endpoints, number, stated));
+        rtps::send(&socket, DOMAIN, datagrams);
+    }
+    answers(&graph).await;
+    for ((pid, before), what) in [pid, own].into_iter().zip(before).zip(["the program", "the agent"]) {
+        let after = rtps::memory_of(pid);
+        assert!(after.0 < before.0 + GROWTH_BYTES, "{what}: {before:?} became {after:?}");
+        // This process runs other tests as well, whose threads take address space.
+        assert!(pid == own || after.1 < before.1 + GROWTH_BYTES, "{what}: {before:?} became {after:?}");
+    }
+    assert_eq!(graph.pid(), pid);
+    assert!(lives(pid));
+    node.leave().await;
+    graph.close().await;
+}
+
+/// Announces a participant and says which samples it has: whoever believes it asks for them.
+fn is_matched(socket: &UdpSocket, domain_id: u16, prefix: [u8; 12], number: u32, port: u16) -> bool {
+    rtps::send(
+        socket,
+        domain_id,
+        [rtps::announcement(prefix, number, port), rtps::heartbeat(prefix, rtps::PUBLICATIONS, 5, number)],
+    );
+    socket.set_read_timeout(Some(Duration::from_millis(100))).unwrap();
+    let mut bytes = [0; 65_536];
+    while let Ok(length) = socket.recv(&mut bytes) {
+        if rtps::kinds(&bytes[..length]).contains(&rtps::ACKNACK) {
+            return true;
+        }
+    }
+    false
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn packets_about_all_numbers_there_are_take_neither_time_nor_memory() {
+    const DOMAIN: u16 = 100;
+    let graph = open(DOMAIN).await;
+    let node = RosNode::start("talker.py", DOMAIN, &[]).await;
+    answers(&graph).await;
+    let pid = graph.pid();
+    let before = rtps::memory_of(pid);
+    let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let port = socket.local_addr().unwrap().port();
+    let prefix = *b"\x01\x0fattacker\0\0";
+    let matched = tokio::task::spawn_blocking({
+        let socket = socket.try_clone().unwrap();
+        move || (1..300).any(|number| is_matched(&socket, DOMAIN, prefix, number, port))
+    });
+    assert!(matched.await.unwrap(), "the attacker was not matched");
+    let started = Instant::now();
+    for count in 501..=550 {
+        rtps::send(
+            &socket,
+            DOMAIN,
+            [
+                rtps::heartbeat(prefix, rtps::PUBLICATIONS, i64::MAX, 2 * count),
+                rtps::gap(prefix, rtps::PUBLICATIONS, i64::from(count) * 1000, i64::MAX - i64::from(count)),
+                rtps::heartbeat(prefix, rtps::PUBLICATIONS, i64::MAX - 1, 2 * count + 1),
+            ],
+        );
+    }
+    answers(&graph).await;
+    let after = rtps::memory_of(pid);
+    assert!(after.0 < before.0 + GROWTH_BYTES && after.1 < before.1 + GROWTH_BYTES, "{before:?} became {after:?}");
+    assert!(lives(pid) && started.elapsed() < Duration::from_secs(30));
+    node.leave().await;
+    graph.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_graph_on_this_host_alone_is_bound_where_nobody_else_can_send_to() {
+    const DOMAIN: u16 = 101;
+    let graph = open(DOMAIN).await;
+    let sockets = std::fs::read_to_string("/proc/net/udp").unwrap();
+    let ports: Vec<u16> = [0, 1].into_iter().chain(10..24).map(|port| 7400 + 250 * DOMAIN + port).collect();
+    let bound: Vec<&str> = sockets
+        .lines()
+        .filter_map(|line| line.split_whitespace().nth(1)?.split_once(':'))
+        .filter(|(_, port)| u16::from_str_radix(port, 16).is_ok_and(|port| ports.contains(&port)))
+        .map(|(address, _)| address)
+        .collect();
+    // Loopback, and the group 239.255.0.1, as the kernel prints them.
+    let [loopback, group] = [[127, 0, 0, 1], [239, 255, 0, 1]].map(|ip| format!("{:08X}", u32::from_ne_bytes(ip)));
+    assert!(bound.len() >= 4, "{bound:?}");
+    assert!(bound.iter().all(|address| **address == loopback || **address == group), "{bound:?}");
+    graph.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_killed_process_is_started_again_and_all_is_heard_as_before() {
+    let temp = tempfile::tempdir().unwrap();
+    let data = DataDir::new(temp.path()).unwrap();
+    let access = GraphAccess::of_robot("02:00:00:00:00:02".parse().unwrap(), data.clone(), program());
+    let facts = facts(102);
+    let first = access.open(Some(&facts)).await.unwrap();
+    let mut node = RosNode::start("talker.py", 102, &[]).await;
+    answers(&first).await;
+    let mut changes = first.changes();
+    signal(first.pid(), Signal::SIGKILL);
+    let closed = async { while changes.changed().await.is_ok() {} };
+    within("the loss to be noticed", closed).await;
+    assert!(matches!(first.parameter(&name("/talker"), "rate", CALL).await, Err(GraphError::Closed)));
+    let refused = access.open(Some(&facts)).await.err().expect("a refusal while it is away");
+    assert_eq!(refused.code, FailureCode::GRAPH_UNAVAILABLE);
+    // Nobody asks for it: what nodes say is kept again all the same.
+    let kept = async {
+        loop {
+            node.order("warn heard again").await;
+            let log = std::fs::read_to_string(data.ros_log()).unwrap_or_default();
+            if log.contains("heard again") {
+                return;
+            }
+        }
+    };
+    within("what nodes say to be kept again", kept).await;
+    let second = access.open(Some(&facts)).await.unwrap();
+    assert_ne!(second.pid(), first.pid());
+    answers(&second).await;
+    node.leave().await;
+    drop(access);
+    second.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_process_that_hangs_is_ended() {
+    let graph = open(103).await;
+    let (pid, mut changes) = (graph.pid(), graph.changes());
+    signal(pid, Signal::SIGSTOP);
+    let closed = async { while changes.changed().await.is_ok() {} };
+    within("the graph to be closed", closed).await;
+    eventually("the process to be ended", || (!lives(pid)).then_some(())).await;
+    assert!(graph.is_closed());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_domain_that_was_left_is_left_by_whoever_keeps_what_nodes_say() {
+    let temp = tempfile::tempdir().unwrap();
+    let data = DataDir::new(temp.path()).unwrap();
+    let access = GraphAccess::of_robot("02:00:00:00:00:01".parse().unwrap(), data, program());
+    let before = access.open(Some(&facts(171))).await.unwrap();
+    let mut changes = before.changes();
+    let now = access.open(Some(&facts(172))).await.unwrap();
+    assert!(!before.is_closed(), "who watches a task there still sees it");
+    drop(before);
+    let closed = async { while changes.changed().await.is_ok() {} };
+    within("the graph of the domain before to be closed", closed).await;
+    assert!(!now.is_closed());
+}

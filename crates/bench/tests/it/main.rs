@@ -10,6 +10,7 @@ mod delivery;
 mod direct_push;
 mod doctor;
 mod flood;
+mod graph_loss;
 mod harness;
 mod hostile;
 mod leftovers;
@@ -24,6 +25,9 @@ mod restore;
 mod revoked;
 mod ros;
 mod ros1;
+#[expect(dead_code, reason = "the agent's own tests need more of it")]
+#[path = "../../../agent/tests/it/rtps.rs"]
+mod rtps;
 mod scenarios;
 mod secrets;
 mod settings;

@@ -8,6 +8,7 @@ mod mutation;
 mod names;
 mod package;
 mod registry;
+mod rtps;
 mod said;
 mod signed;
 mod websocket;
@@ -18,6 +19,7 @@ pub use mutation::Mutation;
 pub use names::{names, selector, token};
 pub use package::{manifest, package_xml, task_toml};
 pub use registry::oci_manifest;
+pub use rtps::{Counting, rtps};
 pub use said::{part, reply, report};
 pub use signed::{desired, envelope};
 pub use websocket::websocket;
@@ -33,7 +35,7 @@ pub struct Target {
 }
 
 /// All of them.
-pub const TARGETS: [Target; 16] = [
+pub const TARGETS: [Target; 17] = [
     Target { name: "archive", run: archive, tries: 500 },
     Target { name: "desired", run: desired, tries: 1_000 },
     Target { name: "envelope", run: envelope, tries: 3_000 },
@@ -46,6 +48,7 @@ pub const TARGETS: [Target; 16] = [
     Target { name: "part", run: part, tries: 20_000 },
     Target { name: "reply", run: reply, tries: 3_000 },
     Target { name: "report", run: report, tries: 2_000 },
+    Target { name: "rtps", run: rtps, tries: 5_000 },
     Target { name: "selector", run: selector, tries: 20_000 },
     Target { name: "task_toml", run: task_toml, tries: 1_000 },
     Target { name: "token", run: token, tries: 20_000 },

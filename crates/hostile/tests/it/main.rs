@@ -2,3 +2,7 @@
 
 mod corpus;
 mod targets;
+
+/// Counts what the target for RTPS takes.
+#[global_allocator]
+static MEMORY: task_hostile::Counting = task_hostile::Counting;

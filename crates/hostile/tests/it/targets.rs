@@ -67,6 +67,11 @@ fn no_report_does_harm() {
 }
 
 #[test]
+fn no_rtps_datagram_does_harm_or_takes_memory() {
+    run("rtps");
+}
+
+#[test]
 fn no_selector_does_harm() {
     run("selector");
 }

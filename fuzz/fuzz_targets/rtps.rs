@@ -1,0 +1,7 @@
+//! Runs `task_hostile::rtps` without end.
+#![no_main]
+
+#[global_allocator]
+static MEMORY: task_hostile::Counting = task_hostile::Counting;
+
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| task_hostile::rtps(bytes));

@@ -7,6 +7,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use task_proto::{RobotId, UserName};
+use tokio::sync::OwnedMutexGuard;
 use tokio_util::sync::CancellationToken;
 
 /// A holder never has too many connections with this number of them: a browser opens six, an agent fewer.
@@ -45,6 +46,8 @@ struct Held {
 pub struct Connection {
     cut: CancellationToken,
     authenticated: CancellationToken,
+    /// Held while a token that was shown on it is looked up.
+    lookup: Arc<tokio::sync::Mutex<()>>,
     bytes_out: Arc<AtomicU64>,
     /// The holder of the last token that was shown on it.
     registration: Arc<Mutex<Option<Registration>>>,
@@ -174,6 +177,17 @@ impl Connection {
         self.authenticated.cancelled().await;
     }
 
+    /// A token that was shown on it is looked up until this is dropped.
+    pub async fn lookup(&self) -> OwnedMutexGuard<()> {
+        self.lookup.clone().lock_owned().await
+    }
+
+    /// Whether a good token was shown on it, once none is looked up.
+    pub async fn is_authenticated_after_lookup(&self) -> bool {
+        let _lookup = self.lookup.lock().await;
+        self.authenticated.is_cancelled()
+    }
+
     /// Resolves when the connection has to end.
     pub async fn cut(&self) {
         self.cut.cancelled().await;
@@ -255,6 +269,18 @@ mod tests {
         let _operator = connected(&all, &person("operator"), 2);
         assert!(all.cut_oldest_of_largest(32));
         assert!(flood[0].cut.is_cancelled() && !flood[1].cut.is_cancelled());
+    }
+
+    #[tokio::test]
+    async fn connection_whose_token_is_looked_up_is_judged_afterwards() {
+        let connection = Connection::default();
+        assert!(!connection.is_authenticated_after_lookup().await);
+        let lookup = connection.lookup().await;
+        let mut judged = Box::pin(connection.is_authenticated_after_lookup());
+        assert!(futures_util::poll!(judged.as_mut()).is_pending());
+        connection.authenticate();
+        drop(lookup);
+        assert!(judged.await);
     }
 
     #[test]

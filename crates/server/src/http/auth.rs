@@ -362,6 +362,10 @@ async fn let_in(
 ) -> Result<Option<TokenHolder>, StoreError> {
     let (app, token, proof) = (app.clone(), token.clone(), showing.proof.clone());
     let connection = showing.connection.cloned();
+    let _lookup = match &connection {
+        Some(connection) => Some(connection.lookup().await),
+        None => None,
+    };
     let admitting = tokio::spawn(async move {
         let Some(Admitted { holder, is_first_use }) = app.store.admit(&token, &proof, now_ms).await? else {
             return Ok(None);

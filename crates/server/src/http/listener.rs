@@ -46,6 +46,8 @@ const WRITE_PAUSE: Duration = Duration::from_secs(60);
 const MOST_HEAD_BYTES: usize = 64 * 1024;
 /// This share of all connections, one in so many, is kept free of holders that have more than theirs.
 const RESERVED_SHARE: usize = 16;
+/// How long the listener rests after it has cut a connection for another.
+const CUT_PAUSE: Duration = Duration::from_millis(1);
 /// How long a place is waited for before the holders are looked at again.
 const LOOK_AGAIN: Duration = Duration::from_millis(250);
 /// Pause after an accept that failed because of us, for example for want of file descriptors.
@@ -182,7 +184,12 @@ impl Site {
             tokio::select! {
                 () = handle.authenticated() => {}
                 () = spoken.cancelled(), if is_proxy => {}
-                () = gives_way(&silent, crowded.clone()) => return,
+                () = gives_way(&silent, crowded.clone()) => {
+                    // What is being looked up by us is no reason to be cut.
+                    if !handle.is_authenticated_after_lookup().await {
+                        return;
+                    }
+                }
             }
             drop(silent);
             std::future::pending().await
@@ -226,12 +233,12 @@ impl Places {
             let left = self.free.available_permits();
             self.crowded.send_if_modified(|crowded| left > self.most / 8 && std::mem::take(crowded));
             if left < self.most / RESERVED_SHARE {
-                self.registry.cut_oldest_of_largest(self.most);
+                self.cut_one().await;
             }
             return Some(place);
         }
         loop {
-            if !self.registry.cut_oldest_of_largest(self.most) {
+            if !self.cut_one().await {
                 self.crowded.send_replace(true);
             }
             // By the next look strangers may have shown whose they are. The semaphore is never closed, so there is always a
@@ -240,6 +247,16 @@ impl Places {
                 return place.ok();
             }
         }
+    }
+
+    /// Cuts the oldest connection of the holder with the most, if that is more than its share. A holder that comes again as
+    /// soon as it is cut would otherwise keep the whole server busy with it.
+    async fn cut_one(&self) -> bool {
+        let is_cut = self.registry.cut_oldest_of_largest(self.most);
+        if is_cut {
+            tokio::time::sleep(CUT_PAUSE).await;
+        }
+        is_cut
     }
 }
 

@@ -204,7 +204,7 @@ pub struct RobotView {
     pub generation: Generation,
     /// The generation it last reported.
     pub observed_generation: Generation,
-    /// `diverged`, `duplicate_identity` and what the robot reported.
+    /// `diverged`, `duplicate_identity`, `instance_waits` and what the robot reported.
     pub conditions: Vec<Condition>,
     /// What it said of its machine.
     pub host: Option<HostFacts>,

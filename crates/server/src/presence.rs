@@ -144,8 +144,10 @@ impl Presence {
             return Standing { is_served: false, is_news: false };
         }
         let is_known = sightings.served.as_ref().is_some_and(|(served, _)| served.instance == claim.instance);
+        // The session of an older agent is told of its state without a word.
+        let is_news = claim.place.is_some() && (is_first_word || !is_known);
         sightings.served = Some((claim, now_ms));
-        Standing { is_served: true, is_news: is_first_word || !is_known }
+        Standing { is_served: true, is_news }
     }
 
     /// An agent that was heard before this process was started, and may be heard again.

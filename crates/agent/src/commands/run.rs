@@ -75,11 +75,7 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
     if let Err(error) = data.clean_leftovers() {
         tracing::warn!(%error, "cannot remove all that an earlier agent left half done");
     }
-    let base = match &config.server {
-        Some(server) => server.clone(),
-        None => parse_server(&identity.server)?,
-    };
-    refuse_plain_text(identity.ca_pin, &base, "server")?;
+    let base = server_of(&config, &identity)?;
     let tls = tls(identity.ca_pin, identity.client_key.as_ref())?;
     let client = server::client(tls.clone()).context("cannot make an HTTP client")?;
     let credential = Credential::from(identity.token.clone());
@@ -147,6 +143,13 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
     stop.abort();
     tracing::info!("task-agent ends; its tasks go on running");
     Ok(())
+}
+
+/// Where the server is: as the settings say, else where the robot enrolled.
+fn server_of(config: &Config, identity: &Identity) -> anyhow::Result<reqwest::Url> {
+    let base = config.server.clone().map_or_else(|| parse_server(&identity.server), Ok)?;
+    refuse_plain_text(identity.ca_pin, &base, "server")?;
+    Ok(base)
 }
 
 /// Keeps a session up, answers what is asked in it and publishes what tasks say.

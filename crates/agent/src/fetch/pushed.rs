@@ -398,7 +398,7 @@ impl<'a> Gathering<'a> {
 }
 
 /// Runs what may wait for the disk where nothing else waits for it.
-async fn on_disk<T: Send + 'static>(
+pub(super) async fn on_disk<T: Send + 'static>(
     path: &Path,
     work: impl FnOnce() -> io::Result<T> + Send + 'static,
 ) -> Result<T, FetchError> {

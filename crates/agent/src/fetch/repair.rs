@@ -8,7 +8,9 @@ use std::sync::Arc;
 
 use task_proto::RepositoryName;
 use task_proto::desired::{BlobRef, PackageRef};
+use tokio::sync::OwnedMutexGuard;
 
+use super::pushed::on_disk;
 use super::{FetchError, Fetcher};
 
 /// The shortest range: of a small content few are needed.
@@ -24,20 +26,25 @@ const MAX_COPIES: usize = 8;
 const MAX_LEAD_BYTES: u64 = 4096;
 
 impl Fetcher {
-    /// Mends the `.part` of a content, all of whose bytes are there.
-    pub(super) async fn repair_content(&self, package: &PackageRef) -> Result<(), FetchError> {
+    /// Mends the `.part` of a content, all of whose bytes are there. The turn is held by writes that outlive this.
+    pub(super) async fn repair_content(
+        &self,
+        package: &PackageRef,
+        turn: &Arc<OwnedMutexGuard<()>>,
+    ) -> Result<(), FetchError> {
         let (repository, blob) = (RepositoryName::of_package(&package.name), package.content);
         let part = self.data.blob_part(&blob.digest);
-        let disk = |source| FetchError::disk(&part, source);
-        let file = Arc::new(OpenOptions::new().read(true).write(true).open(&part).map_err(disk)?);
+        let file = OpenOptions::new().read(true).write(true).open(&part);
+        let file = Arc::new(file.map_err(|source| FetchError::disk(&part, source))?);
         for (from, length) in ranges(blob.size) {
-            let mut first = vec![0; length];
-            file.read_exact_at(&mut first, from).map_err(disk)?;
+            let (read, mut first) = (file.clone(), vec![0; length]);
+            let first = on_disk(&part, move || read.read_exact_at(&mut first, from).map(|()| first)).await?;
             if let Some(agreed) = self.agreed(&repository, blob, from, first).await? {
-                file.write_all_at(&agreed, from).map_err(disk)?;
+                let (written, turn) = (file.clone(), turn.clone());
+                on_disk(&part, move || written.write_all_at(&agreed, from).map(|()| drop(turn))).await?;
             }
         }
-        file.sync_data().map_err(disk)
+        Ok(())
     }
 
     /// The same of a blob that is held in memory.

@@ -45,7 +45,7 @@ impl Fetcher {
             ended => return ended.map_err(FetchError::confirmed),
         }
         tracing::warn!(package = %package.name, "other bytes came again; ranges of them are compared");
-        let repaired = cancel.run_until_cancelled(self.repair_content(package)).await;
+        let repaired = cancel.run_until_cancelled(self.repair_content(package, &turn)).await;
         repaired.ok_or(FetchError::Cancelled)??;
         self.pull_content(package, manifest, progress, cancel, turn).await.map_err(FetchError::confirmed)
     }

@@ -187,7 +187,8 @@ async fn a_version_moves_to_other_content_only_by_force(database: TestDatabase) 
     // A version that means something else than a package, and what is no package, move as ever.
     for layer in [&b"one"[..], b"two"] {
         let image = image(config, registry.push_blob("talker", layer).await);
-        assert_eq!(put("2.0.0", &image).await.status(), StatusCode::CREATED);
+        let answer = registry.put_manifest("/v2/talker/manifests/2.0.0", MANIFEST_TYPE, &image).await;
+        assert_eq!(answer.status(), StatusCode::CREATED);
     }
 }
 

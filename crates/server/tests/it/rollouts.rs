@@ -127,7 +127,7 @@ async fn robots_that_come_back_together_begin_in_batches(database: TestDatabase)
     let begun: Vec<bool> =
         fleet.deployment(&id).await.assignments.expect("there").iter().map(|one| one.released).collect();
     assert_eq!(begun.iter().filter(|released| **released).count(), 2);
-    assert!(fleet.has_begun(&robots[5]).await && fleet.has_begun(&robots[6]).await, "in the order of their turns");
+    assert!(fleet.has_begun(&robots[10]).await && fleet.has_begun(&robots[11]).await, "by name: 10 comes before 5");
 }
 
 async fn a_resume_of_what_is_not_paused_says_what_it_waits_for(database: TestDatabase) {

@@ -190,7 +190,8 @@ async fn an_order_beyond_the_scope_is_refused_as_a_whole(database: TestDatabase)
     assert_eq!(code(fleet.actions.robots_with_task(&alice, &task, &selector("*")).await), "out_of_scope");
     assert_eq!(code(fleet.actions.cancel_deployment(&alice, &everywhere).await), "out_of_scope");
     assert_eq!(code(fleet.actions.resume_deployment(&alice, &everywhere).await), "out_of_scope");
-    fleet.actions.cancel_deployment(&alice, &own).await.expect("all of it is hers");
+    let over = fleet.actions.cancel_deployment(&alice, &own).await;
+    assert_eq!(code(over), "nothing_to_cancel", "all of it is hers, and over");
     let lab = selector("site=lab");
     let stopped = fleet.actions.order_task(&alice, &key, TaskOrder::Stop, &task, &lab).await.expect("ordered");
     assert_eq!(stopped.len(), 2);

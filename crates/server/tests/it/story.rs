@@ -232,16 +232,15 @@ async fn a_newer_deployment_supersedes_and_a_cancel_puts_back(database: TestData
     assert_eq!(fleet.phases(&old).await, [Phase::Running, Phase::Running]);
     assert!(fleet.deployment(&new).await.supersedes.is_empty());
     // A service that runs has settled: there is nothing to interrupt.
-    fleet.actions.cancel_deployment(&fleet.operator, &old).await.expect("cancelled");
+    assert_eq!(code(fleet.actions.cancel_deployment(&fleet.operator, &old).await), "nothing_to_cancel");
     assert_eq!(fleet.phases(&old).await, [Phase::Running, Phase::Running]);
     assert_eq!(fleet.desired(&robots[1]).await.expect("state").tasks[0].deployment, old);
-    // What runs under a cancelled deployment is put back like any other.
     let third = fleet.deploy("3", |_| ()).await;
     fleet.actions.cancel_deployment(&fleet.operator, &third).await.expect("cancelled");
     assert_eq!(fleet.desired(&robots[1]).await.expect("state").tasks[0].deployment, old);
     let unknown = task_proto::DeploymentId::random();
     assert_eq!(code(fleet.actions.cancel_deployment(&fleet.operator, &unknown).await), "not_found");
-    assert_eq!(code(fleet.actions.resume_deployment(&fleet.operator, &old).await), "deployment_cancelled");
+    assert_eq!(code(fleet.actions.resume_deployment(&fleet.operator, &third).await), "deployment_cancelled");
 }
 
 async fn a_cancel_of_what_is_over_is_refused_and_changes_nothing(database: TestDatabase) {

@@ -322,7 +322,7 @@ async fn waiting_ends_with_the_outcome_of_all_robots() {
     let wait = [&order[..], &["--wait", "--timeout", "1m"]].concat();
     bench.taskd(&wait).await.expect(3, "robot-2: failed (process_exited: exit code 3)");
 
-    let order = ["push", &package, "--to", "robot-1", "--idempotency-key", "second", "-o", "json"];
+    let order = ["push", &package, "--to", "robot-1", "--restart", "--idempotency-key", "second", "-o", "json"];
     let wait = [&order[..], &["--wait", "--timeout", "1m"]].concat();
     let deployment = bench.taskd(&order).await.expect(0, "supersedes").json();
     bench.report(&one, &deployment, "running").await;

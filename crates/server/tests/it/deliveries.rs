@@ -73,6 +73,7 @@ async fn every_robot_gets_what_its_rule_says(database: TestDatabase) {
     ];
     let fleet = Fleet::with_delivery(database, &settings(rules)).await;
     let mut robots = fleet.enroll(6).await;
+    robots.iter().for_each(|robot| fleet.go_offline(&robot.id));
     label(&fleet, &robots[0], "metered", "true").await;
     robots[1].battery_percent = Some(15);
     robots[2].link = Some(LinkFacts { throughput_bytes_per_s: Some(512 << 10), ..LinkFacts::default() });
@@ -81,7 +82,7 @@ async fn every_robot_gets_what_its_rule_says(database: TestDatabase) {
         fleet.report(robot).await;
     }
     let address: SocketAddr = "10.0.0.4:1".parse().expect("an address");
-    fleet.presence.connected(&robots[4].id, Some(address), 1, fleet.clock.now_ms());
+    fleet.presence.connected(&robots[4].id, Some(address), 2, fleet.clock.now_ms());
     fleet.load.set(9, 0);
     let id = fleet.deploy("1", |_| ()).await;
     let expected = [
@@ -148,7 +149,7 @@ async fn a_robot_that_has_the_bytes_lacks_nothing(database: TestDatabase) {
     assert_eq!(decisions(&fleet, &id).await, vec![decision(Delivery::Inline, "tiny", "size 2 B ≤ 32 KB"); 3]);
     fleet.follow(&mut robots[0], Phase::Running).await;
     fleet.follow(&mut robots[1], Phase::Fetching).await;
-    let again = fleet.deploy("1", |_| ()).await;
+    let again = fleet.deploy("1", |order| order.restart = true).await;
     let decided = decisions(&fleet, &again).await;
     assert_eq!(decided[0], decision(Delivery::Poll, "own lacking_at_most", "lacking 0 B ≤ 0 B"));
     let tiny = decision(Delivery::Inline, "tiny", "size 2 B ≤ 32 KB");

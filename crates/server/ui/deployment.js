@@ -227,9 +227,8 @@ export class DeploymentView {
         <div><dt>Transferred</dt><dd>${total ? bytes({ done, total }) : '–'}</dd></div>
         <div><dt>Throughput</dt><dd>${rate ? `${size(rate)}/s` : '–'}</dd></div>
         <div><dt>Time left</dt><dd>${timeLeft(this.#deployment.state, done, total, awaited, rate)}</dd></div>
-        ${this.#isUnsettled ? html`
-          <div class="awaited"><dt>Waits for</dt><dd>${busy.length ? someNames(busy) : '–'}</dd></div>
-          <div class="awaited"><dt>Offline</dt><dd>${offline.length ? html`${someNames(offline)}: ${offline.length === 1 ? 'goes' : 'go'} on when back` : '–'}</dd></div>` : nothing}
+        <div class="awaited"><dt>Waits for</dt><dd>${this.#isUnsettled && busy.length ? someNames(busy) : '–'}</dd></div>
+        <div class="awaited"><dt>Offline</dt><dd>${this.#isUnsettled && offline.length ? html`${someNames(offline)}: ${offline.length === 1 ? 'goes' : 'go'} on when back` : '–'}</dd></div>
       </dl>`;
   }
 

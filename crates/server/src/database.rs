@@ -38,7 +38,7 @@ pub struct Database {
 }
 
 impl Database {
-    /// Opens the database at `url`. One that is away is left to [`Self::attend`].
+    /// Opens the database at `url`. A Postgres that is away or has no connection left is left to [`Self::attend`].
     pub async fn open(
         url: &str,
         operator: FirstOperator,
@@ -46,9 +46,9 @@ impl Database {
         clock: Clock,
     ) -> Result<Self, StoreError> {
         let store = match Store::open(url).await {
-            Err(error) if error.fault() == Some(Fault::Away) => {
+            Err(error) if passes(&error) && url.starts_with("postgres") => {
                 let error = &error as &dyn std::error::Error;
-                tracing::warn!(error, "the database does not answer; the server waits for it");
+                tracing::warn!(error, "the database can't be opened now; the server waits for it");
                 Store::unopened(url)
             }
             opened => opened?,
@@ -88,7 +88,7 @@ impl Database {
                 tokio::time::sleep(pause).await;
                 pause = longest.min(pause * 2);
                 let Err(error) = self.bring_up().await else { continue };
-                if !matches!(error.fault(), Some(Fault::Away | Fault::Busy)) {
+                if !passes(&error) {
                     let error = anyhow::Error::new(error);
                     self.unusable.send_replace(Some(format!("{error:#}")));
                     return;
@@ -138,6 +138,11 @@ impl Database {
             created => created,
         }
     }
+}
+
+/// Whether the error is of a kind that passes by itself.
+fn passes(error: &StoreError) -> bool {
+    matches!(error.fault(), Some(Fault::Away | Fault::Busy))
 }
 
 /// Checks the database in full at once and then at this interval, until `stop`.

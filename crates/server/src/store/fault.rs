@@ -67,12 +67,11 @@ impl Fault {
         match code {
             "XX001" | "XX002" => Some(Self::Corrupt),
             "53100" => Some(Self::Full),
-            // Shut down, crashed, starting up, cut off for being idle, too many connections or too little memory, a standby.
-            "57P01" | "57P02" | "57P03" | "57P05" | "25P03" | "53000" | "53200" | "53300" | "53400" | "25006" => {
-                Some(Self::Away)
-            }
-            // A lock or a statement that took too long, a deadlock.
-            "55P03" | "57014" | "40001" | "40P01" => Some(Self::Busy),
+            // Shut down, crashed, starting up, cut off for being idle, a standby.
+            "57P01" | "57P02" | "57P03" | "57P05" | "25P03" | "25006" => Some(Self::Away),
+            // Too many connections, too little memory, a lock or a statement that took too long, a deadlock. Connections that
+            // are there go on.
+            "53000" | "53200" | "53300" | "53400" | "55P03" | "57014" | "40001" | "40P01" => Some(Self::Busy),
             _ if code.starts_with("08") => Some(Self::Away),
             _ => None,
         }
@@ -98,7 +97,7 @@ mod tests {
             ("XX001", Some(Fault::Corrupt)),
             ("53100", Some(Fault::Full)),
             ("57P03", Some(Fault::Away)),
-            ("53300", Some(Fault::Away)),
+            ("53300", Some(Fault::Busy)),
             ("08006", Some(Fault::Away)),
             ("57014", Some(Fault::Busy)),
             ("23505", None),

@@ -184,7 +184,7 @@ impl Presence {
     pub fn offline_ms<'a>(&self, robots: impl IntoIterator<Item = &'a RobotId>, now_ms: u64) -> Vec<Option<u64>> {
         let known = self.robots();
         let offline_ms = |robot: &RobotId| {
-            let since_ms = match known.get(robot).map(|sightings| sightings.view(self.window_ms, now_ms)) {
+            let since_ms = match known.get(robot).and_then(|sightings| sightings.view(self.window_ms, now_ms)) {
                 Some(sighting) if sighting.online => return None,
                 Some(sighting) => sighting.last_seen_ms.max(self.started_ms),
                 None => self.started_ms,

@@ -139,6 +139,11 @@ impl Nats {
         format!("mqtt://taskd:{PASSWORD}@{}", self.mqtt)
     }
 
+    /// What it has logged.
+    fn log(&self) -> String {
+        std::fs::read_to_string(self.dir.join("log")).expect("a log")
+    }
+
     /// What an operator does after robots were enrolled.
     async fn learn(&self, server: &Server) {
         let text = server.operate(["broker", "nats"]).await;
@@ -175,10 +180,14 @@ async fn fleet_works_through_nats_where_robots_reach_their_own_subjects_only() {
     // NATS ends a session for whoever knows its client id. Nobody does.
     let (verdict, words) = doctor(&server).await;
     assert!(verdict == "notice" && words.contains("NATS has no such setting"), "{verdict}: {words}");
+    let replaced = || nats.log().matches("Replacing old client").count();
+    let before = replaced();
+    assert!(before > 0, "the test's own session was replaced: {}", nats.log());
     let mut held = Vec::new();
     for id in known_ids(&server, &victim).await {
         held.push(connect_as(nats.mqtt, &attacker, &id).await);
     }
+    assert_eq!(replaced(), before, "{}", nats.log());
     assert_undisturbed(&server, "robot-2", 1).await;
 
     let (client, mut events) = connect_as(nats.mqtt, &attacker, "spy").await;

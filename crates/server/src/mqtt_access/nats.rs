@@ -1,6 +1,7 @@
 //! The `authorization` block of a NATS server: each account with a bcrypt hash of its password and the subjects that MQTT
-//! maps its topics to. All else is denied, NATS' own subjects (`$MQTT.>`, `$JS.>`, `$SYS.>`) by name, and so is every
-//! protocol but MQTT: a NATS client with a robot's password could read other robots' sessions there.
+//! maps its topics to. What is not in the lists is denied, NATS' own subjects (`$MQTT.>`, `$JS.>`, `$SYS.>`) included; and so
+//! is every protocol but MQTT: a NATS client with a robot's password could read other robots' sessions there. There is no
+//! list of what is denied: one with `$MQTT.>` would also deny the subscriptions that NATS makes for each MQTT session.
 
 use std::fmt::Write as _;
 
@@ -13,9 +14,6 @@ use crate::broker::CANARY_LEVEL;
 const DERIVED_COST: u32 = 4;
 /// The server's own password was thought up by a person.
 const SERVER_COST: u32 = 11;
-/// Subjects that NATS keeps sessions, streams and its own messages under.
-const DENIED: &str = r#""$MQTT.>", "$JS.>", "$SYS.>", "_INBOX.>""#;
-
 /// The whole block.
 pub(super) fn authorization(
     external: &External,
@@ -31,7 +29,7 @@ pub(super) fn authorization(
         let _ = writeln!(
             text,
             "    {{ user: \"{}\", password: \"{hash}\", allowed_connection_types: [\"MQTT\"], permissions: {{\n      \
-             publish: {{ allow: [{publish}], deny: [{DENIED}] }}, subscribe: {{ allow: [{subscribe}], deny: [{DENIED}] }} }} }}",
+             publish: {{ allow: [{publish}] }}, subscribe: {{ allow: [{subscribe}] }} }} }}",
             account.user_name
         );
     }
@@ -71,7 +69,7 @@ fn subjects(account: &Account, prefix: &TopicPrefix) -> (String, String) {
             subscribe.push(parts);
             (list(of_robot(&account.user_name, &from_robots)), list(subscribe))
         }
-        // Without a list of what is allowed, all that is not denied would be.
+        // Without a list of what is allowed everything would be.
         Role::Probe => {
             let own = format!("{prefix}.probe.{}", account.user_name);
             (list(vec![own.clone()]), list(vec![own]))

@@ -133,8 +133,8 @@ export class Server {
     return stdout;
   }
 
-  /** Puts a package there; `files` are its files by name, `more` further lines of its manifest, `to` whom it is deployed to. Answers what was printed. */
-  push(name, version, { files = { 'run.sh': '#!/bin/sh\nexec sleep 1000\n' }, more = '', to } = {}) {
+  /** Puts a package there; `files` are its files by name, `more` further lines of its manifest, `to` whom it is deployed to, `force` whether its version may be another's. Answers what was printed. */
+  push(name, version, { files = { 'run.sh': '#!/bin/sh\nexec sleep 1000\n' }, more = '', to, force = false } = {}) {
     const path = join(directory(this.t), name);
     mkdirSync(path);
     for (const [file, content] of Object.entries(files)) {
@@ -143,7 +143,7 @@ export class Server {
       if (String(content).startsWith('#!')) chmodSync(join(path, file), 0o755);
     }
     writeFileSync(join(path, 'task.toml'), `name = "${name}"\nversion = "${version}"\n\n[run]\nexec = ["./run.sh"]\n${more}`);
-    return JSON.parse(this.operate('push', path, '-o', 'json', ...(to ? ['--to', to, '--yes'] : [])));
+    return JSON.parse(this.operate('push', path, '-o', 'json', ...(force ? ['--force'] : []), ...(to ? ['--to', to, '--yes'] : [])));
   }
 
   enrolmentToken(wanted = {}) {

@@ -88,7 +88,7 @@ test('two packages of one version are told apart', async (t) => {
   server.push('talker', '1.0.0', { files: { 'run.sh': SCRIPT, 'x86_64.so': 'one' }, to: 'atlas' });
   await atlas.report('running', running((manifest) => ({ manifest })));
   const borea = await Puppet.enroll(server, 'borea');
-  server.push('talker', '1.0.0', { files: { 'run.sh': SCRIPT, 'aarch64.so': 'another' }, to: 'borea' });
+  server.push('talker', '1.0.0', { files: { 'run.sh': SCRIPT, 'aarch64.so': 'another' }, to: 'borea', force: true });
   await borea.report('running', running((manifest) => ({ manifest })));
   const page = await open(t, server, { hash: '#/packages/talker' });
   const runsOn = (robot) => page.locator('section', { has: page.getByRole('heading', { name: 'Runs on 1' }) }).getByRole('link', { name: robot });
@@ -114,7 +114,7 @@ test('what robots should have is not offered to be deleted', async (t) => {
   const server = await Server.start(t);
   await Puppet.enroll(server, 'atlas');
   server.push('talker', '1.0.0', { files: { 'run.sh': SCRIPT, 'x86_64.so': 'one' } });
-  server.push('talker', '1.0.0', { files: { 'run.sh': SCRIPT, 'aarch64.so': 'another' }, to: 'atlas' });
+  server.push('talker', '1.0.0', { files: { 'run.sh': SCRIPT, 'aarch64.so': 'another' }, to: 'atlas', force: true });
   const page = await open(t, server, { hash: '#/packages/talker' });
   const dialog = page.getByRole('dialog');
   const remove = dialog.getByRole('button', { name: 'Delete' });

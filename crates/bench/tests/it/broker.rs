@@ -363,8 +363,7 @@ async fn server_and_robots_fail_over_to_the_next_broker_of_the_list() {
     wait_connected(&server, 1).await;
     let is_at = async |broker: &Mosquitto| {
         let info = server.get("/api/v1/server").await.expect("it answers");
-        let info: ServerInfo = serde_json::from_value(info).expect("its facts");
-        info.mqtt == broker.address.to_string()
+        info["mqtt"] == broker.address.to_string()
     };
     // It is at the one that was up first when it tried.
     let (at, other) = if is_at(&brokers[0]).await { (0, 1) } else { (1, 0) };

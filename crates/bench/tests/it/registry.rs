@@ -94,7 +94,7 @@ async fn crane_copies_a_package_under_another_name() {
     let packages = packages["packages"].as_array().expect("packages");
     assert_eq!(packages.len(), 1, "{packages:?}");
     // And back, after its own was deleted.
-    server.operate(["package", "rm", "talker", "1.0.0", "--yes"]).await;
+    server.operate(["package", "rm", "talker:1.0.0", "--yes"]).await;
     crane(dir.path(), &["copy", "--insecure", &mirror, &own]).await;
     assert_eq!(crane(dir.path(), &["digest", "--insecure", &own]).await, digest);
 }

@@ -288,8 +288,8 @@ async fn copy_of_a_robots_data_gets_no_order_while_the_original_is_briefly_away(
     let order = site.push("1.0", &sign).await;
     copy.restart();
     is_noticed(&site).await;
-    assert_eq!(desired_by(&site.server, copy.data()).await.status(), StatusCode::CONFLICT);
     copy.kill();
+    assert_eq!(desired_by(&site.server, copy.data()).await.status(), StatusCode::CONFLICT);
     assert!(!copy.data().join("tasks/worker").exists(), "the copy got the order");
     site.robot.thaw();
     site.wait(&order, Phase::Running).await;

@@ -189,22 +189,34 @@ pub async fn build(order: &BuildOrder, cancel: &CancellationToken) -> Result<(),
     if let Some(missing) = missing {
         return Err(BuildError::NotInstalled { missing, output });
     }
-    let synced = root.to_owned();
-    let syncing = tokio::task::spawn_blocking(move || durable::sync_file_system(&synced));
-    syncing.await.unwrap_or_else(|error| Err(error.into())).map_err(failed(root))
+    let (version, user) = (order.version.clone(), order.user.clone());
+    let finishing = tokio::task::spawn_blocking(move || {
+        // What was built is for every account to run and for none to change.
+        let made = user.iter().flat_map(|user| made(&version).map(|tree| (tree, user.uid)));
+        made.into_iter().try_for_each(|(tree, uid)| task_user::take_back(&tree, uid))?;
+        durable::sync_file_system(version.root())
+    });
+    finishing.await.unwrap_or_else(|error| Err(error.into())).map_err(failed(root))
+}
+
+/// What a build writes into.
+fn made(version: &VersionDir) -> [PathBuf; 3] {
+    [version.build(), version.install(), version.root().join("log")]
 }
 
 fn prepare(order: &BuildOrder, script: &str) -> Result<(), BuildError> {
     let root = order.version.root();
-    for stale in [order.version.build(), order.version.install(), root.join("log")] {
-        durable::remove_dir_all(&stale).map_err(failed(&stale))?;
+    for tree in made(&order.version) {
+        durable::remove_dir_all(&tree).map_err(failed(&tree))?;
+        // The rest of the version is read-only to its build.
+        order.user.as_ref().map_or(Ok(()), |user| user.make_home(&tree)).map_err(failed(&tree))?;
     }
     if let Some(logs) = order.log.parent() {
         durable::create_dir_all(logs).map_err(failed(logs))?;
     }
     let path = script_path(order);
     durable::write(&path, script.as_bytes(), 0o755).map_err(failed(&path))?;
-    order.user.as_ref().map_or(Ok(()), |user| user.hand_over(root)).map_err(failed(root))
+    order.user.as_ref().map_or(Ok(()), |user| user.admit(root)).map_err(failed(root))
 }
 
 fn script_path(order: &BuildOrder) -> PathBuf {

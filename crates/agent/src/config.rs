@@ -4,6 +4,7 @@
 use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::fmt::Write as _;
+use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -26,6 +27,11 @@ use crate::trust::TrustSettings;
 pub const FILE_NAME: &str = "agent.toml";
 /// The longest time the gate may be given to answer, in seconds.
 pub const MAX_GATE_TIMEOUT_S: u64 = 300;
+/// The user ids of tasks and builds. Neither Debian nor systemd gives these to anybody, and they are below those that are
+/// handed out for containers.
+const DEFAULT_TASK_UIDS: &str = "70000-79999";
+/// Below it are the system's own accounts.
+const MIN_TASK_UID: u32 = 1000;
 /// What every variable starts with.
 const VARIABLE_PREFIX: &str = "TASK_AGENT_";
 /// The variable by which ROS 2 itself knows its domain; `ros_domain_id` wins.
@@ -73,13 +79,17 @@ pub struct Settings {
     /// Seconds after which the robot says again how its machine does; 0: it does not say.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub vitals_interval_s: Option<u64>,
-    /// Whom an agent that is root builds and runs tasks as, by name or number; absent: `taskd-task`. `root` must be said.
+    /// Whose groups the tasks of an agent that is root have, by name or number; absent: `taskd-task`. `root` must be said,
+    /// and then tasks run as root.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub task_user: Option<String>,
     /// Whether builds and tasks are denied system calls that only an administrator needs; absent: where they run under an
     /// account of their own.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub seccomp: Option<Seccomp>,
+    /// The user ids that tasks and builds run under, `FIRST-LAST`; `none`: all of them under `task_user`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub task_uids: Option<String>,
     /// The labels the robot gives itself; the server's win.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub labels: Option<Labels>,
@@ -233,10 +243,12 @@ pub struct Config {
     pub token_lifetime: Duration,
     /// Between two times that the robot says how its machine does; zero: never.
     pub vitals_interval: Duration,
-    /// Whom tasks run as, if the settings say.
+    /// Whose groups tasks have, if the settings say.
     pub task_user: Option<String>,
     /// Whether they are denied system calls, if the settings say.
     pub seccomp: Option<Seccomp>,
+    /// The user ids of tasks and builds; `None`: that of `task_user` for all.
+    pub task_uids: Option<RangeInclusive<u32>>,
     /// What tasks may use.
     pub limits: RobotLimits,
     /// Which log lines go to the server by themselves.
@@ -351,6 +363,7 @@ impl Config {
             parallel_tasks: limits.parallel_tasks.map_or(2, count),
             task_user: settings.task_user,
             seccomp: settings.seccomp,
+            task_uids: task_uids(settings.task_uids.as_deref().unwrap_or(DEFAULT_TASK_UIDS))?,
             task_pids: limits.task_pids.unwrap_or(4096),
             limits,
             gate: settings.gate.map(gate).transpose()?,
@@ -388,6 +401,28 @@ fn parse_ros_domain_id(value: &str) -> Result<u32, ConfigError> {
     id.ok_or_else(|| ConfigError::Invalid {
         origin: ROS_DOMAIN_ID.to_owned(),
         reason: format!("{value:?} is not a number from 0 to {MAX_ROS_DOMAIN_ID}"),
+    })
+}
+
+/// User ids as people write a range of them.
+fn task_uids(text: &str) -> Result<Option<RangeInclusive<u32>>, ConfigError> {
+    if text.trim() == "none" {
+        return Ok(None);
+    }
+    let ends = text.split_once('-').map(|(first, last)| (first.trim().parse(), last.trim().parse()));
+    let range = ends.and_then(|(first, last)| Some(first.ok()?..=last.ok()?));
+    let is_usable = |range: &RangeInclusive<u32>| {
+        let (first, last) = (*range.start(), *range.end());
+        // 65534 is nobody, and the highest two of 16 and of 32 bits are none.
+        let reserved = [65_534, 65_535, u32::MAX - 1, u32::MAX];
+        first >= MIN_TASK_UID && last > first && reserved.iter().all(|id| !range.contains(id))
+    };
+    range.filter(is_usable).map(Some).ok_or_else(|| ConfigError::Invalid {
+        origin: "task_uids".to_owned(),
+        reason: format!(
+            "{text:?} is neither \"none\" nor a range of user ids like {DEFAULT_TASK_UIDS:?}, two at least, from \
+             {MIN_TASK_UID} on, without 65534 and 65535"
+        ),
     })
 }
 
@@ -433,7 +468,9 @@ pub fn parse_server(text: &str) -> Result<reqwest::Url, ConfigError> {
 fn override_by(table: &mut Table, name: &str, text: &str) -> Result<(), ConfigError> {
     let key = name[VARIABLE_PREFIX.len()..].to_ascii_lowercase();
     let value = match key.as_str() {
-        "server" | "name" | "task_user" | "seccomp" | "mqtt_transport" | "workspace" => Value::String(text.to_owned()),
+        "server" | "name" | "task_user" | "task_uids" | "seccomp" | "mqtt_transport" | "workspace" => {
+            Value::String(text.to_owned())
+        }
         "gate_command" => Value::Array(vec![Value::String(text.to_owned())]),
         "trusted_publishers_keys" | "trusted_publishers_keeper_keys" => {
             let keys = text.split(',').map(str::trim).filter(|key| !key.is_empty());
@@ -561,6 +598,20 @@ mod tests {
         assert!(text("[logs]\nforward_level = \"loud\"\n", &[]).contains("forward_level"));
         let variable = "TASK_AGENT_LOGS_FORWARD_LINES_PER_S";
         assert!(text("", &[(variable, "100000")]).starts_with("TASK_AGENT_LOGS_FORWARD_LINES_PER_S: 100000 is not"));
+    }
+
+    #[test]
+    fn task_uids_are_a_range_or_none() {
+        let uids = |file: &str| load(file, &[]).map(|config| config.task_uids);
+        assert_eq!(uids("").expect("valid"), Some(70_000..=79_999));
+        assert_eq!(uids("task_uids = \"2000 - 2001\"\n").expect("valid"), Some(2000..=2001));
+        assert_eq!(uids("task_uids = \"none\"\n").expect("valid"), None);
+        let variable = load("", &[("TASK_AGENT_TASK_UIDS", "80000-80003")]).expect("valid");
+        assert_eq!(variable.task_uids, Some(80_000..=80_003));
+        for bad in ["", "70000", "70001-70000", "70000-70000", "500-600", "65000-66000", "70000-99999999999", "a-b"] {
+            let refused = uids(&format!("task_uids = {bad:?}\n")).expect_err(bad).to_string();
+            assert!(refused.starts_with("task_uids in /") && refused.contains("70000-79999"), "{refused}");
+        }
     }
 
     #[test]

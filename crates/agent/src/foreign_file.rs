@@ -95,7 +95,7 @@ fn open_found(found: &OwnedFd) -> io::Result<File> {
     match kind(&fstat(found)?) {
         SFlag::S_IFREG => File::open(by_descriptor(found)),
         SFlag::S_IFLNK => Err(Errno::ELOOP.into()),
-        _ => Err(io::Error::other("it is not a regular file")),
+        _ => Err(io::Error::new(io::ErrorKind::InvalidData, "it is not a regular file")),
     }
 }
 

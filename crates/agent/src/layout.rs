@@ -7,6 +7,7 @@
 //! blobs/sha256/<hex>.part           bytes of a package's content that have arrived so far
 //! blobs/sha256/<hex>.parts          the same where they come as parts in any order: a file with holes
 //! blobs/sha256/<hex>.parts-note     which of its parts are on the disk
+//! accounts.json                     which account each task runs under
 //! staging/                          trees being unpacked; emptied at every start
 //! survey/                           what was last asked about the ROS installations
 //! logs/                             what nodes say that are of no task
@@ -14,11 +15,15 @@
 //! tasks/<name>/run/                 the shim's files: pid, exit status
 //! tasks/<name>/logs/                the task's and the build's output, and what its nodes say on ROS topics
 //! tasks/<name>/home/                the task's home directory, where it runs as a user of its own
+//! tasks/<name>/build_home/          that of its builds
 //! tasks/<name>/uploads.json         which uploads of its files are under way
 //! tasks/<name>/<hex>.signatures     what publishers have signed about a version, out of the task's reach
+//! tasks/<name>/<hex>.seal           what was unpacked and built of a version, by digests
 //! tasks/<name>/<hex>/               one version, by the digest of its OCI manifest
 //!   task.json                       the task manifest, byte for byte as it was pulled
-//!   src/  build/  install/  run.sh
+//!   src/  build/  install/  run.sh  read-only to the task
+//!   work/                           the directory that the task runs in
+//!   node_logs/                      what its nodes write into logs of their own
 //! ```
 //!
 //! It owns names, and what may be cleaned away; what is in the files is their owners' affair.
@@ -36,6 +41,8 @@ use crate::durable;
 const REMOVED: &str = ".removed-";
 /// What follows a version's name in that of the file with its signatures.
 const SIGNATURES: &str = ".signatures";
+/// And in that of the file that says what was unpacked and built.
+const SEAL: &str = ".seal";
 
 /// The agent's data directory.
 #[derive(Debug, Clone)]
@@ -79,6 +86,11 @@ impl DataDir {
     /// The list of publishers the agent goes by.
     pub fn publishers(&self) -> PathBuf {
         self.root.join("publishers.json")
+    }
+
+    /// Which account each task runs under.
+    pub fn accounts(&self) -> PathBuf {
+        self.root.join("accounts.json")
     }
 
     /// Where a blob's bytes gather while they are being pulled.
@@ -187,6 +199,11 @@ impl TaskDir {
         self.root.join("home")
     }
 
+    /// The home directory of its builds.
+    pub fn build_home(&self) -> PathBuf {
+        self.root.join("build_home")
+    }
+
     /// Which uploads of its files are under way: out of the task's reach, because it says where the robot's token goes.
     pub fn uploads(&self) -> PathBuf {
         self.root.join("uploads.json")
@@ -200,6 +217,11 @@ impl TaskDir {
     /// What publishers have signed about that version.
     pub fn signatures(&self, manifest: &Digest) -> PathBuf {
         self.root.join(format!("{}{SIGNATURES}", manifest.hex()))
+    }
+
+    /// What was unpacked and built of that version, by digests: out of the task's reach.
+    pub fn seal(&self, manifest: &Digest) -> PathBuf {
+        self.root.join(format!("{}{SEAL}", manifest.hex()))
     }
 
     /// The version that `current` points to.
@@ -227,7 +249,9 @@ impl TaskDir {
             }
         }
         for path in entries(&self.root)? {
-            let version = file_name(&path).and_then(|name| name.strip_suffix(SIGNATURES)).map(Path::new);
+            let version = file_name(&path)
+                .and_then(|name| [SIGNATURES, SEAL].iter().find_map(|suffix| name.strip_suffix(suffix)))
+                .map(Path::new);
             let version = version.and_then(digest_of);
             if version.is_some_and(|digest| !kept.contains(&digest) && current != Some(digest)) {
                 durable::remove_file(&path)?;
@@ -270,6 +294,11 @@ impl VersionDir {
     /// What was built.
     pub fn install(&self) -> PathBuf {
         self.root.join("install")
+    }
+
+    /// The directory that the task runs in: what it writes there stays until the version goes.
+    pub fn work(&self) -> PathBuf {
+        self.root.join("work")
     }
 
     /// Where the nodes of a run write logs of their own.
@@ -338,6 +367,7 @@ mod tests {
         for digest in [old, previous, current] {
             durable::create_dir_all(&task.version(&digest).src()).unwrap();
             fs::write(task.signatures(&digest), "[]").unwrap();
+            fs::write(task.seal(&digest), "{}").unwrap();
         }
         assert_eq!(task.current(), None);
         task.set_current(&old).unwrap();
@@ -347,6 +377,7 @@ mod tests {
         left.sort();
         assert_eq!((task.current(), task.versions().unwrap()), (Some(current), left));
         assert_eq!([old, previous, current].map(|digest| task.signatures(&digest).exists()), [false, true, true]);
+        assert_eq!([old, previous, current].map(|digest| task.seal(&digest).exists()), [false, true, true]);
         assert_eq!(data.task_names().unwrap(), ["talker".parse().unwrap()]);
         task.remove().unwrap();
         assert_eq!(data.task_names().unwrap(), []);

@@ -343,6 +343,13 @@ fn free_name_beside(path: &Path) -> PathBuf {
     (1..9).map(name).find(|candidate| !candidate.exists()).unwrap_or_else(|| name(9))
 }
 
+impl Preparation {
+    /// Whether the version is on its way. For one that has run before: it is prepared anew.
+    pub fn is_under_way(&self) -> bool {
+        matches!(self.phase, Phase::Fetching | Phase::Building)
+    }
+}
+
 impl TaskRecord {
     /// The record of an order that has just come in.
     pub fn new(order: DesiredTask, now_ms: u64) -> Self {
@@ -408,6 +415,9 @@ impl TaskRecord {
         }
         match active {
             Some(active) if active.process.as_ref().is_some_and(|process| process.ready) => (Phase::Running, None),
+            Some(active) if active.process.is_none() && self.preparation.is_under_way() => {
+                (self.preparation.phase, self.preparation.failure.as_ref())
+            }
             Some(_) => (Phase::Starting, None),
             None => (self.preparation.phase, self.preparation.failure.as_ref()),
         }

@@ -1,5 +1,6 @@
 //! The robot's half: everything `task-agent` does. Imports run downward only; see ARCHITECTURE.md.
 
+pub mod accounts;
 pub mod admission;
 pub mod answers;
 pub mod battery;
@@ -47,6 +48,7 @@ mod registry_words;
 pub mod rotation;
 pub mod run_dir;
 pub mod script;
+pub mod seal;
 pub mod server;
 pub mod settings;
 pub mod shim;
@@ -58,3 +60,4 @@ pub mod underlay;
 pub mod vitals;
 pub mod vouching;
 pub mod watcher;
+pub mod work_dir;

@@ -170,7 +170,8 @@ impl Step {
     pub fn deadline(&self) -> Option<Duration> {
         let seconds = match self {
             Self::PullContent { .. } | Self::Build(_) | Self::Collect(_) => return None,
-            Self::CheckSigners(_) | Self::PullManifest(_) | Self::LookForRos(_) | Self::Start(_) => STEP_DEADLINE_S,
+            Self::CheckSigners(_) | Self::PullManifest(_) | Self::LookForRos(_) => STEP_DEADLINE_S,
+            Self::Start(_) => STEP_DEADLINE_S + VERIFY_DEADLINE_S,
             // Its own, shorter limit is a setting.
             Self::Ask(_) => STEP_DEADLINE_S + crate::config::MAX_GATE_TIMEOUT_S,
             Self::Stop(run) => STEP_DEADLINE_S + 2 * u64::from(run.rules.stop_timeout_s),
@@ -209,6 +210,8 @@ impl Step {
 
 /// How long a step may take whose parts all have shorter limits of their own.
 const STEP_DEADLINE_S: u64 = 120;
+/// How long it may take to read all of a version: the largest there may be, on a slow card.
+const VERIFY_DEADLINE_S: u64 = 900;
 /// How long deleting may take: many small files on a slow card.
 const DELETE_DEADLINE_S: u64 = 600;
 /// A run that went on this long without ending is calm: its restarts are forgiven.
@@ -253,7 +256,7 @@ pub fn prepare(s: &Situation<'_>) -> Next {
     if s.desired != Some(order)
         || order.wanted == Wanted::Stopped
         || s.record.end_of_order().is_some()
-        || s.record.active.as_ref().is_some_and(|active| active.is_for(order))
+        || s.record.active.as_ref().is_some_and(|active| active.is_for(order) && !is_lost(s, active))
         || preparation.phase.is_final()
         || !s.may_begin
         || s.deleting
@@ -355,7 +358,20 @@ fn without_process(s: &Situation<'_>, active: Option<&ActiveRun>) -> Next {
     if s.now_ms < active.retry_at_ms {
         return Next::Rest { until_ms: Some(active.retry_at_ms) };
     }
+    if is_lost(s, active) {
+        return match s.record.preparation.phase.is_final() {
+            true => record(transition::not_restored(s)),
+            false => Next::Rest { until_ms: None },
+        };
+    }
     start(s, active)
+}
+
+/// Whether what `active` is to run is not on the disk any more: it was deleted because it had been changed, and is
+/// prepared anew.
+fn is_lost(s: &Situation<'_>, active: &ActiveRun) -> bool {
+    let is_whole = s.prepared.content && s.prepared.built;
+    active.is_for(&s.record.order) && active.process.is_none() && active.end.is_none() && !is_whole
 }
 
 /// Starts a process of `run`, unless it would write over files that are still to be brought back.

@@ -1,5 +1,5 @@
-//! The account that builds and tasks run as where the agent is root: found by name or number, and given what it needs of
-//! the agent's directories, which is its tasks' own files and the way to them. It reads `/etc/passwd` and `/etc/group`
+//! The account that tasks take their groups from where the agent is root, found by name or number, and what accounts are
+//! given of the agent's directories: their own files, the way to them, and to read what they run. It reads `/etc/passwd` and `/etc/group`
 //! itself, because a static program can't load the system's name services. It never creates an account.
 
 use std::fs;
@@ -16,8 +16,8 @@ use serde::{Deserialize, Serialize};
 
 /// The account that is used when the settings name none.
 pub const DEFAULT_NAME: &str = "taskd-task";
-/// How deep a tree may be that is handed over.
-const MAX_DEPTH: usize = 256;
+/// How deep a tree may be that changes hands.
+pub const MAX_DEPTH: usize = 256;
 /// The call that sets the groups of one thread, with ids of 32 bits.
 #[cfg(target_pointer_width = "64")]
 const SETGROUPS: libc::c_long = libc::SYS_setgroups;
@@ -124,6 +124,20 @@ impl TaskUser {
         }
     }
 
+    /// An account for one task, which has this one's groups, its own included: what they open of the hardware.
+    pub fn with_id(&self, id: u32) -> Self {
+        let groups = std::iter::once(self.gid).chain(self.groups.iter().copied()).collect();
+        Self { name: id.to_string(), uid: id, gid: id, groups }
+    }
+
+    /// Lets the account, and of all that are not root it alone, into a directory that stays root's.
+    pub fn admit(&self, dir: &Path) -> io::Result<()> {
+        let flags = OFlag::O_RDONLY | OFlag::O_DIRECTORY | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
+        let opened = nix::fcntl::open(dir, flags, Mode::empty())?;
+        fchown(&opened, Some(nix::unistd::geteuid()), Some(self.group()))?;
+        Ok(nix::sys::stat::fchmod(&opened, Mode::S_IRWXU | Mode::S_IRGRP | Mode::S_IXGRP)?)
+    }
+
     /// Lets the account pass through `dirs`, without seeing what is in them.
     pub fn let_through(&self, dirs: &[PathBuf]) -> io::Result<()> {
         for dir in dirs {
@@ -155,7 +169,11 @@ impl TaskUser {
         if fstat(&opened)?.st_uid == self.uid {
             return Ok(());
         }
-        self.hand_over_below(&opened, 0)?;
+        each_below(&opened, 0, &mut |entry, stat| {
+            // A file with a second name may be anybody's; packages have none.
+            let is_sure = !is_kind(stat, SFlag::S_IFREG) || stat.st_nlink == 1;
+            if is_sure { self.own_entry(entry) } else { Ok(()) }
+        })?;
         nix::sys::stat::fchmod(&opened, Mode::S_IRWXU)?;
         Ok(fchown(&opened, Some(self.user()), Some(self.group()))?)
     }
@@ -186,28 +204,8 @@ impl TaskUser {
         give_up_capabilities()
     }
 
-    fn hand_over_below(&self, dir: &OwnedFd, depth: usize) -> io::Result<()> {
-        if depth > MAX_DEPTH {
-            return Err(io::Error::other(format!("a directory lies more than {MAX_DEPTH} levels deep")));
-        }
-        for entry in fs::read_dir(format!("/proc/self/fd/{}", dir.as_raw_fd()))? {
-            let name = entry?.file_name();
-            let flags = OFlag::O_RDONLY | OFlag::O_DIRECTORY | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
-            // What is looked at is what is handed over, whatever takes its name in between.
-            let entry =
-                openat(dir, name.as_os_str(), OFlag::O_PATH | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC, Mode::empty())?;
-            let stat = fstat(&entry)?;
-            if is_kind(&stat, SFlag::S_IFDIR) {
-                let below = openat(dir, name.as_os_str(), flags, Mode::empty())?;
-                self.hand_over_below(&below, depth + 1)?;
-                fchown(&below, Some(self.user()), Some(self.group()))?;
-            } else if !is_kind(&stat, SFlag::S_IFREG) || stat.st_nlink == 1 {
-                // A file with a second name may be anybody's; packages have none.
-                let (user, group) = (Some(self.user()), Some(self.group()));
-                fchownat(&entry, "", user, group, AtFlags::AT_EMPTY_PATH)?;
-            }
-        }
-        Ok(())
+    fn own_entry(&self, entry: &OwnedFd) -> io::Result<()> {
+        Ok(fchownat(entry, "", Some(self.user()), Some(self.group()), AtFlags::AT_EMPTY_PATH)?)
     }
 
     fn user(&self) -> Uid {
@@ -222,6 +220,58 @@ impl TaskUser {
 /// Whether the calling thread may not pass through the directory.
 fn is_shut(dir: &Path) -> bool {
     fs::metadata(dir.join(".")).is_err_and(|error| error.kind() == io::ErrorKind::PermissionDenied)
+}
+
+/// Makes what the account `uid` owns in the tree at `dir` root's: for everybody to read, as the account could, and for nobody
+/// to change. What is somebody else's stays as it is, and no link is followed. No process of the account may be left.
+pub fn take_back(dir: &Path, uid: u32) -> io::Result<()> {
+    let flags = OFlag::O_RDONLY | OFlag::O_DIRECTORY | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
+    let opened = match nix::fcntl::open(dir, flags, Mode::empty()) {
+        Err(Errno::ENOENT) => return Ok(()),
+        opened => opened?,
+    };
+    let take = |entry: &OwnedFd, stat: &FileStat| {
+        if stat.st_uid != uid {
+            return Ok(());
+        }
+        if !is_kind(stat, SFlag::S_IFLNK) {
+            // Nobody else had rights to it that its owner had not; set-id bits go.
+            let own = stat.st_mode & 0o700;
+            let mode = own | (own & 0o500) >> 3 | (own & 0o500) >> 6;
+            fs::set_permissions(by_descriptor(entry), fs::Permissions::from_mode(mode))?;
+        }
+        let root = (Some(nix::unistd::geteuid()), Some(nix::unistd::getegid()));
+        Ok(fchownat(entry, "", root.0, root.1, AtFlags::AT_EMPTY_PATH)?)
+    };
+    each_below(&opened, 0, &mut |entry, stat| take(entry, stat))?;
+    take(&opened, &fstat(&opened)?)
+}
+
+/// Does `work` with each entry below `dir`, the directories after what is in them. What is looked at is what is worked on,
+/// whatever takes its name in between.
+fn each_below(
+    dir: &OwnedFd,
+    depth: usize,
+    work: &mut impl FnMut(&OwnedFd, &FileStat) -> io::Result<()>,
+) -> io::Result<()> {
+    if depth > MAX_DEPTH {
+        return Err(io::Error::other(format!("a directory lies more than {MAX_DEPTH} levels deep")));
+    }
+    for entry in fs::read_dir(by_descriptor(dir))? {
+        let name = entry?.file_name();
+        let flags = OFlag::O_PATH | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
+        let entry = openat(dir, name.as_os_str(), flags, Mode::empty())?;
+        let stat = fstat(&entry)?;
+        if is_kind(&stat, SFlag::S_IFDIR) {
+            each_below(&entry, depth + 1, work)?;
+        }
+        work(&entry, &stat)?;
+    }
+    Ok(())
+}
+
+fn by_descriptor(descriptor: &OwnedFd) -> PathBuf {
+    format!("/proc/self/fd/{}", descriptor.as_raw_fd()).into()
 }
 
 /// Does blocking `work` with the rights to files that `user` has, or with the agent's where tasks run as whoever it is.
@@ -290,10 +340,14 @@ mod tests {
         fs::set_permissions(&own, fs::Permissions::from_mode(0o600)).expect("for this user alone");
         let user = TaskUser { name: "4711".to_owned(), uid: 4711, gid: 4711, groups: Vec::new() };
         let kind = |path: &Path| fs::read(path).map(drop).map_err(|error| error.kind());
-        let read = user.with_its_rights(|| [&own, Path::new("/proc/1/environ"), Path::new("/etc/passwd")].map(kind));
+        let status = || fs::read_to_string("/proc/thread-self/status").expect("read");
+        let read = user.with_its_rights(|| ([&own, Path::new("/etc/passwd")].map(kind), status()));
         if nix::unistd::geteuid().is_root() {
-            let denied = Err(io::ErrorKind::PermissionDenied);
-            assert_eq!(read.expect("the rights"), [denied, denied, Ok(())]);
+            let (kinds, status) = read.expect("the rights");
+            assert_eq!(kinds, [Err(io::ErrorKind::PermissionDenied), Ok(())]);
+            for set in ["CapInh", "CapPrm", "CapEff"] {
+                assert!(status.contains(&format!("{set}:\t0000000000000000\n")), "{status}");
+            }
         } else {
             assert!(read.is_err(), "only root may have another's rights");
         }

@@ -106,6 +106,9 @@ pub struct HostFacts {
     /// What keeps tasks from using more than their limits.
     #[serde(default)]
     pub isolation: Isolation,
+    /// Under which accounts tasks run; absent: an agent that does not say.
+    #[serde(default, skip_serializing_if = "Option::is_none", deserialize_with = "tolerant")]
+    pub accounts: Option<TaskAccounts>,
     /// What is left of its battery; absent where it has none that can be read.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub battery_percent: Option<u8>,
@@ -146,6 +149,19 @@ pub enum Isolation {
     #[default]
     #[serde(other)]
     None,
+}
+
+/// Under which accounts tasks run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(rename_all = "snake_case")]
+pub enum TaskAccounts {
+    /// Each task under its own; what was unpacked and built is read-only to it and verified before each start.
+    PerTask,
+    /// All under one, which may not change what was unpacked and built either.
+    Shared,
+    /// All under the agent's: nothing keeps a task from other tasks' files and processes, or from changing its own package.
+    Agent,
 }
 
 /// A condition of the whole robot, with a stable code and a text for people.
@@ -463,6 +479,8 @@ failure_codes! {
     OUT_OF_MEMORY = "out_of_memory";
     /// The robot has no user to run tasks as.
     NO_TASK_USER = "no_task_user";
+    /// What is on the robot's disk of a package is not what was unpacked and built: it was not started.
+    TREE_CHANGED = "tree_changed";
     /// The robot's gate said not now.
     GATE_REFUSED = "gate_refused";
     /// The robot's gate hung, crashed or could not be run.

@@ -417,8 +417,23 @@ fn tasks(checkup: &mut Checkup, data: &Path, config: &Config) {
     let found = TaskUser::find(config.task_user.as_deref());
     let user = found.and_then(|user| user.map(|user| user.admitted_to(data)).transpose());
     match &user {
-        Ok(Some(user)) => checkup.good("task user", format!("tasks run as {}", user.name)),
-        Ok(None) => checkup.good("task user", "tasks run as whoever the agent is"),
+        Ok(Some(user)) => checkup.good(
+            "task user",
+            match &config.task_uids {
+                Some(range) => {
+                    let (first, last) = (range.start(), range.end());
+                    format!(
+                        "each task has an account of its own, from {first} to {last}, with the groups of {}",
+                        user.name
+                    )
+                }
+                None => format!("all tasks run as {}", user.name),
+            },
+        ),
+        Ok(None) => checkup.good(
+            "task user",
+            "tasks run as whoever the agent is: nothing keeps them from each other's files and processes",
+        ),
         Err(error @ TaskUserError::ShutOut { dir, .. }) => {
             let mend = format!("chmod o+x {}, or move the data directory", dir.display());
             checkup.bad("task user", error.to_string(), mend);

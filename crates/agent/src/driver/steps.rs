@@ -156,7 +156,8 @@ impl<E: Effects> Driver<E> {
         {
             // Should deleting have failed, it is not tried again before the next look at the disk.
             prepared.versions.retain(|version| kept.contains(version));
-        } else if step.lane() == Lane::Prepare {
+        } else if step.lane() == Lane::Prepare || matches!(step, Step::Start(_)) {
+            // A start deletes what was changed on the disk.
             self.views.entry(task.clone()).or_default().prepared = None;
         }
         if matches!(step, Step::Start(_) | Step::Stop(_)) {

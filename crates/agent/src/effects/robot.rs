@@ -10,7 +10,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use task_proto::desired::{BlobRef, DesiredState, PackageRef};
 use task_proto::manifest::{BuildTool, TaskManifest};
-use task_proto::report::{Failure, FailureCode, HostFacts, Isolation, Progress};
+use task_proto::report::{Failure, FailureCode, HostFacts, Isolation, Progress, TaskAccounts};
 use task_proto::settings::RobotSettings;
 use task_proto::{Digest, MacAddress, RobotId, TaskName};
 use tokio::sync::watch;
@@ -19,7 +19,9 @@ use tokio_util::sync::CancellationToken;
 use self::held::Held;
 pub(crate) use self::outcomes::chain;
 use self::outcomes::{build_failure, fetch_failure, later, millis, outputs_code, pulled};
+use self::trees::Purpose;
 use super::{Effects, Now};
+use crate::accounts::Accounts;
 use crate::builder::{self, BuildLimits, BuildOrder};
 use crate::cgroup::{Cgroups, RunLimits};
 use crate::config::{Config, ForwardSettings};
@@ -51,6 +53,7 @@ mod outcomes;
 mod ros;
 mod runs;
 mod signers;
+mod trees;
 
 /// Written into a version's directory once it is built.
 const BUILT_MARKER: &str = "built";
@@ -83,6 +86,7 @@ pub struct Robot {
     task_user: Result<Option<TaskUser>, TaskUserError>,
     /// Whether tasks and builds are denied system calls.
     filter_calls: bool,
+    accounts: Accounts,
     mac: MacAddress,
 }
 
@@ -113,6 +117,7 @@ impl Robot {
         if let Err(error) = &task_user {
             tracing::warn!(%error, "nothing can be run");
         }
+        let accounts_data = data.clone();
         let gate = config.gate.clone().map(|gate| Gate::new(gate, robot.clone(), data.root()));
         Self {
             data,
@@ -128,6 +133,7 @@ impl Robot {
             cgroups,
             filter_calls: call_filter::is_wanted(config.seccomp, matches!(&task_user, Ok(Some(_)))),
             task_user,
+            accounts: Accounts::new(accounts_data, config.task_uids.clone()),
             ros: RwLock::new(held.installations()),
             own: config.clone(),
             forward: watch::Sender::new(config.forward),
@@ -160,18 +166,21 @@ impl Robot {
         fetch::stored_manifest(&self.data, package).map_or_else(Promise::default, |manifest| Promise::of(&manifest))
     }
 
-    /// Whom the task and its builds run as, once the way to its directories is open, and the environment they have.
-    fn account(&self, task: &TaskName) -> Result<(Option<TaskUser>, BTreeMap<String, String>), StepFailure> {
-        let user = self.task_user.clone().map_err(|error| later(FailureCode::NO_TASK_USER, &error, 0))?;
+    /// What processes have that run as `user` with the home directory `home`, once the way to the task's directories is open.
+    fn environment_of(
+        &self,
+        task: &TaskName,
+        user: Option<&TaskUser>,
+        home: &Path,
+    ) -> Result<BTreeMap<String, String>, StepFailure> {
         let mut environment = self.held().environment.clone();
-        if let Some(user) = &user {
-            let home = self.data.task(task).home();
-            let opened = user.make_home(&home).and_then(|()| user.let_through(&self.data.way_to(task)));
+        if let Some(user) = user {
+            let opened = user.make_home(home).and_then(|()| user.let_through(&self.data.way_to(task)));
             opened.map_err(|error| later(FailureCode::IO_ERROR, &error, 0))?;
             environment.insert("HOME".to_owned(), home.display().to_string());
             environment.extend(["USER", "LOGNAME"].map(|name| (name.to_owned(), user.name.clone())));
         }
-        Ok((user, environment))
+        Ok(environment)
     }
 
     /// What the task may use: what its package says, else what this robot's settings say.
@@ -226,6 +235,11 @@ impl Effects for Robot {
             ros: environment::ros_facts(&installations, &held.environment),
             battery_percent: battery::percent(Path::new(battery::SUPPLIES)),
             isolation: if isolates { Isolation::Cgroup } else { Isolation::None },
+            accounts: self.task_user.as_ref().ok().map(|user| match user {
+                Some(_) if self.accounts.are_per_task() => TaskAccounts::PerTask,
+                Some(_) => TaskAccounts::Shared,
+                None => TaskAccounts::Agent,
+            }),
             publishers: self.vouching.as_ref().map(|vouching| vouching.version()),
             settings: held.effective.clone(),
         }
@@ -351,7 +365,8 @@ impl Effects for Robot {
             Ok(manifest) => manifest,
             Err(error) => return pulled(Err(error)),
         };
-        pulled(self.fetcher.content(package, &manifest, progress, cancel).await)
+        let done = pulled(self.fetcher.content(package, &manifest, progress, cancel).await)?;
+        self.seal_pulled(package, &manifest, done).await
     }
 
     async fn gather_content(
@@ -367,16 +382,20 @@ impl Effects for Robot {
             Err(error) => return pulled(Err(error)),
         };
         let told = (progress, asks);
-        pulled(self.fetcher.pushed_content(package, &manifest, &self.listening, told, cancel).await)
+        let done = pulled(self.fetcher.pushed_content(package, &manifest, &self.listening, told, cancel).await)?;
+        self.seal_pulled(package, &manifest, done).await
     }
 
     async fn build(&self, package: &PackageRef, cancel: &CancellationToken) -> Result<(), StepFailure> {
         self.still_vouched(package)?;
         let manifest = self.manifest(package).await?;
-        let version = self.version(package);
-        let (user, environment) = self.account(&package.name)?;
+        let (version, tool) = (self.version(package), manifest.build.tool);
+        self.verify(package, tool, Purpose::Build).await?;
+        let user = self.accounts_of(&package.name)?.map(|pair| pair.build);
+        let home = self.data.task(&package.name).build_home();
+        let environment = self.environment_of(&package.name, user.as_ref(), &home)?;
         let order = BuildOrder {
-            tool: manifest.build.tool,
+            tool,
             underlays: self.setup_files(&manifest)?,
             environment,
             log: self.data.task(&package.name).build_log(),
@@ -386,6 +405,7 @@ impl Effects for Robot {
             cgroups: self.cgroups.clone(),
         };
         builder::build(&order, cancel).await.map_err(|error| build_failure(error, self.data.root()))?;
+        self.seal(package, tool).await?;
         let marker = version.root().join(BUILT_MARKER);
         durable::write(&marker, b"", 0o600).map_err(|source| {
             let error = FetchError::disk(&marker, source);
@@ -408,19 +428,24 @@ impl Effects for Robot {
         let purpose = if run.has_started() { Use::GoOn } else { Use::Begin };
         self.vouched(&run.package, purpose, &CancellationToken::new()).await?;
         let manifest = self.manifest(&run.package).await?;
-        let version = self.version(&run.package);
+        let (version, tool) = (self.version(&run.package), manifest.build.tool);
         let text = script::run_script(&manifest, &version, &self.setup_files_of(run, &manifest)?);
-        let (user, mut environment) = self.account(task)?;
-        environment.extend(ros::node_logs(&version).await);
-        durable::write(&version.run_script(), text.as_bytes(), 0o755).map_err(|error| failed(&error))?;
-        user.as_ref().map_or(Ok(()), |user| user.hand_over(version.root())).map_err(|error| failed(&error))?;
         let task_dir = self.data.task(task);
+        let run_dir = self.run_dir(task, process);
+        // What still ran of it could change what is looked at below.
+        self.end_other_runs(&task_dir.run(), Some(&run_dir)).await.map_err(|error| failed(&error))?;
+        self.verify(&run.package, tool, Purpose::Start).await?;
+        let user = self.accounts_of(task)?.map(|pair| pair.run);
+        let mut environment = self.environment_of(task, user.as_ref(), &task_dir.home())?;
+        self.make_work_dir(&run.package, tool, user.clone()).await?;
+        environment.extend(ros::node_logs(&version, user.as_ref()).await);
+        durable::write(&version.run_script(), text.as_bytes(), 0o755).map_err(|error| failed(&error))?;
         task_dir.set_current(&run.package.manifest.digest).map_err(|error| failed(&error))?;
         durable::create_dir_all(&task_dir.logs()).map_err(|error| failed(&error))?;
         let spec = RunSpec {
             assignment: run.deployment.clone(),
             script: version.run_script(),
-            directory: script::run_directory(manifest.build.tool, &version),
+            directory: version.work(),
             environment,
             interrupt: launch::of(&manifest).interrupt,
             log: self.log(task),
@@ -429,11 +454,9 @@ impl Effects for Robot {
             has_outputs: run.rules.has_outputs,
             cgroup: None,
         };
-        let run_dir = self.run_dir(task, process);
         let record = serde_json::to_vec(run).map_err(|error| failed(&error))?;
         durable::create_dir_all(&run_dir).map_err(|error| failed(&error))?;
         durable::write(&run_dir.join(RUN_RECORD), &record, 0o600).map_err(|error| failed(&error))?;
-        self.end_other_runs(&task_dir.run(), Some(&run_dir)).await.map_err(|error| failed(&error))?;
         let (facts, promise) = (self.ros_facts_in(&spec.environment), Promise::of(&manifest));
         if let Some(what) = environment::unheard_of(&spec.environment).filter(|_| !promise.is_empty()) {
             let text = format!("nodes here meet by {what}, which the agent does not speak: [ready] can't be watched");
@@ -478,15 +501,15 @@ impl Effects for Robot {
         cancel: &CancellationToken,
     ) -> Result<(), StepFailure> {
         let manifest = self.manifest(&files.package).await?;
-        let version = self.version(&files.package);
+        let (directory, user) = self.written_in(&files.package, manifest.build.tool)?;
         let order = OutputOrder {
             robot_id: self.robot.clone(),
             task: task.clone(),
             version: files.package.version.clone(),
             deployment: files.deployment.clone(),
             run: files.run,
-            directory: script::run_directory(manifest.build.tool, &version),
-            user: self.task_user.clone().map_err(|error| later(FailureCode::NO_TASK_USER, &error, 0))?,
+            directory,
+            user,
             notes: self.data.task(task).uploads(),
             patterns: manifest.outputs.paths,
             max_bytes: self.held().output_bytes,
@@ -516,10 +539,11 @@ impl Effects for Robot {
     }
 
     async fn remove(&self, task: &TaskName) -> Result<(), StepFailure> {
-        let task = self.data.task(task);
-        let ended = self.end_other_runs(&task.run(), None).await;
+        let dir = self.data.task(task);
+        let ended = self.end_other_runs(&dir.run(), None).await;
         ended.map_err(|error| later(FailureCode::IO_ERROR, &error, 0))?;
-        on_disk(move || task.remove()).await
+        on_disk(move || dir.remove()).await?;
+        self.accounts.release(task).map_err(|error| later(FailureCode::IO_ERROR, &error, 0))
     }
 }
 

@@ -140,6 +140,25 @@ fn a_start_that_seemed_to_fail_is_stopped_before_anything_is_made_of_it() {
 }
 
 #[test]
+fn run_whose_tree_was_changed_is_fetched_and_built_anew_before_it_starts() {
+    let mut world = running(Run::default());
+    world.happen(Happening::ProcessEnds { code: 1 });
+    world.happen(Happening::Wait { ms: 90_000 });
+    assert!(matches!(world.steps[..], [(Step::Start(_), false)]), "{:?}", world.steps);
+    world.happen(Happening::FindsChange);
+    let standing = |world: &World| {
+        let record = world.record.clone().expect("a record");
+        (record.standing().0, record.standing().1.map(|failure| failure.code.clone()))
+    };
+    assert!(matches!(world.steps[..], [(Step::PullContent { .. }, false)]), "{:?}", world.steps);
+    assert_eq!(standing(&world), (Phase::Fetching, Some(task_proto::report::FailureCode::TREE_CHANGED)));
+    world.happen(Happening::Wait { ms: 90_000 });
+    assert!(world.alive.is_empty(), "it is not started before it is there");
+    world.settle();
+    assert_eq!((standing(&world), world.alive.len()), ((Phase::Running, None), 1));
+}
+
+#[test]
 fn a_wait_beyond_all_numbers_is_the_longest_there_is() {
     let mut world = World::new(Run::default());
     world.happen(Happening::Order { deployment: 0, run: 1, stop: false });

@@ -102,6 +102,9 @@ pub fn begun(record: &TaskRecord, step: &Step, boot_id: &str, start: u64, now_ms
             ready: false,
             condemned: None,
         });
+        if run.is_for(&record.order) && record.preparation.is_under_way() {
+            (record.preparation.phase, record.preparation.failure) = (Phase::Staged, None);
+        }
         record.active = Some(run);
     }
     if *step == Step::Remove {
@@ -143,6 +146,13 @@ pub fn finished(s: &Situation<'_>, step: &Step, outcome: Result<Done, StepFailur
             }
         }
         (Step::Start(_), Err(StepFailure { failure, retry_after_ms })) => {
+            if failure.code == FailureCode::TREE_CHANGED
+                && record.active.as_ref().is_some_and(|active| active.is_for(&record.order))
+            {
+                let kind = record.preparation.kind;
+                let (phase, failure) = (Phase::Fetching, Some(failure.clone()));
+                record.preparation = Preparation { phase, failure, kind, ..Preparation::default() };
+            }
             // It may have come about after all: what is made of the failure waits until no process is there.
             if let Some(process) = record.active.as_mut().and_then(|active| active.process.as_mut()) {
                 process.condemned = Some(Condemned { failure, again: retry_after_ms.is_some() });
@@ -285,6 +295,16 @@ pub(super) fn calm(record: &TaskRecord) -> TaskRecord {
     if let Some(active) = &mut record.active {
         active.restarts_in_a_row = 0;
     }
+    record
+}
+
+/// The record once it is known that what the active run is to run can't be had anew.
+pub(super) fn not_restored(s: &Situation<'_>) -> TaskRecord {
+    let mut record = s.record.clone();
+    let failure = record.preparation.failure.clone();
+    let unknown = || Failure::new(FailureCode::TREE_CHANGED, "what it is to run is not on the disk any more");
+    give_up(&mut record, s, failure.unwrap_or_else(unknown));
+    record.settle_phase(s.now_ms);
     record
 }
 

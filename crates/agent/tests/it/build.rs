@@ -14,7 +14,7 @@ use task_agent::process::ExitStatus;
 use task_agent::run_dir::{LogSpec, RunSpec};
 use task_agent::supervisor::Observed;
 use task_agent::underlay::{self, Places};
-use task_agent::{environment, process, script};
+use task_agent::{environment, process, script, work_dir};
 use task_proto::Digest;
 use task_proto::manifest::{BuildTool, TaskManifest};
 use task_proto::report::FailureCode;
@@ -146,11 +146,12 @@ async fn a_real_ros_package_is_built_and_runs_under_its_shim() {
     let version = &build.order.version;
     std::fs::write(version.run_script(), script::run_script(&manifest, version, &build.order.underlays))
         .expect("script");
+    work_dir::refresh(BuildTool::Colcon, version, None).expect("made");
     let run_dir = build.dir.path().join("run");
     let spec = RunSpec {
         assignment: task_proto::DeploymentId::random(),
         script: version.run_script(),
-        directory: script::run_directory(BuildTool::Colcon, version),
+        directory: version.work(),
         environment: build.order.environment.clone(),
         interrupt: Interrupt::Group,
         log: LogSpec::at(build.dir.path().join("task.log")),
@@ -309,10 +310,13 @@ async fn nothing_gets_away_from_a_build_in_a_control_group() {
 }
 
 #[tokio::test]
-async fn a_build_of_the_task_user_owns_what_it_makes_and_has_no_powers() {
+async fn a_build_changes_nothing_but_what_it_builds_and_has_no_powers() {
     let Some(user) = other_user() else { return };
-    let mut build =
-        TestBuild::with_colcon("mkdir -p install/talker; id -u; grep -E 'NoNewPrivs|CapBnd' /proc/self/status");
+    let mut build = TestBuild::with_colcon(
+        "mkdir -m 700 install/talker; touch install/talker/mine build/mine log/mine; chmod 4755 install/talker/mine
+         id -u; grep -E 'NoNewPrivs|CapBnd' /proc/self/status
+         for place in src/new new build.sh; do if touch $place; then echo GOT $place; fi; done",
+    );
     user.let_through(&[
         build.dir.path().to_owned(),
         build.dir.path().join("tasks"),
@@ -323,8 +327,14 @@ async fn a_build_of_the_task_user_owns_what_it_makes_and_has_no_powers() {
     build.run().await.unwrap_or_else(|error| panic!("{error}: {}", build.log()));
     let log = build.log().replace('\t', "");
     assert!(log.contains(&format!("{}\nCapBnd:0000000000000000\nNoNewPrivs:1\n", user.uid)), "{log}");
-    let owner = |name: &str| std::fs::metadata(build.order.version.root().join(name)).expect("there").uid();
-    assert_eq!((owner("src"), owner("install/talker")), (user.uid, user.uid));
+    assert!(!log.contains("GOT"), "{log}");
+    // All of it is root's now, for everybody to read who gets there, and nobody to change.
+    let about = |name: &str| {
+        let about = std::fs::metadata(build.order.version.root().join(name)).expect("there");
+        (about.uid(), about.mode() & 0o7777)
+    };
+    assert_eq!((about("install/talker"), about("install/talker/mine")), ((0, 0o755), (0, 0o755)));
+    assert_eq!((about("build/mine").0, about("log/mine").0, about("src").0), (0, 0, 0));
 }
 
 #[tokio::test]

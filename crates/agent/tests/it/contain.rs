@@ -11,7 +11,7 @@ use task_agent::containment::RUN_DIR_VARIABLE;
 use task_agent::process::{ExitStatus, ProcessEntry};
 use task_agent::run_dir::RunDir;
 use task_agent::supervisor::Observed;
-use task_agent::task_user::TaskUser;
+use task_agent::task_user::{TaskUser, take_back};
 
 use crate::harness::{TestRun, eventually, lives, other_user, supervisor, within};
 
@@ -328,6 +328,29 @@ fn handing_over_follows_no_link_and_leaves_what_was_handed_over_alone() {
     // A link in the place of the tree is refused, not followed.
     std::os::unix::fs::symlink(temp.path(), temp.path().join("tree-link")).expect("link");
     user.hand_over(&temp.path().join("tree-link")).expect_err("refused");
+}
+
+#[test]
+fn taking_back_leaves_to_others_what_is_theirs_and_follows_no_link() {
+    let Some(user) = other_user() else { return };
+    let temp = tempfile::tempdir().expect("temp dir");
+    let (tree, outside) = (temp.path().join("tree"), temp.path().join("outside"));
+    std::fs::create_dir_all(tree.join("deep")).expect("tree");
+    std::fs::write(tree.join("deep/file"), "").expect("file");
+    std::fs::set_permissions(tree.join("deep/file"), std::fs::Permissions::from_mode(0o2700)).expect("set");
+    user.hand_over(&tree).expect("handed over");
+    std::fs::write(&outside, "secret").expect("outside");
+    std::fs::set_permissions(&outside, std::fs::Permissions::from_mode(0o600)).expect("closed");
+    std::os::unix::fs::symlink(&outside, tree.join("link")).expect("link");
+    std::fs::hard_link(&outside, tree.join("second-name")).expect("hard link");
+    take_back(&tree, user.uid).expect("taken back");
+    let about = |path: &str| {
+        let about = std::fs::symlink_metadata(tree.join(path)).expect("there");
+        (about.uid(), about.mode() & 0o7777)
+    };
+    assert_eq!([about(""), about("deep"), about("deep/file")], [(0, 0o755); 3]);
+    assert_eq!(std::fs::metadata(&outside).expect("there").mode() & 0o7777, 0o600);
+    take_back(&temp.path().join("nothing"), user.uid).expect("nothing to do");
 }
 
 #[test]

@@ -1,9 +1,12 @@
 //! Whom tasks run as and what they may use, from the package to what the operator reads.
 
-use task_proto::api::RobotView;
-use task_proto::report::{Failure, Isolation, Phase};
+use std::os::unix::fs::MetadataExt as _;
+use std::path::Path;
 
-use crate::harness::{Fleet, Robot, Server, TASK_USER, eventually, open_directory, write_package};
+use task_proto::api::RobotView;
+use task_proto::report::{Failure, Isolation, Phase, TaskAccounts};
+
+use crate::harness::{Fleet, Robot, Server, eventually, open_directory, write_package};
 use crate::leftovers::processes_with;
 
 async fn failure_of(server: &Server, task: &str, phase: Phase) -> Failure {
@@ -33,11 +36,153 @@ async fn a_task_runs_as_the_task_user_in_a_home_of_its_own() {
     let read = |name: &str| std::fs::read_to_string(found.join(name)).expect(name).trim().to_owned();
     assert_eq!(read("home"), own_home(&fleet.robots[0]));
     if nix::unistd::geteuid().is_root() {
-        assert_eq!((read("user").as_str(), read("identity").as_str()), (TASK_USER, ""));
+        let user: u32 = read("user").parse().expect("a number");
+        assert!((70_000..80_000).contains(&user), "{user}");
+        assert_eq!(read("identity"), "");
         assert_eq!(read("calls"), "Seccomp:\t2", "its system calls are filtered");
     } else {
         eprintln!("unavailable: only root can run a task as another user");
     }
+}
+
+/// What a package would try on its neighbour, and on itself. Each line that it writes is something that it got.
+const BURGLAR: &str = r#"
+got() { if "$@" >/dev/null 2>&1; then echo "GOT $*" >> "$FOUND"; fi; }
+touch mine && echo "own directory: writable" >> "$FOUND"
+for name in src/main.sh run.sh task.json work/main.sh work/new work/written new; do
+  got dd if=/dev/zero "of=$VICTIM/$name" count=1
+done
+got rm "$VICTIM/src/main.sh"
+got mv "$VICTIM/src" "$VICTIM/moved"
+got ls "$VICTIM"
+got cat "$VICTIM/src/main.sh"
+got cat "$VICTIM_HOME/secret"
+got touch "$VICTIM_HOME/new" "$TASKS/new" "$TASKS/victim/new"
+for name in ../src/main.sh ../run.sh ../task.json ../new main.sh; do got dd if=/dev/zero "of=$name" count=1; done
+count=0
+while [ $count -lt 200 ]; do
+  got kill -9 $VICTIM_PID
+  count=$((count + 1))
+done
+got cat /proc/$VICTIM_PID/environ
+got cat /proc/$VICTIM_PID/maps
+got perl -e "exit(syscall(101, 16, $VICTIM_PID, 0, 0) != 0)"
+echo done >> "$FOUND"
+"#;
+
+fn pid_of(robot: &RobotView, task: &str) -> Option<u32> {
+    Some(robot.tasks.iter().find(|t| t.task.as_str() == task)?.active.as_ref()?.pid)
+}
+
+/// The directory of a task's only version.
+fn version_of(robot: &Robot, task: &str) -> std::path::PathBuf {
+    std::fs::read_link(robot.data().join("tasks").join(task).join("current"))
+        .map(|hex| robot.data().join("tasks").join(task).join(hex))
+        .expect("a version")
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn task_can_neither_change_nor_kill_nor_read_its_neighbour_nor_change_its_own_package() {
+    if !nix::unistd::geteuid().is_root() {
+        return eprintln!("unavailable: only root can run tasks under accounts of their own");
+    }
+    let fleet = Fleet::start(1).await;
+    let robot_1 = &fleet.robots[0];
+    let found = fleet.dir.path().join("found");
+    open_directory(&found);
+    let victim = "umask 0; echo secret > \"$HOME/secret\"; echo mine > written; exec sleep 1000\n";
+    fleet.server.push(&fleet.package("victim", "1.0.0", "service", victim), "*").await;
+    let before = fleet.server.wait_phase("robot-1", "victim", Phase::Running).await;
+    let home = robot_1.data().join("tasks/victim/home");
+    eventually("the victim's secret", async || home.join("secret").exists().then_some(())).await;
+    let pid = pid_of(&before, "victim").expect("a pid");
+    let settings = format!(
+        "FOUND={}/found VICTIM={} VICTIM_HOME={} VICTIM_PID={pid} TASKS={}\n",
+        found.display(),
+        version_of(robot_1, "victim").display(),
+        home.display(),
+        robot_1.data().join("tasks").display(),
+    );
+    fleet.server.push(&fleet.package("burglar", "1.0.0", "job", &(settings + BURGLAR)), "*").await;
+    fleet.server.wait_phase("robot-1", "burglar", Phase::Succeeded).await;
+    let found = std::fs::read_to_string(found.join("found")).expect("what it got");
+    assert_eq!(found, "own directory: writable\ndone\n");
+    assert_eq!(pid_of(&robot(&fleet.server).await, "victim"), Some(pid), "it was not killed");
+    let accounts = eventually("the robot's facts", async || robot(&fleet.server).await.host).await.accounts;
+    assert_eq!(accounts, Some(TaskAccounts::PerTask));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn package_that_was_changed_on_the_disk_is_not_started_and_comes_anew() {
+    if !nix::unistd::geteuid().is_root() {
+        return eprintln!("unavailable: only root can keep what tasks run from them");
+    }
+    let fleet = Fleet::start(1).await;
+    let found = fleet.dir.path().join("found");
+    open_directory(&found);
+    let script = format!("echo good >> {}/started; exec sleep 1000\n", found.display());
+    fleet.server.push(&fleet.package("steady", "1.0.0", "service", &script), "*").await;
+    let before = fleet.server.wait_phase("robot-1", "steady", Phase::Running).await;
+    let pid = pid_of(&before, "steady").expect("a pid");
+    let main = version_of(&fleet.robots[0], "steady").join("src/main.sh");
+    std::fs::write(&main, script.replace("good", "evil")).expect("changed");
+    nix::sys::signal::kill(nix::unistd::Pid::from_raw(pid.cast_signed()), nix::sys::signal::Signal::SIGKILL)
+        .expect("killed");
+    eventually("another process", async || {
+        let now = pid_of(&robot(&fleet.server).await, "steady")?;
+        (now != pid && std::fs::read_to_string(found.join("started")).ok()?.lines().count() == 2).then_some(())
+    })
+    .await;
+    assert_eq!(std::fs::read_to_string(found.join("started")).expect("written"), "good\ngood\n");
+    assert_eq!(std::fs::read_to_string(&main).expect("there"), script);
+    let log = std::fs::read_to_string(fleet.robots[0].data().with_extension("agent.log")).expect("a log");
+    assert!(log.contains("src is not what was unpacked"), "{log}");
+}
+
+/// Gives a tree to the account of all tasks, as agents did that let tasks own what they run.
+fn give_to_all_tasks(path: &Path) {
+    let about = std::fs::symlink_metadata(path).expect("there");
+    std::os::unix::fs::lchown(path, Some(65_534), Some(65_534)).expect("given");
+    if about.is_dir() {
+        std::fs::read_dir(path).expect("a list").for_each(|entry| give_to_all_tasks(&entry.expect("an entry").path()));
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn version_of_an_earlier_agent_is_taken_over_at_its_next_start_with_what_its_task_wrote() {
+    if !nix::unistd::geteuid().is_root() {
+        return eprintln!("unavailable: only root can give files to another user");
+    }
+    let mut fleet = Fleet::start(1).await;
+    fleet
+        .server
+        .push(&fleet.package("steady", "1.0.0", "service", "echo run >> written; exec sleep 1000\n"), "*")
+        .await;
+    let before = fleet.server.wait_phase("robot-1", "steady", Phase::Running).await;
+    let pid = pid_of(&before, "steady").expect("a pid");
+    fleet.robots[0].terminate();
+    nix::sys::signal::kill(nix::unistd::Pid::from_raw(pid.cast_signed()), nix::sys::signal::Signal::SIGKILL)
+        .expect("killed");
+    let version = version_of(&fleet.robots[0], "steady");
+    std::fs::remove_dir_all(version.join("work")).expect("removed");
+    std::fs::remove_file(version.with_extension("seal")).expect("removed");
+    give_to_all_tasks(&version);
+    let (handed_over, old) =
+        (std::fs::metadata(version.join("task.json")).expect("there"), version.join("src/written"));
+    let since = (handed_over.ctime(), handed_over.ctime_nsec());
+    // The clock of files does not tick at each write.
+    while std::fs::metadata(&old).map_or(true, |about| (about.mtime(), about.mtime_nsec()) <= since) {
+        std::fs::write(&old, "old\n").expect("written");
+    }
+    give_to_all_tasks(&old);
+    fleet.robots[0].restart();
+    eventually("another process", async || {
+        (std::fs::read_to_string(version.join("work/written")).ok()? == "old\nrun\n").then_some(())
+    })
+    .await;
+    let owner = |name: &str| std::fs::metadata(version.join(name)).expect("there").uid();
+    assert_eq!((owner(""), owner("src"), owner("src/main.sh")), (0, 0, 0));
+    assert!((70_000..80_000).contains(&owner("work/written")) && version.with_extension("seal").exists());
 }
 
 fn own_home(robot: &Robot) -> String {
@@ -91,7 +236,6 @@ async fn a_task_that_wants_eight_gigabytes_fails_alone_and_by_name() {
         }
     }
     let after = robot(&fleet.server).await;
-    let pid = |view: &RobotView| Some(view.tasks.iter().find(|t| t.task.as_str() == "calm")?.active.as_ref()?.pid);
-    assert_eq!(pid(&after), pid(&before));
-    assert!(pid(&after).is_some());
+    assert_eq!(pid_of(&after, "calm"), pid_of(&before, "calm"));
+    assert!(pid_of(&after, "calm").is_some());
 }

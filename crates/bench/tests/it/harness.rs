@@ -28,7 +28,7 @@ pub const PATIENCE: Duration = Duration::from_secs(90);
 const MAX_SHOWN: usize = 100;
 
 /// Whom the robots' tasks run as where the tests run as root, as agents on real robots do: nobody who owns anything.
-pub const TASK_USER: &str = "65534";
+const TASK_USER: &str = "65534";
 
 /// The path of one of the workspace's programs.
 pub fn program(name: &str) -> PathBuf {

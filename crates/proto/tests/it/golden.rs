@@ -27,7 +27,7 @@ use task_proto::part::{Part, PartRange};
 use task_proto::publisher::{PackageStatement, PublisherList, Role, SIGNATURE_ARTIFACT};
 use task_proto::report::{
     ActiveVersion, Condition, Failure, FailureCode, HostFacts, Isolation, LinkFacts, Phase, Progress, Report, RosFacts,
-    Status, TaskReport,
+    Status, TaskAccounts, TaskReport,
 };
 use task_proto::request::{Action, Answer, Ask, Outcome, Refusal, Reply, Request};
 use task_proto::ros::{Endpoint, LifecycleState, NodeDetail, NodeSummary, Parameter, TopicSummary, Transition};
@@ -103,6 +103,7 @@ fn report() -> Report {
                 localhost_only: false,
             }),
             isolation: Isolation::Cgroup,
+            accounts: Some(TaskAccounts::PerTask),
             battery_percent: Some(80),
             publishers: Some(3),
             settings: Some(crate::fleet::effective_settings()),

@@ -2,7 +2,7 @@
 
 use task_proto::api::{PendingRobot, RobotTask, RobotView};
 use task_proto::id::Labels;
-use task_proto::report::{ActiveVersion, Isolation, LinkFacts, Phase, RosFacts};
+use task_proto::report::{ActiveVersion, Isolation, LinkFacts, Phase, RosFacts, TaskAccounts};
 
 use super::output::{self, Output, bytes, time};
 use super::robot_settings::shown;
@@ -50,6 +50,15 @@ pub(super) fn pending_row(robot: &PendingRobot) -> Vec<String> {
         robot.token.as_ref().map_or_else(|| "-".to_owned(), ToString::to_string),
         time(robot.since_ms),
     ]
+}
+
+/// Under which accounts tasks run, for people.
+fn task_accounts(accounts: TaskAccounts) -> &'static str {
+    match accounts {
+        TaskAccounts::PerTask => "one for each task",
+        TaskAccounts::Shared => "one for all tasks",
+        TaskAccounts::Agent => "none: tasks run as the agent",
+    }
 }
 
 fn shown_labels(labels: &Labels) -> String {
@@ -100,6 +109,9 @@ pub(super) fn describe(robot: &RobotView, output: &Output) -> String {
             facts.push(("ros in use", ros_in_use(ros)));
         }
         facts.push(("isolation", if host.isolation == Isolation::Cgroup { "cgroup" } else { "none" }.to_owned()));
+        if let Some(accounts) = host.accounts {
+            facts.push(("accounts", task_accounts(accounts).to_owned()));
+        }
         facts.push(("disk free", bytes(host.disk_free_bytes)));
         facts.push(("publishers", publishers(host.publishers)));
         if let Some(percent) = host.battery_percent {

@@ -20,6 +20,8 @@ const ASK_LATER_MS = 60_000;
 // An hour of them, one every two seconds.
 const KEPT_SAMPLES = 1_900;
 
+// Under which accounts tasks run, as the robot says.
+const accounts = { per_task: 'one for each task', shared: 'one for all tasks', agent: 'none: tasks run as the agent' };
 const percent = (value) => `${Math.round(value)} %`;
 /** Three digits, so that a text that changes every two seconds keeps its width. */
 const rate = (value) => `${size(value).replace(/^(\d{3})\.\d/, '$1')}/s`;
@@ -220,6 +222,7 @@ export class Monitor {
       ['Host', host && `${host.hostname}, ${host.arch}, agent ${host.agent_version}`],
       ['ROS', host && ros(host)],
       ['Isolation', host?.isolation && words(host.isolation)],
+      ['Accounts', host?.accounts && (accounts[host.accounts] ?? words(host.accounts))],
       ['Free disk', host?.disk_free_bytes && size(host.disk_free_bytes)],
       ['Load', vitals?.load_1m != null && `${vitals.load_1m.toFixed(2)} over a minute`],
       ['Temperature', vitals?.temperature_c != null && `${Math.round(vitals.temperature_c)} °C`],

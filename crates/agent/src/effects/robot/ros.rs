@@ -17,6 +17,7 @@ use crate::layout::VersionDir;
 use crate::ledger::ActiveRun;
 use crate::plan::StepFailure;
 use crate::run_dir::RunDir;
+use crate::task_user::TaskUser;
 use crate::{environment, launch, survey, underlay};
 
 /// Where looking into ROS installations has its files.
@@ -24,10 +25,15 @@ const SURVEY_DIR: &str = "survey";
 
 /// The variable by which nodes find where to write logs of their own, which begin anew: ROS makes new files at each start and
 /// deletes none. What of them can't be deleted is no reason not to start.
-pub(super) async fn node_logs(version: &VersionDir) -> [(String, String); 1] {
-    let logs = version.node_logs();
+pub(super) async fn node_logs(version: &VersionDir, user: Option<&TaskUser>) -> [(String, String); 1] {
+    let (logs, user) = (version.node_logs(), user.cloned());
     let variable = ("ROS_LOG_DIR".to_owned(), logs.display().to_string());
-    let emptied = tokio::task::spawn_blocking(move || durable::remove_dir_all(&logs)).await;
+    let empty = move || {
+        durable::remove_dir_all(&logs)?;
+        // The version's directory is root's: who writes there needs one of its own.
+        user.map_or(Ok(()), |user| user.make_home(&logs))
+    };
+    let emptied = tokio::task::spawn_blocking(empty).await;
     if let Err(error) = emptied.map_err(io::Error::from).flatten() {
         tracing::warn!(%error, "cannot delete what nodes wrote into logs of their own");
     }
@@ -128,11 +134,11 @@ mod tests {
         let digest = task_proto::Digest::of(b"manifest");
         let data = crate::layout::DataDir::new(temp.path()).expect("a directory");
         let version = data.task(&"talker".parse().expect("valid")).version(&digest);
-        let [(name, place)] = node_logs(&version).await;
+        let [(name, place)] = node_logs(&version, None).await;
         assert_eq!((name.as_str(), Path::new(&place)), ("ROS_LOG_DIR", version.node_logs().as_path()));
         std::fs::create_dir_all(version.node_logs().join("2026-11-22")).expect("made");
         std::fs::write(version.node_logs().join("2026-11-22/launch.log"), "long").expect("written");
-        node_logs(&version).await;
+        node_logs(&version, None).await;
         assert!(!version.node_logs().exists() && version.root().exists());
     }
 

@@ -63,6 +63,8 @@ pub(super) enum Happening {
     ToldToWait {
         ms: u64,
     },
+    /// A start finds that what is on the disk was changed, and deletes it.
+    FindsChange,
     /// The agent learns of the ends of steps.
     Learn,
     ProcessEnds {
@@ -118,6 +120,7 @@ pub(super) fn happening() -> impl Strategy<Value = Happening> {
         1 => Just(Withdraw),
         8 => prop::bool::weighted(0.8).prop_map(|well| Effect { well }),
         2 => (0..90_000u64).prop_map(|ms| ToldToWait { ms }),
+        1 => Just(FindsChange),
         8 => Just(Learn),
         2 => (0..2i32).prop_map(|code| ProcessEnds { code }),
         1 => Just(ProcessVanishes),
@@ -197,6 +200,7 @@ impl World {
             Happening::Effect { well } => self.effect(well),
             Happening::ToldToWait { ms } => self.told_to_wait(ms),
             Happening::Learn => self.learn(),
+            Happening::FindsChange => self.find_change(),
             Happening::ProcessEnds { code } => self.end_process(Some(ExitStatus::Code(code))),
             Happening::ProcessVanishes => self.end_process(None),
             Happening::AgentDies => self.start_agent(self.boot),
@@ -342,6 +346,20 @@ impl World {
         assert_eq!((after.phase, after.attempts), (before.phase, before.attempts), "it counts as a try");
         assert!(after.failure.is_none() && after.retry_at_ms >= self.now_ms.saturating_add(ms));
         self.record = Some(record);
+    }
+
+    fn find_change(&mut self) {
+        let start = |(step, done): &(Step, bool)| {
+            if let (Step::Start(run), false) = (step, done) { Some(run.clone()) } else { None }
+        };
+        let Some((at, run)) = self.steps.iter().enumerate().find_map(|(at, step)| Some((at, start(step)?))) else {
+            return;
+        };
+        let (step, _) = self.steps.remove(at);
+        self.raise(&run.package, 1);
+        let failure = Failure::new(FailureCode::TREE_CHANGED, "src is not what was unpacked");
+        let error = StepFailure { failure, retry_after_ms: Some(0) };
+        self.record = Some(self.with_situation(|s| finished(s, &step, Err(error.clone()))));
     }
 
     fn effect(&mut self, well: bool) {

@@ -169,11 +169,11 @@ fn has_pair(range: &RangeInclusive<u32>, id: u32) -> bool {
 
 /// Whether something lies in the directories that are open to all which belongs to this id.
 fn owns_public_files(id: u32) -> bool {
-    let owns_in = |dir: &&str| {
+    let owns_in = |dir: &str| {
         let entries = fs::read_dir(Path::new(dir)).into_iter().flatten().flatten();
         entries.into_iter().any(|entry| entry.metadata().is_ok_and(|about| about.uid() == id || about.gid() == id))
     };
-    PUBLIC_DIRECTORIES.iter().any(|dir| owns_in(&dir))
+    PUBLIC_DIRECTORIES.iter().any(|dir| owns_in(dir))
 }
 
 #[cfg(test)]

@@ -139,7 +139,10 @@ fn add_content(hasher: &mut Sha256, mut file: File) -> io::Result<()> {
     loop {
         match file.read(&mut buffer)? {
             // The size comes last: a file that grows while it is read is no other file with a known end.
-            0 => return Ok(hasher.update(size.to_le_bytes())),
+            0 => {
+                hasher.update(size.to_le_bytes());
+                return Ok(());
+            }
             count => {
                 hasher.update(&buffer[..count]);
                 size += count as u64;

@@ -146,13 +146,7 @@ pub fn finished(s: &Situation<'_>, step: &Step, outcome: Result<Done, StepFailur
             }
         }
         (Step::Start(_), Err(StepFailure { failure, retry_after_ms })) => {
-            if failure.code == FailureCode::TREE_CHANGED
-                && record.active.as_ref().is_some_and(|active| active.is_for(&record.order))
-            {
-                let kind = record.preparation.kind;
-                let (phase, failure) = (Phase::Fetching, Some(failure.clone()));
-                record.preparation = Preparation { phase, failure, kind, ..Preparation::default() };
-            }
+            prepare_changed(&mut record, &failure);
             // It may have come about after all: what is made of the failure waits until no process is there.
             if let Some(process) = record.active.as_mut().and_then(|active| active.process.as_mut()) {
                 process.condemned = Some(Condemned { failure, again: retry_after_ms.is_some() });
@@ -201,6 +195,15 @@ pub fn finished(s: &Situation<'_>, step: &Step, outcome: Result<Done, StepFailur
     }
     record.settle_phase(s.now_ms);
     record
+}
+
+/// Begins to prepare anew what was found to be changed on the disk, if it is what is ordered.
+fn prepare_changed(record: &mut TaskRecord, failure: &Failure) {
+    let is_ordered = record.active.as_ref().is_some_and(|active| active.is_for(&record.order));
+    if failure.code == FailureCode::TREE_CHANGED && is_ordered {
+        let (kind, failure) = (record.preparation.kind, Some(failure.clone()));
+        record.preparation = Preparation { phase: Phase::Fetching, failure, kind, ..Preparation::default() };
+    }
 }
 
 fn answered(gate: &mut GateRecord, s: &Situation<'_>, refusal: Option<StepFailure>) {

@@ -93,7 +93,7 @@ impl Receiver {
       } else {
         EntityKind::WRITER_NO_KEY_USER_DEFINED
       };
-      EntityId::create_custom_entity_id([0, 0, number], kind)
+      EntityId::new([0, 0, number], kind)
     };
     let sedp = Discovery::builtin_sedp_reader_qos();
     let best_effort = QosPolicyBuilder::new().best_effort().build();

@@ -103,8 +103,7 @@ impl Connection {
         Ok((connection, snapshot))
     }
 
-    /// Passes messages both ways until one side ends; gives back the program's input, whose end ends it, where the program
-    /// is to leave by itself.
+    /// Passes messages both ways until one side ends. The program's input ends with this, and the program with its input.
     async fn speak(
         &self,
         closing: &CancellationToken,

@@ -8,7 +8,6 @@ use task_proto::api::{AWAITS_APPROVAL, RobotTask, RobotView};
 use task_proto::desired::{BlobRef, Delivery, DesiredTask, Evidence, PackageRef};
 use task_proto::id::Labels;
 use task_proto::report::{Condition, LinkFacts, Phase, Report};
-use task_proto::selector::Selector;
 use task_proto::settings::RobotSettings;
 use task_proto::{DeploymentId, Digest, Generation, MacAddress, RobotId, RobotName, TaskName};
 
@@ -28,15 +27,6 @@ pub struct KnownRobot {
     pub mac: MacAddress,
     /// Its labels.
     pub labels: Labels,
-}
-
-/// The robots that a selector means.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Matching {
-    /// Those that match, of all scopes, sorted by name.
-    pub robots: Vec<KnownRobot>,
-    /// Names and ids in the selector that no robot of the scope has, sorted.
-    pub unknown: Vec<RobotName>,
 }
 
 /// Which password a robot has at an external broker.
@@ -80,9 +70,6 @@ pub struct FetchedBy {
 
 pub(super) const KNOWN: &str = "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL";
 
-/// Those that can be ordered something.
-const ORDERABLE: &str = "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL AND awaits_approval = 0";
-
 const KNOWN_BY_ID_OR_NAME: &str =
     "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL AND (id = $1 OR name = $1)";
 
@@ -123,19 +110,6 @@ impl Store {
     pub async fn find_robot(&self, id_or_name: &str) -> Result<Option<KnownRobot>, StoreError> {
         let row = sqlx::query(KNOWN_BY_ID_OR_NAME).bind(id_or_name).fetch_optional(&self.reads).await?;
         row.map(|row| known_robot(&row)).transpose()
-    }
-
-    /// The robots that `selector` means now, sorted by name; none that waits to be approved.
-    pub async fn matching_robots(&self, selector: &Selector, scope: &Scope) -> Result<Matching, StoreError> {
-        matching(sqlx::query(ORDERABLE).fetch_all(&self.reads).await?, selector, scope)
-    }
-
-    /// The names and ids in a selector that no robot of a scope has, sorted.
-    pub async fn unknown_robots(&self, selector: &Selector, scope: &Scope) -> Result<Vec<RobotName>, StoreError> {
-        if selector.names().is_empty() {
-            return Ok(Vec::new());
-        }
-        Ok(matching(sqlx::query(KNOWN).fetch_all(&self.reads).await?, selector, scope)?.unknown)
     }
 
     /// The robots in a scope.
@@ -266,11 +240,6 @@ impl Store {
 }
 
 impl Write {
-    /// The robots that `selector` means now, sorted by name; none that waits to be approved.
-    pub async fn matching_robots(&mut self, selector: &Selector, scope: &Scope) -> Result<Matching, StoreError> {
-        matching(sqlx::query(ORDERABLE).fetch_all(self.connection()).await?, selector, scope)
-    }
-
     /// The robots of a scope, and those that were when they were removed.
     pub async fn robots_ever_in(&mut self, scope: &Scope) -> Result<Vec<RobotId>, StoreError> {
         let rows = sqlx::query("SELECT id, name, mac, labels FROM robots").fetch_all(self.connection()).await?;
@@ -418,21 +387,6 @@ const TASK_ROWS: &str = "SELECT a.robot_id, a.task, a.deployment_id, a.wanted, a
          a.mechanism, a.rule, a.because, d.version
      FROM assignments a JOIN deployments d ON d.id = a.deployment_id
      WHERE (a.desired = 1 OR a.ended = 0) AND (a.desired = 1 OR a.released = 1)";
-
-fn matching(rows: Vec<sqlx::any::AnyRow>, selector: &Selector, scope: &Scope) -> Result<Matching, StoreError> {
-    let mut robots = rows.iter().map(known_robot).collect::<Result<Vec<_>, _>>()?;
-    let mut names = selector.names();
-    if !names.is_empty() {
-        for robot in robots.iter().filter(|robot| scope.covers(&robot.id, &robot.name, &robot.labels)) {
-            names.remove(robot.name.as_str());
-            names.remove(robot.id.as_str());
-        }
-    }
-    let unknown = names.into_iter().collect();
-    robots.retain(|robot| selector.matches(&robot.id, &robot.name, &robot.labels));
-    robots.sort_by(|one, other| one.name.cmp(&other.name));
-    Ok(Matching { robots, unknown })
-}
 
 pub(super) fn known_robot(row: &sqlx::any::AnyRow) -> Result<KnownRobot, StoreError> {
     Ok(KnownRobot {

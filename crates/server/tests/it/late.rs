@@ -2,6 +2,7 @@
 //! nothing moves again that somebody stopped.
 
 use task_proto::Generation;
+use task_proto::api::DeploymentState;
 use task_proto::desired::Wanted;
 use task_proto::manifest::TaskKind;
 use task_proto::report::{Condition, Phase, Report};
@@ -16,6 +17,7 @@ on_both_databases! {
     what_was_stopped_stays_so,
     a_silent_robot_holds_up_its_batch_and_no_later_one,
     no_batch_waits_for_who_has_run_it_or_was_put_out,
+    a_cancel_of_what_is_over_is_refused_and_changes_nothing,
     nobody_takes_over_robots_that_are_not_theirs,
     a_robots_word_opens_no_blob,
     what_was_taken_over_can_be_rolled_back_to,
@@ -133,6 +135,31 @@ async fn no_batch_waits_for_who_has_run_it_or_was_put_out(database: TestDatabase
     assert!(!has_it(&robots[4]).await);
     fleet.actions.revoke_robot(&fleet.operator, &robots[2].id).await.expect("revoked");
     assert!(has_it(&robots[4]).await);
+}
+
+async fn a_cancel_of_what_is_over_is_refused_and_changes_nothing(database: TestDatabase) {
+    let fleet = Fleet::new(database).await;
+    let mut robots = fleet.enroll(2).await;
+    let id = fleet.deploy("1", |_| ()).await;
+    for robot in &mut robots {
+        fleet.follow(robot, Phase::Running).await;
+    }
+    let before = fleet.deployment(&id).await;
+    let refused = fleet.actions.cancel_deployment(&fleet.operator, &id).await;
+    assert_eq!(code(refused), "nothing_to_cancel");
+    assert_eq!(fleet.deployment(&id).await, before);
+    assert_eq!(before.state, DeploymentState::Settled);
+    // Nor is one that others took the place of, and that has settled since.
+    let newer = fleet.deploy("2", |_| ()).await;
+    fleet.follow(&mut robots[0], Phase::Running).await;
+    fleet.follow(&mut robots[1], Phase::Running).await;
+    assert_eq!(code(fleet.actions.cancel_deployment(&fleet.operator, &id).await), "nothing_to_cancel");
+    // Where it failed, the version before comes back.
+    let broken = fleet.deploy("3", |_| ()).await;
+    fleet.follow(&mut robots[0], Phase::Running).await;
+    fleet.follow(&mut robots[1], Phase::Failed).await;
+    fleet.actions.cancel_deployment(&fleet.operator, &broken).await.expect("one has failed");
+    assert_eq!(fleet.desired(&robots[1]).await.expect("state").tasks[0].deployment, newer);
 }
 
 /// A fleet whose robots run version 1 of orders that its database has never seen.

@@ -21,7 +21,6 @@ on_both_databases! {
     an_idempotency_key_orders_once,
     racing_operators_leave_one_winner,
     a_newer_deployment_supersedes_and_a_cancel_puts_back,
-    a_cancel_of_what_is_over_is_refused_and_changes_nothing,
     a_cancel_skips_what_was_cancelled_before,
     a_cancel_passes_over_what_was_deleted,
     robots_that_are_to_poll_are_not_rung,
@@ -241,31 +240,6 @@ async fn a_newer_deployment_supersedes_and_a_cancel_puts_back(database: TestData
     let unknown = task_proto::DeploymentId::random();
     assert_eq!(code(fleet.actions.cancel_deployment(&fleet.operator, &unknown).await), "not_found");
     assert_eq!(code(fleet.actions.resume_deployment(&fleet.operator, &third).await), "deployment_cancelled");
-}
-
-async fn a_cancel_of_what_is_over_is_refused_and_changes_nothing(database: TestDatabase) {
-    let fleet = Fleet::new(database).await;
-    let mut robots = fleet.enroll(2).await;
-    let id = fleet.deploy("1", |_| ()).await;
-    for robot in &mut robots {
-        fleet.follow(robot, Phase::Running).await;
-    }
-    let before = fleet.deployment(&id).await;
-    let refused = fleet.actions.cancel_deployment(&fleet.operator, &id).await;
-    assert_eq!(code(refused), "nothing_to_cancel");
-    assert_eq!(fleet.deployment(&id).await, before);
-    assert_eq!(before.state, DeploymentState::Settled);
-    // Nor is one that others took the place of, and that has settled since.
-    let newer = fleet.deploy("2", |_| ()).await;
-    fleet.follow(&mut robots[0], Phase::Running).await;
-    fleet.follow(&mut robots[1], Phase::Running).await;
-    assert_eq!(code(fleet.actions.cancel_deployment(&fleet.operator, &id).await), "nothing_to_cancel");
-    // Where it failed, the version before comes back.
-    let broken = fleet.deploy("3", |_| ()).await;
-    fleet.follow(&mut robots[0], Phase::Running).await;
-    fleet.follow(&mut robots[1], Phase::Failed).await;
-    fleet.actions.cancel_deployment(&fleet.operator, &broken).await.expect("one has failed");
-    assert_eq!(fleet.desired(&robots[1]).await.expect("state").tasks[0].deployment, newer);
 }
 
 async fn a_cancel_skips_what_was_cancelled_before(database: TestDatabase) {

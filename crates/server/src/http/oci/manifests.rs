@@ -69,6 +69,21 @@ pub(super) struct Push<'a> {
     pub(super) takes_version: bool,
 }
 
+impl<'a> Push<'a> {
+    /// What a request pushes. `?force=true` says that a package may take its version from another.
+    pub(super) fn of(
+        parts: &Parts,
+        repository: &'a RepositoryName,
+        reference: Reference,
+        by: Option<&'a Person>,
+        only: Option<&'static str>,
+    ) -> Result<Self, OciError> {
+        let pairs: Vec<(String, String)> = super::query(&parts.uri)?;
+        let takes_version = pairs.iter().any(|(key, value)| key == "force" && value == "true");
+        Ok(Self { repository, reference, by, only, takes_version })
+    }
+}
+
 /// `PUT`: stores the exact bytes, if all they refer to is in the repository.
 pub(super) async fn put(registry: &Registry, as_said: Push<'_>, parts: &Parts, body: Body) -> Answer {
     let bytes = read_body(body).await?;
@@ -168,12 +183,6 @@ fn version_taken(new: &NewManifest, other: &Digest) -> OciError {
         "{name} {version} is there with other content, manifest {other}: robots that have it would show this version for \
          two contents. Raise the version, or push with --force (?force=true)"
     ))
-}
-
-/// Whether the query says that a package may take its version from another.
-pub(super) fn is_forced(parts: &Parts) -> Result<bool, OciError> {
-    let pairs: Vec<(String, String)> = super::query(&parts.uri)?;
-    Ok(pairs.iter().any(|(key, value)| key == "force" && value == "true"))
 }
 
 /// What a manifest hashes to, which must be what it is pushed as.

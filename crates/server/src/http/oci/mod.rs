@@ -174,13 +174,7 @@ pub async fn dispatch(
                 Method::GET | Method::HEAD => manifests::get(&registry, &repository, reference, &parts).await,
                 Method::PUT => {
                     let only = robot.map(|_| OUTPUT_TYPE);
-                    let push = manifests::Push {
-                        repository: &repository,
-                        reference: reference?,
-                        by: person,
-                        only,
-                        takes_version: manifests::is_forced(&parts)?,
-                    };
+                    let push = manifests::Push::of(&parts, &repository, reference?, person, only)?;
                     manifests::put(&registry, push, &parts, body).await
                 }
                 Method::DELETE if is_of_another_algorithm(text) => Err(OciError::manifest_unknown()),

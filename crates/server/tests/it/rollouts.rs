@@ -1,12 +1,17 @@
 //! Batched rollouts among robots that come and go, told on every database.
 
-use task_proto::api::DeploymentState;
+use std::time::Duration;
+
+use serde_json::json;
+use task_proto::api::{DeploymentState, DeploymentView};
 use task_proto::report::Phase;
 use taskd::actions::ActionError;
 use taskd::rollout::{LOST_AFTER_MS, OFFLINE_GRACE_MS};
+use tokio::time::timeout;
 
 use crate::database::{TestDatabase, on_both_databases};
 use crate::fleet::{Fleet, Robot};
+use crate::harness::{TestServer, answer};
 use crate::story::code;
 
 on_both_databases! {
@@ -150,4 +155,21 @@ async fn a_resume_of_what_is_not_paused_says_what_it_waits_for(database: TestDat
     assert!(matches!(refused().await, ActionError::NotPaused { .. }));
     assert_eq!(code::<()>(Err(refused().await)), "not_paused");
     assert!(refused().await.to_string().ends_with("it has settled on every robot"));
+}
+
+/// The running server looks at rollouts by itself where a robot comes online.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_robot_that_comes_online_begins_at_once() {
+    let server = TestServer::start().await;
+    let robot = server.enroll("atlas").await;
+    let package = server.push("talker", "1.0.0").await;
+    let order = json!({ "package": "talker", "manifest": package.manifest.digest, "selector": "*", "batch": 1 });
+    let ordered: DeploymentView = answer(server.order("/api/v1/deployments", "key-1", &order)).await;
+    let has_begun = |view: &DeploymentView| view.assignments.iter().flatten().all(|one| one.released);
+    assert!(!has_begun(&ordered), "it has not been heard yet");
+    server.ask_desired(&robot).await;
+    let path = format!("/api/v1/deployments/{}", ordered.id);
+    let begins = async { while !has_begun(&server.get(&path).await) {} };
+    timeout(Duration::from_secs(60), begins).await.expect("it begins");
+    assert_eq!(server.desired(&robot).await.tasks.len(), 1);
 }

@@ -47,7 +47,12 @@ impl GraphProgram {
     }
 
     pub(super) fn start(&self) -> io::Result<Child> {
-        let limits = RunLimits { memory_bytes: Some(MEMORY_BYTES), cpu_weight: None, pids: Some(MAX_THREADS) };
+        let limits = RunLimits {
+            memory_bytes: Some(MEMORY_BYTES),
+            cpu_weight: None,
+            pids: Some(MAX_THREADS),
+            filter_calls: true,
+        };
         let group = self.group.as_ref().and_then(|(cgroups, dir)| {
             let made = cgroups.create(dir, &limits);
             made.inspect_err(|error| tracing::warn!(%error, "the ROS graph has no control group")).ok()

@@ -6,6 +6,7 @@
 //! What is heard is acknowledged by hand: a part once it was written, all else at once. A part that nobody takes is all
 //! that is held here; until somebody does, nothing more is read.
 
+mod destination;
 mod room;
 mod subscriptions;
 mod ways;
@@ -18,15 +19,16 @@ use rumqttc::{
     Publish, QoS, StateError, Transport,
 };
 use task_proto::RobotId;
-use task_proto::api::{ExternalBroker, MqttEndpoint, MqttPlace};
+use task_proto::api::ExternalBroker;
 use task_proto::desired::{Doorbell, MAX_DOORBELL_BYTES};
 use task_proto::report::{MAX_REPORT_BYTES, Status};
 use task_proto::request::Request;
 use task_proto::topic::{RobotTopic, Topic, TopicPrefix};
 use task_transport::{Line, LineError, Route};
-use tokio::sync::{mpsc, watch};
+use tokio::sync::mpsc;
 use tokio::time::Instant;
 
+use self::destination::{moved, place_count};
 use self::room::MessageRoom;
 use self::subscriptions::Subscriptions;
 pub use self::ways::Ways;
@@ -178,54 +180,6 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
             () = shared.shutdown.cancelled() => return,
         }
     }
-}
-
-/// Where one session goes, and as whom.
-#[derive(Clone, PartialEq, Eq)]
-struct Destination {
-    host: String,
-    port: u16,
-    prefix: TopicPrefix,
-    /// Whether the port speaks TLS.
-    is_encrypted: bool,
-    /// What is otherwise there than at the server's own broker.
-    external: Option<ExternalBroker>,
-}
-
-impl MqttAccess {
-    /// The place with this number among those that the server names, beginning with 0.
-    fn destination(&self, endpoint: Option<&MqttEndpoint>, number: usize) -> Destination {
-        let Some(MqttEndpoint { host, port, prefix, tls, external, alternatives }) = endpoint.cloned() else {
-            let (host, prefix) = (self.host.clone(), self.prefix.clone());
-            return Destination { host, port: self.port, prefix, is_encrypted: false, external: None };
-        };
-        let other = number.checked_sub(1).and_then(|at| alternatives.into_iter().nth(at));
-        let MqttPlace { host, port, tls } = other.unwrap_or(MqttPlace { host, port, tls });
-        let host = host.unwrap_or_else(|| self.host.clone());
-        Destination { host, port, prefix, is_encrypted: tls, external }
-    }
-
-    /// The same access at this destination.
-    fn at(&self, there: &Destination) -> Self {
-        let Destination { host, port, prefix, .. } = there.clone();
-        Self { host, port, prefix, ..self.clone() }
-    }
-}
-
-/// How many places the server names.
-fn place_count(endpoint: Option<&MqttEndpoint>) -> usize {
-    1 + endpoint.map_or(0, |endpoint| endpoint.alternatives.len())
-}
-
-/// Waits until the server names another place first than `there`, where a session is or is tried.
-async fn moved(endpoint: &mut watch::Receiver<Option<MqttEndpoint>>, access: &MqttAccess, there: &Destination) {
-    // Cancel-safe: a watch remembers that it changed.
-    while endpoint.changed().await.is_ok() {
-        if access.destination(endpoint.borrow_and_update().as_ref(), 0) != *there {
-            return;
-        }
-    }
-    std::future::pending().await
 }
 
 /// What was published and is not acknowledged, the first one first.

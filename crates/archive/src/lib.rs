@@ -100,13 +100,13 @@ pub enum Refusal {
     )]
     OtherDigest {
         /// Its digest.
-        found: Digest,
+        found: Box<Digest>,
         /// The announced one.
-        announced: Digest,
+        announced: Box<Digest>,
     },
     /// The manifest describes the uncompressed archive by a digest that nobody compares.
     #[error("content.tar_digest: {0} is no SHA-256 digest")]
-    DigestAlgorithm(Digest),
+    DigestAlgorithm(Box<Digest>),
     /// An entry is something a package must not hold.
     #[error("entry {name}: {reason}")]
     Entry {
@@ -260,7 +260,7 @@ fn admit(content_size: u64, facts: &ContentFacts, limits: &Limits) -> Result<(),
     }
     match facts.tar_digest.algorithm() {
         Algorithm::Sha256 => Ok(()),
-        Algorithm::Sha512 => Err(Refusal::DigestAlgorithm(facts.tar_digest)),
+        Algorithm::Sha512 => Err(Refusal::DigestAlgorithm(facts.tar_digest.into())),
     }
 }
 

@@ -223,7 +223,7 @@ impl<R: Read> Blocks<R> {
         if let Some((hasher, announced)) = self.digest.take() {
             let found = Digest::from_sha256(hasher.finalize().into());
             if found != announced {
-                return Err(Refusal::OtherDigest { found, announced }.into());
+                return Err(Refusal::OtherDigest { found: found.into(), announced: announced.into() }.into());
             }
         }
         Ok(())

@@ -13,6 +13,7 @@ use task_proto::oci::{ImageManifest, MANIFEST_TYPE};
 use task_proto::selector::Selector;
 use task_proto::token::Token;
 use task_proto::{CaPin, DeploymentId, Digest, RobotId, TaskName, Version};
+use tokio::sync::Mutex;
 
 use crate::encryption::client_config;
 use crate::package::Package;
@@ -40,6 +41,8 @@ pub struct Server {
     http: reqwest::Client,
     base: Url,
     token: String,
+    /// Packages that were to be removed while robots should have them.
+    in_use: Mutex<Vec<(TaskName, Digest)>>,
 }
 
 impl Server {
@@ -48,7 +51,7 @@ impl Server {
         let http = reqwest::Client::builder().timeout(ANSWER_TIMEOUT).redirect(reqwest::redirect::Policy::none());
         let http = http.tls_backend_preconfigured(client_config(pin));
         let http = http.build().map_err(|source| ServerError::NoAnswer("nothing", source))?;
-        Ok(Self { http, base, token: token.reveal() })
+        Ok(Self { http, base, token: token.reveal(), in_use: Mutex::default() })
     }
 
     /// What it is, and what went over it.
@@ -117,10 +120,20 @@ impl Server {
         Ok(digest)
     }
 
-    /// Deletes a package version.
+    /// Deletes a package version. One that robots should have is deleted by a later call, once they should not.
     pub async fn remove_package(&self, name: &TaskName, manifest: &Digest) -> Result<(), ServerError> {
-        let delete = self.request(Method::DELETE, &format!("/v2/{name}/manifests/{manifest}"));
-        send("the package's removal", delete).await.map(drop)
+        let mut in_use = self.in_use.lock().await;
+        in_use.push((name.clone(), *manifest));
+        let mut kept = Vec::new();
+        for (name, manifest) in in_use.drain(..) {
+            let delete = self.request(Method::DELETE, &format!("/v2/{name}/manifests/{manifest}"));
+            match send("the package's removal", delete).await {
+                Err(ServerError::Refused(_, StatusCode::CONFLICT, _)) => kept.push((name, manifest)),
+                removed => drop(removed?),
+            }
+        }
+        *in_use = kept;
+        Ok(())
     }
 
     async fn push_blob(&self, name: &TaskName, blob: BlobRef, bytes: Vec<u8>) -> Result<(), ServerError> {

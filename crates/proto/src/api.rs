@@ -22,7 +22,10 @@ pub use self::awaited::{Awaited, names};
 pub use self::bulk::{BulkLabels, BulkRemove};
 pub use self::conduct::ConductTotals;
 pub use self::delivery::{DeliveryChoice, DeliveryDecision, MAX_PRIORITY, MIN_PRIORITY};
-pub use self::enrolment::{AWAITS_APPROVAL, EnrollmentTokenList, EnrollmentTokenView, PendingRobot, PendingRobotList};
+pub use self::enrolment::{
+    AWAITS_APPROVAL, CreateEnrollmentToken, EnrollmentToken, EnrollmentTokenList, EnrollmentTokenView, PendingRobot,
+    PendingRobotList,
+};
 pub use self::feed::{FeedEntry, FeedKind, FeedPage, MAX_FEED_ENTRIES};
 pub use self::history::{MAX_TIMELINE, PastAssignment, TaskHistory, TimelineEntry, VitalsView};
 pub use self::logs::{LogEvent, LogsFrom, LogsQuery, LogsView};
@@ -120,46 +123,6 @@ pub struct EnrollResponse {
 pub struct RobotToken {
     /// The robot's next bearer token and MQTT password.
     pub token: String,
-}
-
-/// `POST /enrollment-tokens` (administer).
-#[derive(Debug, Clone, Default, Serialize, Deserialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
-pub struct CreateEnrollmentToken {
-    /// Only for this robot, by id or name, which may register again with it.
-    #[serde(default)]
-    pub robot: Option<String>,
-    /// How many enrolments it is good for; absent: as many as the server's setting `enrolment.uses` says.
-    #[serde(default)]
-    pub uses: Option<u64>,
-    /// Whether it is good for any number of them; not with `uses`.
-    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-    pub unlimited: bool,
-    /// Lifetime in seconds; the server's default is a day.
-    #[serde(default)]
-    pub ttl_s: Option<u64>,
-    /// Labels each robot that uses it gets.
-    #[serde(default)]
-    #[cfg_attr(feature = "openapi", schema(inline))]
-    pub labels: Labels,
-    /// Whether a robot that comes by it waits to be approved, also where the server does not ask that of all.
-    #[serde(default)]
-    pub approval: bool,
-}
-
-/// A new enrolment token. The secret is shown this once.
-#[derive(Clone, Serialize, Deserialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
-pub struct EnrollmentToken {
-    /// The public part of it.
-    pub id: String,
-    /// The whole token.
-    pub token: String,
-    /// How many enrolments it is good for; absent: any number.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub uses_left: Option<u64>,
-    /// When it ends.
-    pub expires_at_ms: u64,
 }
 
 /// `GET /robots` (read), optionally `?selector=`, and `?limit=` (1 to 1,000) with `?after=`, a robot's name, for a page.

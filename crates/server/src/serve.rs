@@ -1,28 +1,26 @@
 //! The running server: puts the parts together, starts them, and stops them in an order that loses nothing. It decides
 //! nothing that a part could decide.
 
+mod jobs;
+
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::AtomicUsize;
 use std::time::Duration;
 
 use task_proto::CaPin;
-use task_proto::api::{FeedKind, ListenerView};
-use tokio::sync::broadcast::{
-    self,
-    error::{RecvError, TryRecvError},
-};
+use task_proto::api::ListenerView;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
-use tokio::time::{Interval, MissedTickBehavior};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-use crate::actions::{ActionError, ActionSettings, Actions};
+use self::jobs::{advance_rollouts, expire_assignments, notice_silence, show_conduct, watch_load};
+use crate::actions::{ActionSettings, Actions};
 use crate::backlog::listen;
 use crate::blobs::{BlobError, BlobSettings, Blobs};
 use crate::broker::{Broker, BrokerConfig, BrokerError, ExternalConfig, Gatekeeper, Health, Inbox, Limits};
-use crate::changes::{Change, Changes};
+use crate::changes::Changes;
 use crate::chooser::{Chooser, ServerLoad};
 use crate::clock::Clock;
 use crate::collector;
@@ -34,7 +32,6 @@ use crate::downlink::Downlink;
 use crate::fan_out::FanOutWorker;
 use crate::feed::{Feed, FeedSource};
 use crate::gatekeeper::StoreGatekeeper;
-use crate::happening::Happening;
 use crate::http::events::{EventFeed, EventSource};
 use crate::http::person_limits::PersonLimits;
 use crate::http::traffic::HttpTotals;
@@ -65,23 +62,11 @@ const WRITER_PATIENCE: Duration = Duration::from_secs(3);
 const DATABASE_PATIENCE: Duration = Duration::from_secs(1);
 /// How long a TLS handshake may take before an HTTP request.
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
-/// How often the server looks for assignments that have expired.
-const EXPIRY_INTERVAL: Duration = Duration::from_secs(30);
-/// How often it looks for robots that have fallen silent.
-const SILENCE_INTERVAL: Duration = Duration::from_secs(5);
-/// How often it looks for rollouts that go on without robots that stay away.
-const ROLLOUT_INTERVAL: Duration = Duration::from_secs(10);
-/// The pause between two looks at rollouts, however many robots come meanwhile.
-const ROLLOUT_PAUSE: Duration = Duration::from_millis(250);
-/// How often it looks for robots that misbehave no longer.
-const FORGIVING_INTERVAL: Duration = Duration::from_secs(1);
 /// What people leave free on the disk unless somebody wants it otherwise: this share of it, but no more than so many bytes.
 const RESERVE_SHARE: u64 = 40;
 const MAX_RESERVE_BYTES: u64 = 1 << 30;
 /// What is kept of one robot is at most this share of the disk, unless somebody wants more.
 const ROBOT_SHARE: u64 = 8;
-/// How often it looks at how busy it is.
-const LOAD_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Why the server did not start.
 #[derive(Debug, thiserror::Error)]
@@ -324,111 +309,6 @@ async fn start_readiness(tasks: &TaskTracker, app: &App) {
     };
     check.check().await;
     tasks.spawn(check.run(app.stop.clone()));
-}
-
-async fn expire_assignments(app: App) {
-    let mut ticks = ticks(EXPIRY_INTERVAL);
-    while next_tick(&mut ticks, &app.stop).await {
-        match app.actions.expire().await {
-            // They come back with a token that is good, if they have one.
-            Ok(users) => users.iter().for_each(|user| app.broker.disconnect_person(user)),
-            Err(ActionError::Store(error)) => error.log("assignments could not be looked through for expired ones"),
-            Err(error) => tracing::error!(
-                error = &error as &dyn std::error::Error,
-                "assignments could not be looked through for expired ones"
-            ),
-        }
-    }
-}
-
-/// Moves rollouts on where robots come or stay away: what a report or an order changes moves them on by itself.
-async fn advance_rollouts(app: App) {
-    let mut ticks = ticks(ROLLOUT_INTERVAL);
-    let mut happenings = app.changes.happenings();
-    while !app.stop.is_cancelled() {
-        tokio::select! {
-            () = app.stop.cancelled() => return,
-            _ = ticks.tick() => {}
-            () = robot_came(&mut happenings) => {}
-        }
-        if let Err(error) = app.actions.advance_rollouts().await {
-            tracing::error!(error = &error as &dyn std::error::Error, "rollouts could not be moved on");
-        }
-        // Robots that come at once, as after a restart, are looked at once.
-        tokio::select! {
-            () = app.stop.cancelled() => return,
-            () = tokio::time::sleep(ROLLOUT_PAUSE) => {}
-        }
-    }
-}
-
-/// Waits until some robot has come online. Takes all that has been said so far.
-async fn robot_came(happenings: &mut broadcast::Receiver<Happening>) {
-    let mut came = false;
-    while !came {
-        came = match happenings.recv().await {
-            Ok(happening) => matches!(happening, Happening::Presence(_, true)),
-            Err(RecvError::Lagged(_)) => true,
-            Err(RecvError::Closed) => std::future::pending().await,
-        };
-    }
-    while !matches!(happenings.try_recv(), Err(TryRecvError::Empty | TryRecvError::Closed)) {}
-}
-
-/// Shows that robots misbehave, and that they do so no longer.
-async fn show_conduct(app: App) {
-    let mut ticks = ticks(FORGIVING_INTERVAL);
-    loop {
-        let news = tokio::select! {
-            () = app.stop.cancelled() => return,
-            _ = ticks.tick() => {
-                app.conduct.forgive(tokio::time::Instant::now());
-                continue;
-            }
-            news = app.conduct.news() => news,
-        };
-        for robot in news {
-            if let Some(text) = app.conduct.trouble(&robot) {
-                app.changes.happened(Happening::Robot(robot.clone(), FeedKind::RobotMisbehaved, text));
-            }
-            app.changes.announce(Change::Robot(robot));
-        }
-    }
-}
-
-async fn watch_load(app: App, load: Arc<ServerLoad>) {
-    let mut ticks = ticks(LOAD_INTERVAL);
-    while next_tick(&mut ticks, &app.stop).await {
-        app.transfers.look();
-        load.set(app.transfers.running(), app.broker.queued_part_bytes() as u64);
-    }
-}
-
-async fn notice_silence(app: App) {
-    let mut ticks = ticks(SILENCE_INTERVAL);
-    let mut since_ms = app.clock.now_ms();
-    while next_tick(&mut ticks, &app.stop).await {
-        let now_ms = app.clock.now_ms();
-        for robot in app.presence.fell_silent(since_ms, now_ms) {
-            app.changes.happened(Happening::Presence(robot.clone(), false));
-            app.changes.announce(Change::Robot(robot));
-        }
-        since_ms = now_ms;
-    }
-}
-
-fn ticks(interval: Duration) -> Interval {
-    let mut ticks = tokio::time::interval(interval);
-    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
-    ticks
-}
-
-/// Waits for the next tick; false when it is time to stop.
-async fn next_tick(ticks: &mut Interval, stop: &CancellationToken) -> bool {
-    tokio::select! {
-        () = stop.cancelled() => false,
-        _ = ticks.tick() => true,
-    }
 }
 
 async fn open_database(

@@ -18,7 +18,7 @@ use tokio_util::sync::CancellationToken;
 
 use self::held::Held;
 pub(crate) use self::outcomes::chain;
-use self::outcomes::{build_failure, fetch_failure, later, millis, outputs_code, pulled};
+use self::outcomes::{build_failure, fetch_failure, later, millis, on_disk, outputs_code, pulled};
 use self::trees::Purpose;
 use super::{Effects, Now};
 use crate::accounts::Accounts;
@@ -545,11 +545,6 @@ impl Effects for Robot {
         on_disk(move || dir.remove()).await?;
         self.accounts.release(task).map_err(|error| later(FailureCode::IO_ERROR, &error, 0))
     }
-}
-
-async fn on_disk(work: impl FnOnce() -> std::io::Result<()> + Send + 'static) -> Result<(), StepFailure> {
-    let done = tokio::task::spawn_blocking(work).await.map_err(std::io::Error::other);
-    done.flatten().map_err(|error| later(FailureCode::IO_ERROR, &error, 0))
 }
 
 #[cfg(test)]

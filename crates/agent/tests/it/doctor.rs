@@ -83,7 +83,7 @@ fn data_that_the_tasks_account_can_not_get_to_is_named_with_the_directory_in_the
     assert_found(&checks, "task user", "bad", &format!("which may not enter {}, where", dir.path().display()));
     std::fs::set_permissions(dir.path(), std::fs::Permissions::from_mode(0o711)).unwrap();
     let checks = doctor(&data, &[("TASK_AGENT_TASK_USER", "4711")]);
-    assert_found(&checks, "task user", "good", "tasks run as 4711");
+    assert_found(&checks, "task user", "good", "with the groups of 4711");
     assert_found(&checks, "seccomp", "good", "only an administrator needs");
     let off = [("TASK_AGENT_TASK_USER", "4711"), ("TASK_AGENT_SECCOMP", "off")];
     assert_found(&doctor(&data, &off), "seccomp", "notice", "all system calls");

@@ -38,6 +38,7 @@ impl Launched {
         let data = DataDir::new(&run.path("it's data")).expect("data dir");
         let version = data.task(&manifest.name).version(&Digest::of(b"manifest"));
         write(&version.install().join("local_setup.bash"), "export OVERLAY=sourced\n");
+        std::fs::create_dir_all(version.work()).expect("a working directory");
         let underlay = run.path("setup.bash");
         write(&underlay, &format!("export UNDERLAY=sourced PATH=\"{}:$PATH\"\n", run.path("bin").display()));
         let program = run.path("bin/ros2");
@@ -45,7 +46,7 @@ impl Launched {
         std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).expect("executable");
         write(&run.spec.script, &script::run_script(&manifest, &version, &[underlay]));
         run.spec.interrupt = launch::of(&manifest).interrupt;
-        run.spec.directory = version.root().to_owned();
+        run.spec.directory = version.work();
         run.spec.environment.insert("ROS_DOMAIN_ID".to_owned(), "42".to_owned());
         Self { run, version }
     }
@@ -84,7 +85,7 @@ async fn launch_arguments_reach_ros2_as_they_are() {
     let log = launched.run.log();
     assert_eq!(ended, Observed::Exited(ExitStatus::Code(0)), "{log}");
 
-    let root = launched.version.root();
+    let root = launched.version.work();
     let mut expected = vec!["launch".to_owned(), "talker".to_owned(), "talker.launch.py".to_owned()];
     expected.extend(arguments.iter().map(|(name, value)| format!("{name}:={value}")));
     assert_eq!(texts(root.join("argv")), expected);

@@ -13,9 +13,9 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::Signal;
 use rand::{RngExt as _, SeedableRng as _};
 use serde_json::Value;
-use task_proto::api::{DeploymentView, RobotView};
+use task_proto::api::{DeploymentView, INSTANCE_HEADER, PLACE_HEADER, RobotView};
 use task_proto::report::Phase;
-use task_proto::{CaPin, RobotId};
+use task_proto::{CaPin, InstanceId, RobotId};
 use task_transport::Trust;
 use tempfile::TempDir;
 
@@ -510,4 +510,10 @@ fn show_log_of_failed(path: &Path) {
 
 fn log_file(path: &Path) -> File {
     File::options().create(true).append(true).open(path).expect("log file")
+}
+
+/// A request in the name of a robot, as its agent makes it after a restart in the data directory `data`.
+pub fn from_restarted_agent(request: reqwest::RequestBuilder, data: &Path) -> reqwest::RequestBuilder {
+    let place = std::fs::File::open(data.join("lock")).and_then(|lock| task_agent::place::of(&lock)).expect("a place");
+    request.header(INSTANCE_HEADER, InstanceId::random().as_str()).header(PLACE_HEADER, place.to_string())
 }

@@ -7,7 +7,7 @@ use task_proto::report::Phase;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 
-use crate::harness::{Fleet, PATIENCE, Robot, Server, add_ballast, eventually, program};
+use crate::harness::{Fleet, PATIENCE, Robot, Server, add_ballast, eventually, from_restarted_agent, program};
 
 /// More than all buffers between the server and a client that reads nothing.
 const HEAVY_BYTES: usize = 64 << 20;
@@ -85,6 +85,7 @@ async fn a_revoked_robot_is_out_at_once_and_keeps_what_runs() {
     let mut got = download.chunk().await.expect("bytes").expect("bytes").len() as u64;
     let mut report = half_a_report(server, &id, &token).await;
     let next = client.post(server.url(&format!("/api/v1/robots/{id}/token"))).bearer_auth(&token);
+    let next = from_restarted_agent(next, robot.data());
     let next: Value = next.send().await.expect("sent").json().await.expect("json");
     let next = next["token"].as_str().expect("a token").to_owned();
     assert!(server.robot("robot-1").await.expect("there").mqtt.is_some(), "it has a session");

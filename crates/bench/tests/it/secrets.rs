@@ -3,7 +3,7 @@
 #![expect(clippy::disallowed_methods, reason = "a test starts processes")]
 
 use std::collections::BTreeSet;
-use std::io::Write as _;
+use std::io::{BufRead as _, BufReader, Write as _};
 use std::net::SocketAddr;
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
@@ -18,7 +18,7 @@ use task_proto::report::Phase;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};
 
-use crate::harness::{Robot, Server, program, write_package};
+use crate::harness::{Robot, Server, from_restarted_agent, program, write_package};
 
 /// Files that may hold a secret, if nobody else can read them.
 const KEEPERS: [&str; 3] = ["operator.token", "identity.json", "credentials.json"];
@@ -118,6 +118,22 @@ async fn run(mut command: Command, input: &str) -> Output {
     tokio::task::spawn_blocking(run).await.expect("no panic")
 }
 
+/// Runs it until it has said `words` on its standard error, then kills it. Gives all that it said there.
+async fn run_until(mut command: Command, words: &'static str) -> Vec<u8> {
+    let run = move || {
+        let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().expect("runs");
+        let mut said = Vec::new();
+        let mut errors = BufReader::new(child.stderr.take().expect("piped"));
+        while !String::from_utf8_lossy(&said).contains(words) {
+            assert_ne!(errors.read_until(b'\n', &mut said).expect("readable"), 0, "it ended without {words:?}");
+        }
+        child.kill().expect("killed");
+        child.wait().expect("ended");
+        said
+    };
+    tokio::task::spawn_blocking(run).await.expect("no panic")
+}
+
 fn files_below(dir: &Path, found: &mut Vec<PathBuf>) {
     for entry in std::fs::read_dir(dir).expect("readable").flatten() {
         match entry.file_type().expect("a type") {
@@ -150,7 +166,6 @@ async fn do_wrong(server: &Server, dir: &Path, secrets: &Secrets, tokens: &[Stri
         command
     };
     let mut wrong = vec![
-        serve(&[("TASKD_DATABASE", &url)], &[]),
         serve(&[("TASKD_DATABASE", &url.replace("postgres", "mysql"))], &[]),
         serve(&[("TASKD_BROKER", &format!("mqtt://u:{password}@no host"))], &[]),
         serve(&[], &["--config", file.to_str().expect("utf-8")]),
@@ -164,6 +179,9 @@ async fn do_wrong(server: &Server, dir: &Path, secrets: &Secrets, tokens: &[Stri
         enroll.env("TASK_AGENT_ENROLL_TOKEN", mangled(token));
         wrong.push(enroll);
     }
+    // A server waits for a database that is away, and says so.
+    let said = run_until(serve(&[("TASKD_DATABASE", &url)], &[]), "the server waits").await;
+    secrets.assert_absent("a server whose database is away", &said);
     for command in wrong {
         let shown = format!("{command:?}").replace(password, "…");
         let output = run(command, "").await;
@@ -256,6 +274,7 @@ async fn robot(server: &Server, dir: &Path, proxy: SocketAddr, secrets: &mut Sec
     server.push(&package, "atlas").await;
     server.wait_phase("atlas", "teller", Phase::Running).await;
     let next = reqwest::Client::new().post(format!("http://{proxy}/api/v1/robots/{id}/token")).bearer_auth(&token);
+    let next = from_restarted_agent(next, robot.data());
     let next: Value = next.send().await.expect("sent").json().await.expect("json");
     secrets.token("the robot's next token", next["token"].as_str().expect("a token"));
     (robot, [enrolment, token])

@@ -160,7 +160,7 @@ async fn a_list_rotates_and_revokes_keys_and_what_runs_is_not_started_again_with
         (view.host.as_ref()?.publishers == Some(2) && view.tasks[0].degraded.is_some()).then_some(())
     })
     .await;
-    let order = site.push("1.0", &["--sign", &bob]).await;
+    let order = site.push("1.0", &["--sign", &bob, "--restart"]).await;
     let (_, failure) = site.refused(&order).await;
     assert!(failure.text.contains("version 2 of the list of publishers withdraws it"), "{failure}");
 }

@@ -12,15 +12,15 @@ use axum::http::StatusCode;
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
 use serde_json::{Value, json};
-use task_proto::api::{DeploymentView, INSTANCE_HEADER, PLACE_HEADER, RobotView};
+use task_proto::DeploymentId;
+use task_proto::api::{DeploymentView, RobotView};
 use task_proto::desired::{BlobRef, DesiredState, PackageRef};
 use task_proto::digest::unhex;
 use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
 use task_proto::report::{FailureCode, Phase, Report, TaskReport};
-use task_proto::{DeploymentId, InstanceId};
 use tokio::task::JoinHandle;
 
-use crate::harness::{Server, eventually, open_directory, write_package};
+use crate::harness::{Server, eventually, from_restarted_agent, open_directory, write_package};
 use crate::signing::{Site, new_key};
 
 /// Somebody in the server's place, with a state for the robot and blobs, who listens to what the robot says.
@@ -85,11 +85,7 @@ async fn desired_by(server: &Server, data: &std::path::Path) -> reqwest::Respons
     let text = |key: &str| identity[key].as_str().expect("text");
     let desired = server.url(&format!("/api/v1/robots/{}/desired", text("robot_id")));
     let request = reqwest::Client::new().get(desired).bearer_auth(text("token"));
-    // As an agent that was started again there would ask.
-    let place = std::fs::File::open(data.join("lock")).and_then(|lock| task_agent::place::of(&lock)).expect("a place");
-    let request = request.header(INSTANCE_HEADER, InstanceId::random().as_str());
-    let request = request.header(PLACE_HEADER, place.to_string());
-    request.send().await.expect("an answer")
+    from_restarted_agent(request, data).send().await.expect("an answer")
 }
 
 /// The state that the server has for the robot, as it signed it.
@@ -165,7 +161,7 @@ async fn whoever_has_stolen_the_servers_key_can_not_make_a_robot_run_anything_el
     let evil = site.dir.path().join("worker-evil");
     let script = format!("touch {}/was-here\nexec sleep 1000\n", marker.display());
     write_package(&evil, "worker", "1.0", "service", &script);
-    let args = ["push", evil.to_str().expect("utf-8"), "-o", "json"];
+    let args = ["push", evil.to_str().expect("utf-8"), "--force", "-o", "json"];
     let evil: PackageRef = serde_json::from_str(&site.server.operate(args).await).expect("a package");
 
     let key = stolen_key(&site.server);

@@ -214,3 +214,14 @@ fn what_is_worth_a_look() {
     let newer: FeedKind = serde_json::from_value(json!("robot_levitated")).expect("tolerated");
     assert_eq!(newer, FeedKind::Unknown);
 }
+
+#[test]
+fn a_decision_about_the_delivery() {
+    let decision = DeliveryDecision {
+        mechanism: Delivery::DirectPush,
+        rule: "many small".to_owned(),
+        because: "size 20 KB ≤ 256 KB, robots 40 ≥ 8".to_owned(),
+    };
+    check("delivery_decision.json", &decision);
+    check_tolerance::<DeliveryDecision>("delivery_decision.json");
+}

@@ -9,9 +9,9 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 use task_proto::api::{
-    ConductTotals, CreateDeployment, DeliveryChoice, DeliveryDecision, EnrollRequest, EnrollResponse, ErrorBody, Event,
-    ExternalBroker, HttpTraffic, LogEvent, LogsFrom, LogsView, MqttConnection, MqttEndpoint, MqttPlace, MqttTraffic,
-    OutputList, OutputView, ReportReply, RobotToken, ServerInfo, Traffic,
+    ConductTotals, CreateDeployment, DeliveryChoice, EnrollRequest, EnrollResponse, ErrorBody, Event, ExternalBroker,
+    HttpTraffic, LogEvent, LogsFrom, LogsView, MqttConnection, MqttEndpoint, MqttPlace, MqttTraffic, OutputList,
+    OutputView, ReportReply, RobotToken, ServerInfo, Traffic,
 };
 use task_proto::desired::{
     BlobRef, Delivery, DesiredState, DesiredTask, Doorbell, Evidence, Inline, PackageRef, SignatureRef, Wanted,
@@ -441,17 +441,6 @@ fn documents_of_the_api() {
             dry_run: false,
         },
     );
-}
-
-#[test]
-fn a_decision_about_the_delivery() {
-    let decision = DeliveryDecision {
-        mechanism: Delivery::DirectPush,
-        rule: "many small".to_owned(),
-        because: "size 20 KB ≤ 256 KB, robots 40 ≥ 8".to_owned(),
-    };
-    check("delivery_decision.json", &decision);
-    check_tolerance::<DeliveryDecision>("delivery_decision.json");
 }
 
 /// The last part of a blob of 1,030 bytes, in hexadecimal digits.

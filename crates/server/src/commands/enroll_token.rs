@@ -79,7 +79,7 @@ pub(super) async fn run(session: &Session, action: Action) -> Result<Outcome, Co
             let key = super::client::random_key();
             let token: EnrollmentToken = session.client.order("/enrollment-tokens", &request, &key).await?;
             session.output.described(&token, |token| token.id.clone(), |token| token.token.clone())?;
-            let good_for = token.uses_left.map_or_else(|| "any number of robots".to_owned(), |uses| robots(uses));
+            let good_for = token.uses_left.map_or_else(|| "any number of robots".to_owned(), robots);
             let until = time(token.expires_at_ms);
             say(&format!("{}, good for {good_for}, valid until {until}; it is not shown again", token.id));
         }

@@ -44,7 +44,8 @@ pub(super) async fn enroll(
 }
 
 /// Makes an enrolment token.
-#[utoipa::path(post, path = "/api/v1/enrollment-tokens", tag = "enrolment")]
+#[utoipa::path(post, path = "/api/v1/enrollment-tokens", tag = "enrolment",
+    responses((status = 404, description = "There is no such robot.")))]
 pub(super) async fn create_token(
     State(app): State<App>,
     by: Person,

@@ -143,7 +143,7 @@ async fn pushed(registry: &TestRegistry, case: &Case) -> Result<(), String> {
     let content = registry.push_blob("talker", &case.content).await;
     let config = registry.push_blob("talker", task.to_string().as_bytes()).await;
     let package = ImageManifest::package(config, content);
-    let answer = registry.put_manifest("/v2/talker/manifests/1.0.0", MANIFEST_TYPE, &package).await;
+    let answer = registry.put_manifest("/v2/talker/manifests/1.0.0?force=true", MANIFEST_TYPE, &package).await;
     if answer.status() == StatusCode::CREATED {
         return Ok(());
     }

@@ -17,7 +17,7 @@ use crate::people::PASSWORD;
 struct Stage {
     server: TestServer,
     robot: TestRobot,
-    talker: PackageRef,
+    unused: PackageRef,
     walker: PackageRef,
     manifest: String,
     deployment: String,
@@ -47,6 +47,7 @@ impl Stage {
         let state = server.desired(&robot).await;
         assert_eq!(server.report(&mut robot, &state, Phase::Failed).await.status(), 200);
         let (talker, walker) = (server.push("talker", "1.0.0").await, server.push("walker", "1.0.0").await);
+        let unused = server.push("unused", "1.0.0").await;
         let path = format!("/v2/talker/manifests/{}", talker.manifest.digest);
         let manifest = server.request(Method::GET, &path).send().await.expect("an answer").text().await.expect("text");
         let deployment = server.deploy(&talker, "*", "first").await.id.to_string();
@@ -58,7 +59,7 @@ impl Stage {
         let enrolment: EnrollmentToken = server.post("/api/v1/enrollment-tokens", &json!({})).await;
         let enrolment = enrolment.token;
         let paused = paused.id.to_string();
-        Self { server, robot, talker, walker, manifest, deployment, paused, failed, enrolment, signed_in, other_token }
+        Self { server, robot, unused, walker, manifest, deployment, paused, failed, enrolment, signed_in, other_token }
     }
 
     fn order(&self, path: &str, body: &Value) -> RequestBuilder {
@@ -76,7 +77,7 @@ impl Stage {
         let deploy = json!({ "package": "walker", "manifest": self.walker.manifest.digest, "selector": "*" });
         let manifest = self.server.request(Method::PUT, "/v2/talker/manifests/2.0.0");
         let manifest = manifest.header("content-type", MANIFEST_TYPE).body(self.manifest.clone());
-        let talker = &self.talker;
+        let unused = &self.unused;
         let ask = json!({ "type": "lifecycle", "node": "/talker", "transition": "activate" });
         vec![
             ("enrolment_token.create", request(Method::POST, &api("enrollment-tokens"), json!({}))),
@@ -109,8 +110,8 @@ impl Stage {
             ),
             ("manifest.push", manifest),
             ("tag.delete", delete("/v2/talker/manifests/2.0.0")),
-            ("manifest.delete", delete(&format!("/v2/talker/manifests/{}", talker.manifest.digest))),
-            ("blob.delete", delete(&format!("/v2/talker/blobs/{}", talker.content.digest))),
+            ("manifest.delete", delete(&format!("/v2/unused/manifests/{}", unused.manifest.digest))),
+            ("blob.delete", delete(&format!("/v2/unused/blobs/{}", unused.content.digest))),
             ("user.add", request(Method::POST, &api("users"), json!({ "name": "bob", "roles": ["viewer"] }))),
             ("user.edit", request(Method::PATCH, &api("users/alice"), json!({ "roles": ["viewer"] }))),
             ("sign_in", bare(Method::POST, &api("login"), json!({ "user": "alice", "password": PASSWORD }))),

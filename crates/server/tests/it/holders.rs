@@ -14,7 +14,7 @@ use tokio::sync::Notify;
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 
-use crate::harness::{TestRobot, TestServer, answer, client, refusal};
+use crate::harness::{TestRobot, TestServer, answer, archive_of, client, refusal};
 use crate::mqtt_harness::PATIENCE;
 use crate::people::PASSWORD;
 
@@ -98,7 +98,7 @@ async fn crowded_server() -> (TestServer, TestRobot, String) {
     let server = TestServer::start_in(directory, |config| config.max_http_connections = CONNECTIONS).await;
     let robot = server.enroll("atlas").await;
     // More than the buffers between server and client hold.
-    let package = server.push_content("talker", "1.0.0", vec![7; 32 << 20]).await;
+    let package = server.push_content("talker", "1.0.0", archive_of(32 << 20, 7)).await;
     server.deploy(&package, "atlas", "first").await;
     let blob = format!("/v2/talker/blobs/{}", package.content.digest);
     (server, robot, blob)
@@ -142,7 +142,7 @@ async fn robot_that_takes_every_connection_does_not_keep_another_from_being_stop
 }
 
 /// Answers by status, as they come on all connections of a pipelining client.
-#[derive(Default)]
+#[derive(Debug, Default)]
 struct Answers {
     served: AtomicUsize,
     refused: AtomicUsize,
@@ -204,10 +204,19 @@ async fn eight_thousand_lists_of_one_viewer_do_not_delay_a_robot() {
         let [median, most] = [overtaken[10], overtaken[19]];
         assert!(median < 40 && most < 120, "lists that were served while the robot waited: {overtaken:?}");
     };
-    timeout(4 * PATIENCE, async { tokio::join!(flood, watch) }).await.expect("an end");
+    // The last connections of the flood are slowed, not refused, so it takes long to end.
+    let most_refused = async {
+        while answers.refused.load(Ordering::SeqCst) <= 4_000 {
+            tokio::task::yield_now().await;
+        }
+    };
+    let watched = async { tokio::join!(watch, most_refused) };
+    tokio::select! {
+        () = flood => panic!("the flood ended: {answers:?}"),
+        ended = timeout(4 * PATIENCE, watched) => drop(ended.expect("most are refused")),
+    }
     let (served, refused) = (answers.served.into_inner(), answers.refused.into_inner());
-    assert_eq!(served + refused, 8_000);
-    assert!(refused > 4_000, "only {refused} of 8,000 were refused");
+    assert!(served < refused, "{served} were served, {refused} refused");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -238,11 +247,12 @@ async fn person_has_one_upload_at_a_time() {
         let request = server.bare(Method::POST, "/api/v1/packages").bearer_auth(token);
         request.header("content-type", "application/x-tar").body(body)
     };
-    let endless = reqwest::Body::wrap_stream(futures_util::stream::pending::<Result<Vec<u8>, std::io::Error>>());
-    let first = upload(&publisher, endless).send();
+    let endless = || reqwest::Body::wrap_stream(futures_util::stream::pending::<Result<Vec<u8>, std::io::Error>>());
+    // The other upload may have the place for a moment.
+    let first = async { while refusal(upload(&publisher, endless())).await.0 == 429 {} };
     let second = async { while refusal(upload(&publisher, "hello".into())).await.0 != 429 {} };
     tokio::select! {
-        _ = first => panic!("an upload without an end had one"),
+        () = first => panic!("an upload without an end had one"),
         refused = timeout(PATIENCE, second) => refused.expect("no second one"),
     }
     let operator = server.operator.reveal();

@@ -138,7 +138,7 @@ async fn thousands_of_robots_that_were_chosen_one_by_one_are_not_listed_each_tim
     let server = TestServer::start().await;
     server.enroll("atlas").await;
     let package = server.push("talker", "1.0.0").await;
-    let others = (0..10_000).map(|number| format!("r{number:016x}"));
+    let others = (0..10_000).map(|number| format!("site=s{number:x}"));
     let selector = std::iter::once("atlas".to_owned()).chain(others).collect::<Vec<_>>().join(",");
     let ordered = server.deploy(&package, &selector, "one").await;
     assert_eq!(ordered.counts.iter().map(|count| count.count).sum::<u64>(), 1);

@@ -9,10 +9,49 @@ use std::{
 use std::collections::BTreeSet;
 
 use num_traits::NumOps;
-use num_derive::{FromPrimitive, NumOps, ToPrimitive};
+use num_derive::{FromPrimitive, ToPrimitive};
 use serde::{Deserialize, Serialize};
 use speedy::{Context, Readable, Reader, Writable, Writer};
 use log::error;
+
+// Arithmetic that stays at the lowest or highest number: a sender chooses the numbers, and sums
+// with them must neither panic nor wrap.
+macro_rules! saturating_ops {
+  ($number:ty) => {
+    impl std::ops::Add for $number {
+      type Output = Self;
+      fn add(self, other: Self) -> Self {
+        Self(self.0.saturating_add(other.0))
+      }
+    }
+    impl std::ops::Sub for $number {
+      type Output = Self;
+      fn sub(self, other: Self) -> Self {
+        Self(self.0.saturating_sub(other.0))
+      }
+    }
+    impl std::ops::Mul for $number {
+      type Output = Self;
+      fn mul(self, other: Self) -> Self {
+        Self(self.0.saturating_mul(other.0))
+      }
+    }
+    impl std::ops::Div for $number {
+      type Output = Self;
+      fn div(self, other: Self) -> Self {
+        Self(self.0 / other.0)
+      }
+    }
+    impl std::ops::Rem for $number {
+      type Output = Self;
+      fn rem(self, other: Self) -> Self {
+        Self(self.0 % other.0)
+      }
+    }
+  };
+}
+saturating_ops!(SequenceNumber);
+saturating_ops!(FragmentNumber);
 
 //
 /// RTPS Specification v2.3 Section "8.3.5.4 SequenceNumber"
@@ -25,7 +64,6 @@ use log::error;
   Eq,
   PartialOrd,
   Ord,
-  NumOps,
   FromPrimitive,
   ToPrimitive,
   Serialize,
@@ -209,7 +247,6 @@ impl Default for SequenceNumber {
   Eq,
   Readable,
   Writable,
-  NumOps,
   FromPrimitive,
   ToPrimitive,
 )]

@@ -22,6 +22,12 @@ pub(super) fn pulled(outcome: Result<(), FetchError>) -> Result<Done, StepFailur
     }
 }
 
+/// Does work on the disk in a thread that may block; a failure is tried again.
+pub(super) async fn on_disk(work: impl FnOnce() -> std::io::Result<()> + Send + 'static) -> Result<(), StepFailure> {
+    let done = tokio::task::spawn_blocking(work).await.map_err(std::io::Error::other);
+    done.flatten().map_err(|error| later(FailureCode::IO_ERROR, &error, 0))
+}
+
 pub(super) fn millis(duration: Duration) -> u64 {
     u64::try_from(duration.as_millis()).unwrap_or(u64::MAX)
 }

@@ -39,6 +39,7 @@ mod unreleased;
 
 use conduct::until;
 use parts::{Parts, due};
+use subscriptions::lower;
 use unreleased::Unreleased;
 
 /// Answers a client may leave unread before nothing more is read from it.
@@ -546,8 +547,4 @@ async fn heard(listener: &mut Option<Listener>) -> Result<Heard, RouterError> {
         Some(listener) => listener.next().await,
         None => std::future::pending().await,
     }
-}
-
-fn lower(a: QoS, b: QoS) -> QoS {
-    if (a as u8) < b as u8 { a } else { b }
 }

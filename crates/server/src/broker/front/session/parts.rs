@@ -9,7 +9,8 @@ use task_proto::topic::Topic;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::Notify;
 
-use super::{Count, End, Session, lower};
+use super::subscriptions::lower;
+use super::{Count, End, Session};
 use crate::broker::Part;
 use crate::broker::front::access::Hearing;
 use crate::broker::front::codec::encode_publish_head;

@@ -5,7 +5,7 @@ use task_proto::Digest;
 use task_proto::api::Subscription;
 use tokio::io::{AsyncRead, AsyncWrite};
 
-use super::{End, Session, lower};
+use super::{End, Session};
 use crate::broker::front::access::{Hearing, Visitor, matches, may_subscribe};
 use crate::broker::front::parts::Member;
 use crate::broker::router::Heard;
@@ -84,4 +84,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         let member = Member::join(grant, robot, self.parts.news());
         member.map(|member| self.parts.join(digest, member)).is_some()
     }
+}
+
+/// The lower of two qualities of service.
+pub(super) fn lower(a: QoS, b: QoS) -> QoS {
+    if (a as u8) < b as u8 { a } else { b }
 }

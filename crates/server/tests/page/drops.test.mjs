@@ -109,7 +109,7 @@ test('a server whose disk is full says so, and takes what there is room for', as
   const server = await Server.start(t, { disk: await smallDisk(t, 30 * MB) });
   const page = await open(t, server, { hash: '#/packages' });
   await drop(page, folder(t, 'mapper', { 'model.bin': randomBytes(60 * MB) }));
-  await upload(page, 'mapper').locator('.problem', { hasText: 'the server\'s disk' }).waitFor();
+  await upload(page, 'mapper').locator('.problem', { hasText: 'the server\'s disk is nearly full' }).waitFor();
   assert.match(takeComplaints(page).join(), /507/);
   assert.deepEqual(await listed(server), []);
   assert.deepEqual(readdirSync(join(server.data, 'incoming')), [], 'what had come makes room again');

@@ -169,6 +169,7 @@ impl Server {
             attempts: Arc::default(),
             facts,
             slow_figures: Arc::default(),
+            lists: Arc::default(),
             events: EventFeed::new(),
             key: public_key,
             ca_pin: tls.as_ref().map(Tls::pin),

@@ -1,9 +1,8 @@
-//! A blob's bytes as the body of an HTTP answer: slices of bounded size, and a length known from the start. Whatever
-//! would wait for the disk is done on a blocking thread, so that one cold blob never stalls the other connections.
+//! A blob's bytes as the body of an HTTP answer: slices of bounded size, and a length known from the start. Reads that
+//! would wait for the disk are done on a blocking thread, so that one cold blob never stalls the other connections.
 
 use std::io;
 use std::ops::Range;
-use std::path::Path;
 use std::pin::Pin;
 use std::task::{Context, Poll, ready};
 
@@ -12,7 +11,7 @@ use futures_util::FutureExt as _;
 use futures_util::future::BoxFuture;
 use http_body::{Body, Frame, SizeHint};
 
-use super::{Blob, BlobError};
+use super::{Blob, BytesFor};
 
 /// The most bytes handed out at once.
 const SLICE_BYTES: u64 = 128 * 1024;
@@ -26,8 +25,10 @@ const PAGE_BYTES: usize = 4096;
 /// Part of a blob, on its way to a client.
 pub struct BlobBody {
     blob: Blob,
+    /// The blob's mapped bytes, if the kernel is the one that reads them.
+    mapped: Option<Bytes>,
     left: Range<u64>,
-    /// Up to where it was in memory when that was looked at last.
+    /// The end of the mapped bytes that were in memory at the last look.
     in_memory_until: u64,
     /// Whether others are to have theirs first. A client that is as fast as memory would otherwise keep a thread until it
     /// has all.
@@ -37,35 +38,43 @@ pub struct BlobBody {
 }
 
 impl BlobBody {
-    pub(super) fn new(blob: Blob, range: Range<u64>) -> Self {
-        debug_assert!(range.end <= blob.size);
-        Self { blob, in_memory_until: range.start, left: range, is_turn_over: false, pending: None }
+    pub(super) fn new(blob: Blob, range: Range<u64>, reader: BytesFor) -> Self {
+        debug_assert!(range.end <= blob.size());
+        let mapped = blob.mapped.clone().filter(|_| reader == BytesFor::Socket);
+        let in_memory_until = range.start;
+        Self { blob, mapped, in_memory_until, left: range, is_turn_over: false, pending: None }
     }
 
     /// The next slice if it is in memory; else starts to fetch it.
     fn next_slice(&mut self) -> io::Result<Option<Bytes>> {
         let start = self.left.start;
         let length = usize::try_from(SLICE_BYTES.min(self.left.end - start)).map_err(io::Error::other)?;
-        let blob = self.blob.clone();
-        if blob.mapped.is_none() {
-            self.pending = Some(blob.read_in_turn(move |blob| blob.read_at(start, length)).boxed());
-            return Ok(None);
-        }
-        let slice = blob.read_at(start, length)?;
-        if start + length as u64 <= self.in_memory_until {
-            return Ok(Some(slice));
-        }
-        let left = usize::try_from(self.left.end - start).unwrap_or(LOOK_AHEAD_BYTES);
-        let ahead = blob.read_at(start, left.min(LOOK_AHEAD_BYTES))?;
-        let resident = bytes_in_memory(&ahead);
-        if resident >= length {
-            self.in_memory_until = start + resident as u64;
-            return Ok(Some(slice));
-        }
-        self.in_memory_until = start + ahead.len() as u64;
-        let length = ahead.len();
-        let fetching = blob.read_in_turn(move |blob| blob.bring_into_memory(start, length).map(|()| slice));
-        self.pending = Some(fetching.boxed());
+        let ahead = usize::try_from(self.left.end - start).unwrap_or(usize::MAX).min(LOOK_AHEAD_BYTES);
+        let slice = match &self.mapped {
+            None => match self.blob.read_cached(start, length) {
+                Some(slice) => return Ok(Some(slice)),
+                None => None,
+            },
+            Some(mapped) => {
+                let at = usize::try_from(start).map_err(io::Error::other)?;
+                let slice = mapped.slice(at..at + length);
+                if start + length as u64 <= self.in_memory_until {
+                    return Ok(Some(slice));
+                }
+                let resident = bytes_in_memory(&mapped.slice(at..at + ahead));
+                let is_resident = resident >= length;
+                self.in_memory_until = start + if is_resident { resident } else { ahead } as u64;
+                if is_resident {
+                    return Ok(Some(slice));
+                }
+                Some(slice)
+            }
+        };
+        let fetch = move |blob: &Blob| {
+            blob.read_ahead(start, ahead)?;
+            slice.map_or_else(|| blob.read_at(start, length), Ok)
+        };
+        self.pending = Some(self.blob.clone().with_disk_permit(fetch).boxed());
         Ok(None)
     }
 }
@@ -103,37 +112,6 @@ impl Body for BlobBody {
 
     fn size_hint(&self) -> SizeHint {
         SizeHint::with_exact(self.left.end - self.left.start)
-    }
-}
-
-impl Blob {
-    /// The bytes of `range`, which lies inside the blob: mapped ones are not copied, only brought into memory.
-    pub async fn slice(&self, range: Range<u64>) -> Result<Bytes, BlobError> {
-        debug_assert!(range.end <= self.size);
-        let name = self.digest.hex();
-        let read = self.clone().read_in_turn(move |blob| {
-            let length = usize::try_from(range.end - range.start).map_err(io::Error::other)?;
-            if blob.mapped.is_some() {
-                blob.bring_into_memory(range.start, length)?;
-            }
-            blob.read_at(range.start, length)
-        });
-        read.await.map_err(BlobError::disk("read", Path::new(&name)))
-    }
-
-    /// Reads what may have to come from the disk, when it is this reader's turn.
-    async fn read_in_turn<T, F>(self, read: F) -> io::Result<T>
-    where
-        T: Send + 'static,
-        F: FnOnce(&Self) -> io::Result<T> + Send + 'static,
-    {
-        let turn = self.disk.clone().acquire_owned().await.map_err(io::Error::other)?;
-        let reading = tokio::task::spawn_blocking(move || {
-            let read = read(&self);
-            drop(turn);
-            read
-        });
-        reading.await.map_err(io::Error::other)?
     }
 }
 

@@ -3,13 +3,13 @@
 //! [`crate::collector`]'s decision. A blob's modification time is when it was last asked for by someone
 //! who pushes; its content is never judged by it.
 
+mod blob;
 mod body;
 mod upload;
 
-use std::collections::VecDeque;
+use std::collections::{HashSet, VecDeque};
 use std::fs::{self, File};
 use std::io::{self, Write as _};
-use std::os::unix::fs::FileExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, SystemTime};
@@ -19,6 +19,7 @@ use task_proto::Digest;
 use task_proto::digest::Algorithm;
 use tokio::sync::{OwnedRwLockReadGuard, OwnedRwLockWriteGuard, RwLock, Semaphore};
 
+pub use blob::{Blob, BytesFor};
 pub use body::BlobBody;
 use upload::Uploads;
 pub use upload::{InvalidUploadId, UploadId};
@@ -29,8 +30,6 @@ use crate::delivery::shown_bytes;
 /// Reads from the disk for answers at the same time. More would not be faster, and would keep the processor from those who
 /// wait for something else.
 const DISK_READS: usize = 2;
-/// What is read at a time to have it in memory.
-const SCRAP_BYTES: usize = 64 * 1024;
 
 /// The blob store's limits and choices.
 #[derive(Debug, Clone, Copy)]
@@ -163,21 +162,10 @@ struct Shared {
     uploads: Uploads,
     /// Blobs opened before, the latest first: opening and mapping costs more than a small blob's bytes.
     open: Mutex<VecDeque<Blob>>,
+    /// Blobs whose files are checked because a read failed.
+    checked: Mutex<HashSet<Digest>>,
     disk: Arc<Semaphore>,
     collection: Arc<RwLock<()>>,
-}
-
-/// A blob to read. It stays readable while this lives, even if the blob is deleted.
-#[derive(Clone)]
-pub struct Blob {
-    digest: Digest,
-    size: u64,
-    quoted_digest: Bytes,
-    file: Arc<File>,
-    /// All of the file, if it is read that way.
-    mapped: Option<Bytes>,
-    /// Whose turn it is to read from the disk.
-    disk: Arc<Semaphore>,
 }
 
 /// While this lives, no blob is collected: whoever found one present can still rely on it.
@@ -201,7 +189,8 @@ impl Blobs {
         let uploads = Uploads::open(data.join("uploads"), settings)?;
         let open = Mutex::new(VecDeque::with_capacity(settings.max_open_blobs));
         let disk = Arc::new(Semaphore::new(DISK_READS));
-        let shared = Shared { directory, settings, uploads, open, disk, collection: Arc::default() };
+        let shared =
+            Shared { directory, settings, uploads, open, checked: Mutex::default(), disk, collection: Arc::default() };
         Ok(Self { shared: Arc::new(shared) })
     }
 
@@ -222,16 +211,15 @@ impl Blobs {
 
     /// The blob, if it is here.
     pub async fn get(&self, digest: Digest) -> Result<Option<Blob>, BlobError> {
-        if let Some(blob) = self.already_open(digest) {
+        if let Some(blob) = self.shared.already_open(digest) {
             return Ok(Some(blob));
         }
-        let path = self.path(digest);
-        let (reading, disk) = (self.shared.settings.reading, self.shared.disk.clone());
-        let opened = on_disk(move || match Blob::open(digest, &path, reading, disk) {
+        let shared = self.shared.clone();
+        let opened = on_disk(move || match Blob::open(digest, &shared) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
-            opened => opened.map(Some).map_err(BlobError::disk("open", &path)),
+            opened => opened.map(Some).map_err(BlobError::disk("open", &shared.path(digest))),
         });
-        Ok(opened.await?.map(|blob| self.keep_open(blob)))
+        Ok(opened.await?.map(|blob| self.shared.keep_open(blob)))
     }
 
     /// Stores small bytes that are in memory already, and says what they hash to.
@@ -321,7 +309,7 @@ impl Blobs {
 
     /// Deletes a blob. Only the collector may, which knows that nothing refers to it.
     pub async fn delete(&self, digest: Digest, _collection: &Collection) -> Result<(), BlobError> {
-        self.close(digest);
+        self.shared.close(digest);
         let path = self.path(digest);
         on_disk(move || match fs::remove_file(&path) {
             Err(error) if error.kind() != io::ErrorKind::NotFound => Err(BlobError::disk("delete", &path)(error)),
@@ -329,12 +317,18 @@ impl Blobs {
         })
         .await?;
         // A reader may have opened it in between; it keeps its copy, later ones shall not find it.
-        self.close(digest);
+        self.shared.close(digest);
         Ok(())
     }
 
     fn path(&self, digest: Digest) -> PathBuf {
-        self.shared.directory.join(digest.algorithm().as_str()).join(digest.hex())
+        self.shared.path(digest)
+    }
+}
+
+impl Shared {
+    fn path(&self, digest: Digest) -> PathBuf {
+        self.directory.join(digest.algorithm().as_str()).join(digest.hex())
     }
 
     /// The blob, if it is open; it then is the last to be closed.
@@ -354,7 +348,7 @@ impl Blobs {
             return earlier.clone();
         }
         open.push_front(blob.clone());
-        open.truncate(self.shared.settings.max_open_blobs);
+        open.truncate(self.settings.max_open_blobs);
         blob
     }
 
@@ -363,97 +357,7 @@ impl Blobs {
     }
 
     fn open_blobs(&self) -> MutexGuard<'_, VecDeque<Blob>> {
-        self.shared.open.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
-impl Blob {
-    fn open(digest: Digest, path: &Path, reading: BlobRead, disk: Arc<Semaphore>) -> io::Result<Self> {
-        let file = File::open(path)?;
-        let size = file.metadata()?.len();
-        let mapped = match reading {
-            // An empty file can't be mapped.
-            BlobRead::Mmap if size > 0 => {
-                // SAFETY: nothing modifies or truncates a file after it was renamed into the store; deleting it leaves
-                // the mapping intact.
-                let mapping = unsafe { memmap2::Mmap::map(&file) }?;
-                Some(Bytes::from_owner(mapping))
-            }
-            BlobRead::Mmap | BlobRead::Pread => None,
-        };
-        let quoted_digest = format!("\"{digest}\"").into();
-        Ok(Self { digest, size, quoted_digest, file: Arc::new(file), mapped, disk })
-    }
-
-    /// What it hashes to.
-    pub fn digest(&self) -> Digest {
-        self.digest
-    }
-
-    /// The digest's text in double quotes, as HTTP writes a tag. It is shared: every answer has it.
-    pub fn quoted_digest(&self) -> &Bytes {
-        &self.quoted_digest
-    }
-
-    /// Its size in bytes.
-    pub fn size(&self) -> u64 {
-        self.size
-    }
-
-    /// The bytes of `range`, which lies inside the blob, as the body of an answer.
-    pub fn body(&self, range: std::ops::Range<u64>) -> BlobBody {
-        BlobBody::new(self.clone(), range)
-    }
-
-    /// All of it for a thread that may wait for the disk.
-    pub fn reader(&self) -> impl io::Read + Send + use<> {
-        BlobReader { file: self.file.clone(), offset: 0 }
-    }
-
-    /// All of it in memory. For small blobs: the caller has checked [`Blob::size`].
-    pub async fn read(&self) -> Result<Bytes, BlobError> {
-        let blob = self.clone();
-        on_disk(move || {
-            let length = usize::try_from(blob.size).unwrap_or(usize::MAX);
-            blob.read_at(0, length).map_err(BlobError::disk("read", Path::new(&blob.digest.hex())))
-        })
-        .await
-    }
-
-    fn read_at(&self, offset: u64, length: usize) -> io::Result<Bytes> {
-        if let Some(bytes) = &self.mapped {
-            let start = usize::try_from(offset).map_err(io::Error::other)?;
-            return Ok(bytes.slice(start..start + length));
-        }
-        let mut bytes = vec![0; length];
-        self.file.read_exact_at(&mut bytes, offset)?;
-        Ok(bytes.into())
-    }
-
-    /// Has the kernel read these bytes, so that their mapping can be read without waiting. Not through the mapping: all
-    /// threads share its lock, and would wait for the disk with this one.
-    fn bring_into_memory(&self, offset: u64, length: usize) -> io::Result<()> {
-        let mut scrap = vec![0; SCRAP_BYTES.min(length)];
-        let end = offset + length as u64;
-        for start in (offset..end).step_by(SCRAP_BYTES) {
-            let length = usize::try_from(end - start).unwrap_or(SCRAP_BYTES).min(SCRAP_BYTES);
-            self.file.read_exact_at(&mut scrap[..length], start)?;
-        }
-        Ok(())
-    }
-}
-
-/// A blob's file with a place of its own in it: many read the same file.
-struct BlobReader {
-    file: Arc<File>,
-    offset: u64,
-}
-
-impl io::Read for BlobReader {
-    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        let count = self.file.read_at(buffer, self.offset)?;
-        self.offset += count as u64;
-        Ok(count)
+        self.open.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 

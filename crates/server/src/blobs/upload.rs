@@ -165,7 +165,7 @@ impl Upload {
 }
 
 /// The hash of a file. SHA-512 is computed so, which few ask for, and that of an upload which was taken up.
-fn hash<D: sha2::Digest>(path: &Path) -> io::Result<sha2::digest::Output<D>> {
+pub(super) fn hash<D: sha2::Digest>(path: &Path) -> io::Result<sha2::digest::Output<D>> {
     let (mut file, mut hasher, mut piece) = (File::open(path)?, D::new(), vec![0; GATHERED_BYTES]);
     loop {
         match file.read(&mut piece)? {

@@ -3,7 +3,7 @@
 use axum::Json;
 use axum::extract::State;
 use axum::response::{IntoResponse, Response};
-use http::{HeaderMap, StatusCode};
+use http::{HeaderMap, StatusCode, Uri};
 use serde::Deserialize;
 use task_proto::DeploymentId;
 use task_proto::api::{
@@ -16,6 +16,7 @@ use utoipa::IntoParams;
 
 use super::extract::{JsonBody, PathParam, QueryParams, idempotency_key, page_limit};
 use super::openapi::OrderKey;
+use super::shared_lists::{ListKey, SharedJson};
 use super::views::{complete_deployment, complete_matched, narrowed, without_others};
 use crate::person::Person;
 
@@ -40,8 +41,13 @@ const LISTED: u32 = 200;
 pub(super) async fn list(
     State(app): State<App>,
     by: Person,
+    uri: Uri,
     QueryParams(query): QueryParams<ListQuery>,
-) -> Result<Json<DeploymentList>, ApiError> {
+) -> Result<SharedJson<DeploymentList>, ApiError> {
+    app.lists.get(ListKey::new(&by.scope, &uri), listed(&app, &by, &query)).await
+}
+
+async fn listed(app: &App, by: &Person, query: &ListQuery) -> Result<DeploymentList, ApiError> {
     let limit = page_limit(query.limit)?.unwrap_or(LISTED);
     let robots = match by.scope.is_everything() {
         true => None,
@@ -56,7 +62,7 @@ pub(super) async fn list(
         true => page.deployments,
         false => page.deployments.into_iter().map(without_others).collect(),
     };
-    Ok(Json(DeploymentList { deployments, next: page.next }))
+    Ok(DeploymentList { deployments, next: page.next })
 }
 
 /// The query of `GET /deployments/{deployment}`.
@@ -74,10 +80,11 @@ pub(super) struct ShowQuery {
 pub(super) async fn show(
     State(app): State<App>,
     by: Person,
+    uri: Uri,
     PathParam(id): PathParam<DeploymentId>,
     QueryParams(query): QueryParams<ShowQuery>,
-) -> Result<Json<DeploymentView>, ApiError> {
-    seen(&app, &by, &id, query.timeline).await.map(Json)
+) -> Result<SharedJson<DeploymentView>, ApiError> {
+    app.lists.get(ListKey::new(&by.scope, &uri), seen(&app, &by, &id, query.timeline)).await
 }
 
 /// Orders a package on robots, or only says which robots that would be.

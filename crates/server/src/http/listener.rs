@@ -178,7 +178,7 @@ impl Site {
         let Guest { peer, silent, proof, crowded, handle } = guest;
         let (spoken, is_proxy) = (CancellationToken::new(), self.proxies.contains(&peer.ip().to_canonical()));
         let (router, traffic) = (self.router.clone(), self.traffic.clone());
-        let origin = Origin { peer, proof, handle: handle.clone() };
+        let origin = Origin { peer, is_encrypted: self.tls.is_some(), proof, handle: handle.clone() };
         let mut connection = pin!(connection(stream, origin, spoken.clone(), router, traffic));
         let stranger = async {
             tokio::select! {
@@ -313,9 +313,14 @@ fn is_the_clients_fault(error: &io::Error) -> bool {
     matches!(error.kind(), ConnectionAborted | ConnectionRefused | ConnectionReset)
 }
 
+/// Marks a request whose connection is not encrypted: only the kernel reads the bytes of its answer.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Unencrypted;
+
 /// What is known of every request of a connection.
 struct Origin {
     peer: SocketAddr,
+    is_encrypted: bool,
     proof: ClientProof,
     handle: Connection,
 }
@@ -325,6 +330,9 @@ impl Origin {
         request.extensions_mut().insert(ConnectInfo(self.peer));
         request.extensions_mut().insert(self.proof.clone());
         request.extensions_mut().insert(self.handle.clone());
+        if !self.is_encrypted {
+            request.extensions_mut().insert(Unencrypted);
+        }
     }
 }
 

@@ -30,6 +30,7 @@ pub mod person_limits;
 mod proxy;
 mod robots;
 pub mod session;
+pub mod shared_lists;
 pub mod status;
 mod tasks;
 pub mod traffic;
@@ -130,6 +131,8 @@ pub struct AppParts {
     pub facts: Arc<ServerFacts>,
     /// What was found out about it last.
     pub slow_figures: Arc<status::SlowFigures>,
+    /// The long lists that are being rendered.
+    pub lists: Arc<shared_lists::SharedLists>,
     /// The event stream's source.
     pub events: events::EventFeed,
     /// The key that verifies desired states.

@@ -6,7 +6,7 @@ use std::str::FromStr;
 use axum::extract::{ConnectInfo, State};
 use axum::response::{IntoResponse, NoContent, Response};
 use axum::{Extension, Json};
-use http::{HeaderMap, StatusCode, header};
+use http::{HeaderMap, StatusCode, Uri, header};
 use serde::Deserialize;
 use task_proto::api::{
     EditRobot, FeedKind, INSTANCE_HEADER, MqttConnection, PLACE_HEADER, ReportReply, RobotList, RobotToken, RobotView,
@@ -22,6 +22,7 @@ use super::auth::TokenNumber;
 use super::error::ApiError;
 use super::extract::{JsonBody, PathParam, QueryParams, TolerantJson, page_limit};
 use super::openapi::Created;
+use super::shared_lists::{ListKey, SharedJson};
 use super::views::complete_robot;
 use crate::changes::Change;
 use crate::happening::Happening;
@@ -49,8 +50,13 @@ pub(super) struct ListQuery {
 pub(super) async fn list(
     State(app): State<App>,
     by: Person,
+    uri: Uri,
     QueryParams(query): QueryParams<ListQuery>,
-) -> Result<Json<RobotList>, ApiError> {
+) -> Result<SharedJson<RobotList>, ApiError> {
+    app.lists.get(ListKey::new(&by.scope, &uri), listed(&app, &by, &query)).await
+}
+
+async fn listed(app: &App, by: &Person, query: &ListQuery) -> Result<RobotList, ApiError> {
     let (selector, after) = (query.selector.as_ref(), query.after.as_ref());
     let mut list = match (page_limit(query.limit)?, after) {
         (Some(limit), after) => {
@@ -71,7 +77,7 @@ pub(super) async fn list(
     }
     let now_ms = app.clock.now_ms();
     list.robots.iter_mut().for_each(|robot| complete_robot(robot, &app.presence, &app.conduct, &app.vitals, now_ms));
-    Ok(Json(list))
+    Ok(list)
 }
 
 /// Shows one robot.

@@ -74,7 +74,7 @@ async fn status(server: &TestServer) -> ServerStatus {
     server.get("/api/v1/server/status").await
 }
 
-async fn eventually(what: &str, mut is_so: impl AsyncFnMut() -> bool) {
+pub async fn eventually(what: &str, mut is_so: impl AsyncFnMut() -> bool) {
     let wait = async { while !is_so().await {} };
     tokio::time::timeout(PATIENCE, wait).await.unwrap_or_else(|_| panic!("{what}"));
 }

@@ -16,6 +16,7 @@ mod commands;
 mod completions;
 mod conduct;
 mod corruption;
+mod damaged_blobs;
 mod database;
 mod deliveries;
 mod direct_push;

@@ -15,7 +15,8 @@ use task_proto::{Digest, RepositoryName, RobotId};
 
 use super::manifests::deleted;
 use super::{Answer, OciError, Registry};
-use crate::blobs::Blob;
+use crate::blobs::{Blob, BytesFor};
+use crate::http::listener::Unencrypted;
 use crate::person::Person;
 use crate::store::{Act, Deed};
 use crate::transfers::Claim;
@@ -110,9 +111,11 @@ pub(super) fn serve(blob: &Blob, request: &Parts, content_type: HeaderValue, cac
         };
         let length = range.end - range.start;
         let is_head = request.method == Method::HEAD;
+        let reader =
+            if request.extensions.get::<Unencrypted>().is_some() { BytesFor::Socket } else { BytesFor::Process };
         let content_range = (status == StatusCode::PARTIAL_CONTENT)
             .then(|| format!("bytes {}-{}/{}", range.start, range.end.saturating_sub(1), blob.size()));
-        let mut response = with_room(if is_head { Body::empty() } else { Body::new(blob.body(range)) });
+        let mut response = with_room(if is_head { Body::empty() } else { Body::new(blob.body(range, reader)) });
         *response.status_mut() = status;
         if let Some(content_range) = content_range {
             response.headers_mut().insert(CONTENT_RANGE, header_value(content_range)?);

@@ -7,13 +7,14 @@ use axum::Json;
 use axum::extract::{ConnectInfo, Extension, Path, Request, State};
 use axum::response::sse::Sse;
 use axum::response::{IntoResponse, NoContent, Response};
-use http::{HeaderMap, StatusCode};
+use http::{HeaderMap, StatusCode, Uri};
 use utoipa::{IntoParams, ToSchema};
 
 use super::super::auth::Caller;
 use super::super::error::ApiError;
 use super::super::extract::{JsonBody, PathParam, PathParams, QueryParams, TolerantJson};
 use super::super::oci::OciError;
+use super::super::shared_lists::SharedJson;
 use super::Draft;
 use crate::person::Person;
 
@@ -36,6 +37,7 @@ impl<S> Argument for State<S> {}
 impl<T> Argument for Extension<T> {}
 impl Argument for ConnectInfo<SocketAddr> {}
 impl Argument for HeaderMap {}
+impl Argument for Uri {}
 impl Argument for Request {}
 impl Argument for Caller {}
 impl Argument for Person {}
@@ -94,6 +96,12 @@ impl Answer for Response {}
 impl<S> Answer for Sse<S> {}
 
 impl<T: ToSchema> Answer for Json<T> {
+    fn describe(draft: &mut Draft) {
+        draft.gives_json::<T>(StatusCode::OK);
+    }
+}
+
+impl<T: ToSchema> Answer for SharedJson<T> {
     fn describe(draft: &mut Draft) {
         draft.gives_json::<T>(StatusCode::OK);
     }

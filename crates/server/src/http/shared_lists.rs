@@ -170,7 +170,8 @@ mod tests {
         }));
         assert!(poll_immediate(&mut before).await.is_none());
         fleet.set(2);
-        let after = lists.get(key("/robots"), async { Ok(fleet.get()) });
+        let mut after = Box::pin(lists.get(key("/robots"), async { Ok(fleet.get()) }));
+        assert!(poll_immediate(&mut after).await.is_none());
         release.send(()).expect("awaited");
         let (before, after) = tokio::join!(before, after);
         let body = |list: Result<SharedJson<i32>, ApiError>| list.expect("rendered").body;

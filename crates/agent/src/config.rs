@@ -1,6 +1,9 @@
 //! The robot's property file, `agent.toml` in the data directory, and the `TASK_AGENT_*` variables above it:
 //! environment > file > defaults. Unknown keys are refused by name. It is read once, at start; it never holds a secret.
 
+pub mod settings;
+pub mod trust;
+
 use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::fmt::Write as _;
@@ -19,9 +22,10 @@ use task_proto::publisher::{InvalidRole, Role};
 use task_proto::settings::{MAX_ROS_DOMAIN_ID, RobotLimits};
 use toml::{Table, Value};
 
-use crate::call_filter::Seccomp;
-use crate::durable;
-use crate::trust::TrustSettings;
+use crate::config::trust::TrustSettings;
+use crate::logs::forwarder::ForwardSettings;
+use crate::process::call_filter::Seccomp;
+use crate::system::durable;
 
 /// The file's name.
 pub const FILE_NAME: &str = "agent.toml";
@@ -203,15 +207,6 @@ pub struct GateConfig {
     pub timeout: Duration,
     /// What it means when there is no answer.
     pub default: GateDefault,
-}
-
-/// Which log lines go to the server while nobody follows.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct ForwardSettings {
-    /// Only these and more serious ones.
-    pub level: LogLevel,
-    /// Lines a second and task.
-    pub lines_per_s: u32,
 }
 
 /// The settings that hold, defaults filled in.

@@ -8,7 +8,6 @@ pub mod console;
 pub mod forwarder;
 pub mod line;
 pub mod record;
-pub mod ros;
 pub mod rotated;
 pub mod tail;
 
@@ -16,15 +15,16 @@ pub use rotated::RotatedLog;
 
 use std::fs::File;
 use std::io::{self, Read as _, Seek as _, SeekFrom};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use serde::{Deserialize, Serialize};
 use task_proto::TaskName;
 use task_proto::log::{LogLevel, LogLine, LogSource};
 use tokio::sync::watch;
 
-use crate::clock;
-use crate::layout::DataDir;
+use crate::system::clock;
+use crate::system::layout::DataDir;
 use archive::Wanted;
 use line::LogFile;
 use record::Record;
@@ -32,11 +32,29 @@ use record::Record;
 /// The longest that lines are published for one question; who still follows asks again.
 const MAX_LEASE: Duration = Duration::from_secs(120);
 
+/// Where a task's output goes and how much of it is kept.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LogSpec {
+    /// The current file; older ones are beside it with `.1`, `.2`, … added.
+    pub path: PathBuf,
+    /// The size at which a file is rotated.
+    pub max_bytes: u64,
+    /// How many files are kept, the current one included.
+    pub files: u32,
+}
+
 /// What is asked of a robot's logs.
 #[derive(Debug, Clone)]
 pub struct Logs {
     data: DataDir,
     following: watch::Sender<Option<Following>>,
+}
+
+impl LogSpec {
+    /// A log at `path` of at most 50 MiB in five files.
+    pub fn at(path: PathBuf) -> Self {
+        Self { path, max_bytes: 10 * 1024 * 1024, files: 5 }
+    }
 }
 
 /// Somebody follows.

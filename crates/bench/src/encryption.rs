@@ -4,7 +4,7 @@ use anyhow::Context as _;
 use rcgen::{BasicConstraints, CertificateParams, IsCa, Issuer, KeyPair};
 use rustls::ClientConfig;
 use rustls::client::Resumption;
-use task_agent::clock;
+use task_agent::system::clock;
 use task_proto::CaPin;
 use task_transport::{Trust, pin_of};
 

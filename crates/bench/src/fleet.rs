@@ -182,7 +182,7 @@ impl Fleet {
 
     /// What the payload that robot `number` has unpacked hashes to.
     pub fn payload(&self, number: usize, package: &TaskName, manifest: &Digest) -> anyhow::Result<Digest> {
-        let data = task_agent::layout::DataDir::new(&self.dir.path().join(number.to_string()))?;
+        let data = task_agent::system::layout::DataDir::new(&self.dir.path().join(number.to_string()))?;
         let path: PathBuf = data.task(package).version(manifest).src().join(PAYLOAD_FILE);
         let bytes = std::fs::read(&path).with_context(|| path.display().to_string())?;
         Ok(Digest::of(&bytes))

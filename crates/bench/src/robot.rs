@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use rumqttc::{
     AsyncClient, Event, EventLoop, Incoming, LastWill, MqttOptions, NetworkOptions, Outgoing, QoS, SubscribeReasonCode,
 };
-use task_agent::vitals::Source as _;
+use task_agent::telemetry::vitals::Source as _;
 use task_proto::api::EnrollResponse;
 use task_proto::desired::{DesiredState, DesiredTask, Doorbell, MAX_DOORBELL_BYTES};
 use task_proto::envelope::{DESIRED_STATE_TYPE, PublicKey};

@@ -14,17 +14,17 @@ use std::sync::Arc;
 use anyhow::{Context as _, anyhow};
 use rustls::ClientConfig;
 use task_agent::config::{Config, MqttTransport, parse_server};
-use task_agent::credential::Credential;
-use task_agent::driver::{Driver, Speaker};
-use task_agent::effects::Robot;
-use task_agent::fetch::{FetchSettings, Fetcher};
-use task_agent::layout::DataDir;
-use task_agent::ledger::Ledger;
-use task_agent::link::{self, Heard, Intervals, Message, Shared, Talk};
-use task_agent::mqtt::{self, MqttAccess, Ways};
-use task_agent::outputs::Registry;
-use task_agent::server;
-use task_agent::vitals::{Sender, Source as _};
+use task_agent::install::fetch::{FetchSettings, Fetcher};
+use task_agent::link::mqtt::{self, MqttAccess, Ways};
+use task_agent::link::state::{self, Heard, Intervals, Message, Shared, Talk};
+use task_agent::reconcile::driver::{Driver, Speaker};
+use task_agent::reconcile::robot::Robot;
+use task_agent::system::layout::DataDir;
+use task_agent::task::ledger::Ledger;
+use task_agent::telemetry::outputs::Registry;
+use task_agent::telemetry::vitals::{Sender, Source as _};
+use task_agent::transfer::credential::Credential;
+use task_agent::transfer::server;
 use task_proto::report::{HostFacts, Phase, Report, Status, TaskReport};
 use task_proto::request::{Answer, Ask, Outcome, Refusal, Reply, Request};
 use task_proto::topic::RobotTopic;
@@ -179,7 +179,7 @@ fn start(number: usize, robot: Assembled, crew: &Crew, words: mpsc::Sender<Word>
     tokio::spawn(answer(robot_id, source, asked, said));
     tokio::spawn(witness(number, shared.clone(), words));
     tokio::spawn(driver.run(messages));
-    tokio::spawn(link::over_http(server, shared.clone(), intervals, heard.clone()));
+    tokio::spawn(state::over_http(server, shared.clone(), intervals, heard.clone()));
     tokio::spawn(async move {
         // Their tasks say nothing.
         let (_batches, lines) = mpsc::channel(1);

@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use task_agent::vitals::Source;
+use task_agent::telemetry::vitals::Source;
 use task_proto::vitals::Vitals;
 
 /// As often as robots of ours say it.

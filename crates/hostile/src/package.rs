@@ -2,9 +2,9 @@
 
 use std::path::{Component, Path};
 
-use task_agent::launch;
-use task_agent::layout::DataDir;
-use task_agent::script::run_script;
+use task_agent::setup::launch;
+use task_agent::setup::script::run_script;
+use task_agent::system::layout::DataDir;
 use task_proto::Digest;
 use task_proto::manifest::{Build, BuildTool, ContentFacts, TaskManifest};
 

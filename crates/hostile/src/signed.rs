@@ -1,6 +1,6 @@
 //! Envelopes and the desired states in them, as a robot receives them from whoever.
 
-use task_agent::admission::{Refused, admit};
+use task_agent::reconcile::admission::{Refused, admit};
 use task_proto::desired::{BlobRef, DesiredState, Doorbell, Inline};
 use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
 use task_proto::{Digest, Generation, RobotId};

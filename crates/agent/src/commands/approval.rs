@@ -8,12 +8,12 @@ use task_proto::api::AWAITS_APPROVAL;
 
 use super::enroll::check_key;
 use super::say;
-use crate::durable;
-use crate::effects::chain;
-use crate::identity::Identity;
-use crate::layout::DataDir as Layout;
-use crate::plan::backoff_ms;
-use crate::server::{Sent, Server, ServerError};
+use crate::system::durable;
+use crate::system::error_chain::chain;
+use crate::system::identity::Identity;
+use crate::system::layout::DataDir as Layout;
+use crate::task::plan::backoff_ms;
+use crate::transfer::server::{Sent, Server, ServerError};
 
 /// The longest pause between two questions; the shortest is a quarter of it.
 const PAUSE: Duration = Duration::from_secs(8);

@@ -12,10 +12,10 @@ use task_proto::id::{LabelKey, LabelValue};
 use super::enroll::parse_label;
 use super::{DataDir, say};
 use crate::config::{FILE_NAME, Settings, parse_server};
-use crate::durable;
-use crate::identity;
-use crate::layout::DataDir as Layout;
-use crate::underlay::{self, Places};
+use crate::setup::underlay::{self, Places};
+use crate::system::durable;
+use crate::system::identity;
+use crate::system::layout::DataDir as Layout;
 
 /// Arguments of `configure`.
 #[derive(Debug, clap::Args)]

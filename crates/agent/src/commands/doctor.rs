@@ -18,21 +18,23 @@ use tokio::time::timeout;
 
 use super::status::agent_runs;
 use super::{DataDir, Output, refuse_plain_text, say, tls};
-use crate::call_filter::{self, CallFilter};
-use crate::cgroup::{self, Outlook};
+use crate::config::settings::settle;
 use crate::config::{Config, ConfigError, MqttTransport, parse_server};
-use crate::credential::Credential;
-use crate::effects::chain;
-use crate::fetch::FetchSettings;
-use crate::identity::Identity;
-use crate::installation::{Installation, all_distros};
-use crate::layout::DataDir as Layout;
-use crate::ledger::Ledger;
-use crate::server::{self, Server, ServerError};
-use crate::settings::settle;
-use crate::task_user::{TaskUser, TaskUserError};
-use crate::underlay::{self, UnderlayError};
-use crate::{admission, clock, disk};
+use crate::install::fetch::FetchSettings;
+use crate::process::call_filter::{self, CallFilter};
+use crate::process::cgroup::{self, Outlook};
+use crate::reconcile::admission;
+use crate::setup::installation::{Installation, all_distros};
+use crate::setup::underlay::{self, UnderlayError};
+use crate::system::clock;
+use crate::system::disk;
+use crate::system::error_chain::chain;
+use crate::system::identity::Identity;
+use crate::system::layout::DataDir as Layout;
+use crate::system::task_user::{TaskUser, TaskUserError};
+use crate::task::ledger::Ledger;
+use crate::transfer::credential::Credential;
+use crate::transfer::server::{self, Server, ServerError};
 
 /// How long each answer may take.
 const PATIENCE: Duration = Duration::from_secs(5);

@@ -11,14 +11,14 @@ use task_proto::{MacAddress, RobotName};
 use task_transport::ClientKey;
 
 use super::{DataDir, approval, refuse_plain_text, say, tls};
-use crate::admission;
-use crate::clock;
 use crate::config::{Config, Settings, parse_server};
-use crate::durable;
-use crate::identity::{self, Identity};
-use crate::layout::DataDir as Layout;
-use crate::plan::backoff_ms;
-use crate::server::{self, Sent, Server, ServerError};
+use crate::reconcile::admission;
+use crate::system::clock;
+use crate::system::durable;
+use crate::system::identity::{self, Identity};
+use crate::system::layout::DataDir as Layout;
+use crate::task::plan::backoff_ms;
+use crate::transfer::server::{self, Sent, Server, ServerError};
 
 /// How often the server is asked.
 const TRIES: u32 = 4;

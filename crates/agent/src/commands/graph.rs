@@ -8,8 +8,8 @@ use anyhow::Context as _;
 use task_proto::line::OneLineEach;
 use tokio::net::unix::pipe;
 
-use crate::confinement;
-use crate::graph::serve;
+use crate::process::confinement;
+use crate::ros::graph::serve;
 
 /// What takes more than a moment, and so has a thread of its own: opening the graph, leaving it.
 const MAX_BLOCKING_THREADS: usize = 2;

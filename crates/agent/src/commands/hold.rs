@@ -6,8 +6,8 @@ use std::process::ExitCode;
 use anyhow::Context as _;
 
 use super::DataDir;
-use crate::durable;
-use crate::effects::HOLD_FILE;
+use crate::system::durable;
+use crate::system::layout::HOLD_FILE;
 
 /// Arguments of `hold` and of `release`.
 #[derive(Debug, clap::Args)]

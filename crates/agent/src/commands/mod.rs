@@ -9,7 +9,7 @@ use rustls::ClientConfig;
 use task_proto::CaPin;
 use task_transport::{ClientKey, Trust};
 
-use crate::clock;
+use crate::system::clock;
 
 mod approval;
 pub mod configure;

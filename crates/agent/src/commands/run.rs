@@ -16,26 +16,30 @@ use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
 use super::{DataDir, refuse_plain_text, tls};
-use crate::answers::Answers;
 use crate::config::{Config, parse_server};
-use crate::credential::Credential;
-use crate::driver::{Driver, Speaker};
-use crate::effects::Robot;
-use crate::fetch::{FetchSettings, Fetcher};
-use crate::graph_answers::GraphAnswers;
-use crate::identity::Identity;
-use crate::layout::DataDir as Layout;
-use crate::ledger::{Found, Ledger};
-use crate::link::{self, Heard, Intervals, Message, Shared, Talk};
+use crate::install::fetch::{FetchSettings, Fetcher};
+use crate::link::endpoint;
+use crate::link::mqtt::{self, MqttAccess, Ways};
+use crate::link::rotation::Rotation;
+use crate::link::state::{self, Heard, Intervals, Message, Shared, Talk};
 use crate::logs::Logs;
 use crate::logs::forwarder::Forwarder;
-use crate::mqtt::{self, MqttAccess, Ways};
-use crate::orders::Orders;
-use crate::outputs::Registry;
-use crate::rotation::Rotation;
-use crate::server::{self, Server};
-use crate::vitals::{self, Gauge, Places};
-use crate::{clock, confinement, endpoint, place, process};
+use crate::process::confinement;
+use crate::process::program;
+use crate::reconcile::answers::Answers;
+use crate::reconcile::driver::{Driver, Speaker};
+use crate::reconcile::graph_answers::GraphAnswers;
+use crate::reconcile::orders::Orders;
+use crate::reconcile::robot::Robot;
+use crate::system::clock;
+use crate::system::identity::Identity;
+use crate::system::layout::DataDir as Layout;
+use crate::system::place;
+use crate::task::ledger::{Found, Ledger};
+use crate::telemetry::outputs::Registry;
+use crate::telemetry::vitals::{self, Gauge, Places};
+use crate::transfer::credential::Credential;
+use crate::transfer::server::{self, Server};
 
 /// Messages from the link that the driver has not taken yet.
 const QUEUED_MESSAGES: usize = 16;
@@ -54,7 +58,7 @@ pub struct Arguments {
 /// Runs the agent until SIGINT or SIGTERM.
 pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     start_logging();
-    if let Some(status) = process::collect_orphans_as_init().context("cannot start as process 1")? {
+    if let Some(status) = program::collect_orphans_as_init().context("cannot start as process 1")? {
         return Ok(ExitCode::from(status.as_shell_code()));
     }
     confinement::protect_this_process();
@@ -94,7 +98,7 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
         server_key: identity.server_key.clone(),
         instance: instance.clone(),
         place,
-        boot_id: process::boot_id().context("cannot read the kernel's boot id")?,
+        boot_id: clock::boot_id().context("cannot read the kernel's boot id")?,
         name: config.name.clone(),
         labels: config.labels.clone(),
     };
@@ -106,7 +110,7 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
     let server = Server::new(client, base.clone(), identity.robot_id.clone(), credential.clone());
     let server = server.speaking_as(&instance, place);
     let intervals = Intervals { slow: config.poll_interval, fast: config.poll_interval_without_mqtt };
-    tokio::spawn(link::over_http(server.clone(), shared.clone(), intervals, heard.clone()));
+    tokio::spawn(state::over_http(server.clone(), shared.clone(), intervals, heard.clone()));
     let rotation = Rotation {
         server: server.clone(),
         credential: credential.clone(),

@@ -5,6 +5,6 @@ use std::process::ExitCode;
 
 /// Runs the shim of the run in `dir` until its task has ended.
 pub fn run(dir: &Path) -> anyhow::Result<ExitCode> {
-    crate::shim::run(dir)?;
+    crate::process::shim::run(dir)?;
     Ok(ExitCode::SUCCESS)
 }

@@ -6,10 +6,10 @@ use std::process::ExitCode;
 use serde_json::json;
 
 use super::{DataDir, Output, say};
-use crate::effects::HOLD_FILE;
-use crate::identity::Identity;
-use crate::layout::DataDir as Layout;
-use crate::ledger::{Ledger, TaskRecord};
+use crate::system::identity::Identity;
+use crate::system::layout::DataDir as Layout;
+use crate::system::layout::HOLD_FILE;
+use crate::task::ledger::{Ledger, TaskRecord};
 
 /// Arguments of `status`.
 #[derive(Debug, clap::Args)]

@@ -12,7 +12,7 @@ use task_proto::log::{LogLevel, LogLine, MAX_BATCH_BYTES, MAX_KEPT_LINES};
 use super::line::{Entry, LogFile, Twins};
 use super::record::Record;
 use super::rotated::aged;
-use crate::clock;
+use crate::system::clock;
 
 const CHUNK_BYTES: usize = 64 * 1024;
 /// The longest line that is looked at whole; what the shim writes is shorter.
@@ -209,9 +209,9 @@ mod tests {
     use task_proto::time::timestamp;
 
     use super::*;
+    use crate::logs::LogSpec;
     use crate::logs::record;
     use crate::logs::rotated::RotatedLog;
-    use crate::run_dir::LogSpec;
 
     const DAY_MS: u64 = 86_400_000;
     const NOW_MS: u64 = clock::PROGRAM_EXISTS_SINCE_MS + 100 * DAY_MS;

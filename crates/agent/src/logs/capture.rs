@@ -13,8 +13,8 @@ use task_proto::time::timestamp;
 
 use super::record::{self, MAX_TEXT_BYTES};
 use super::rotated::RotatedLog;
-use crate::clock;
-use crate::run_dir::LogSpec;
+use crate::logs::LogSpec;
+use crate::system::clock;
 
 /// How long the beginning of a line waits for the rest.
 const PARTIAL_TIMEOUT: Duration = Duration::from_secs(1);

@@ -14,9 +14,17 @@ use super::line::{Entry, LogFile, Twins};
 use super::record::Record;
 use super::tail::Tail;
 use super::{Following, files};
-use crate::clock;
-use crate::config::ForwardSettings;
-use crate::layout::DataDir;
+use crate::system::clock;
+use crate::system::layout::DataDir;
+
+/// Which log lines go to the server while nobody follows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ForwardSettings {
+    /// Only these and more serious ones.
+    pub level: LogLevel,
+    /// Lines a second and task.
+    pub lines_per_s: u32,
+}
 
 /// How often the files are looked at.
 const PAUSE: Duration = Duration::from_millis(500);

@@ -8,7 +8,7 @@ use task_proto::log::{LogLine, LogSource};
 
 use super::console;
 use super::record::Record;
-use crate::recent::Recent;
+use crate::system::recent_set::Recent;
 
 /// Lines among which the second of two is looked for.
 const TWIN_WINDOW: usize = 4096;

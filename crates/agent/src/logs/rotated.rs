@@ -10,8 +10,8 @@ use task_proto::log::LogSource;
 use task_proto::time::timestamp;
 
 use super::record;
-use crate::clock;
-use crate::run_dir::LogSpec;
+use crate::logs::LogSpec;
+use crate::system::clock;
 
 /// A log file that is rotated by size.
 #[derive(Debug)]

@@ -155,8 +155,8 @@ mod tests {
     use std::io::Write as _;
 
     use super::*;
+    use crate::logs::LogSpec;
     use crate::logs::rotated::RotatedLog;
-    use crate::run_dir::LogSpec;
 
     fn read(tail: &mut Tail, log: &Path) -> Vec<String> {
         let mut lines = Vec::new();

@@ -9,12 +9,12 @@ use axum::extract::State;
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
-use task_agent::admission::{self, Refused};
-use task_agent::credential::Credential;
-use task_agent::identity::Identity;
-use task_agent::link::{self, Heard, Intervals, Shared};
-use task_agent::rotation::Rotation;
-use task_agent::server::{self, Server, ServerError};
+use task_agent::link::rotation::Rotation;
+use task_agent::link::state::{self, Heard, Intervals, Shared};
+use task_agent::reconcile::admission::{self, Refused};
+use task_agent::system::identity::Identity;
+use task_agent::transfer::credential::Credential;
+use task_agent::transfer::server::{self, Server, ServerError};
 use task_proto::desired::DesiredState;
 use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
 use task_proto::report::{HostFacts, Report};
@@ -67,7 +67,7 @@ async fn answer_canned(State(fake): State<Arc<Fake>>, headers: HeaderMap) -> Res
 
 /// A client that never meets a certificate.
 fn plain_client() -> reqwest::Client {
-    server::client(Trust::System.client_config(task_agent::clock::for_certificates())).unwrap()
+    server::client(Trust::System.client_config(task_agent::system::clock::for_certificates())).unwrap()
 }
 
 fn server(url: &reqwest::Url, robot: &RobotId) -> Server {
@@ -219,7 +219,7 @@ async fn a_report_is_sent_again_until_it_is_stored() {
     };
     shared.reports.send_replace(Some(Arc::new(report)));
     let (heard, mut messages) = mpsc::channel(4);
-    let posting = tokio::spawn(link::post(server(&url, &robot), shared.clone(), heard));
+    let posting = tokio::spawn(state::post(server(&url, &robot), shared.clone(), heard));
     let asked = async {
         while fake.asked_with.lock().unwrap().is_empty() {
             tokio::task::yield_now().await;
@@ -240,7 +240,7 @@ async fn polling_goes_on_after_every_kind_of_answer() {
     let shared = Shared::new(CancellationToken::new());
     let (heard, mut messages) = mpsc::channel(1);
     let intervals = Intervals { slow: Duration::from_millis(20), fast: Duration::from_millis(10) };
-    let polling = tokio::spawn(link::poll(server(&url, &robot), shared.clone(), intervals, heard));
+    let polling = tokio::spawn(state::poll(server(&url, &robot), shared.clone(), intervals, heard));
     let answers = [(200, "text/html", "<html>".to_owned()), sealed(&state(&robot, 1), &key)];
     let mut next = async || tokio::time::timeout(PATIENCE, messages.recv()).await.unwrap().unwrap();
     assert!(matches!(next().await, Heard::TokenRefused(_)));
@@ -268,7 +268,7 @@ async fn an_order_that_nobody_announces_is_found_by_the_poll_also_while_mqtt_is_
     shared.settled.send_replace(true);
     let (heard, mut messages) = mpsc::channel(1);
     let intervals = Intervals { slow: Duration::from_millis(50), fast: Duration::from_secs(3600) };
-    let polling = tokio::spawn(link::poll(server(&url, &robot), shared.clone(), intervals, heard));
+    let polling = tokio::spawn(state::poll(server(&url, &robot), shared.clone(), intervals, heard));
     let mut next = async || tokio::time::timeout(PATIENCE, messages.recv()).await.unwrap().unwrap();
     assert!(matches!(next().await, Heard::Desired { .. }));
     fake.set((304, "application/json", String::new()));
@@ -306,7 +306,7 @@ async fn a_state_is_sent_once_and_again_only_to_a_robot_that_does_not_keep_to_it
     let (heard, mut messages) = mpsc::channel(1);
     let never = Duration::from_secs(3600);
     let polling =
-        tokio::spawn(link::poll(server(&url, &robot), shared.clone(), Intervals { slow: never, fast: never }, heard));
+        tokio::spawn(state::poll(server(&url, &robot), shared.clone(), Intervals { slow: never, fast: never }, heard));
     let mut next = async || tokio::time::timeout(PATIENCE, messages.recv()).await.unwrap().unwrap();
     assert!(matches!(next().await, Heard::Desired { .. }));
 

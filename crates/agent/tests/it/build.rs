@@ -5,16 +5,20 @@ use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::PathBuf;
 use std::time::Duration;
 
-use task_agent::builder::{self, BuildError, BuildLimits, BuildOrder};
-use task_agent::cgroup::{Cgroups, RunLimits};
-use task_agent::installation::RosVersion;
-use task_agent::launch::Interrupt;
-use task_agent::layout::DataDir;
-use task_agent::process::ExitStatus;
-use task_agent::run_dir::{LogSpec, RunSpec};
-use task_agent::supervisor::Observed;
-use task_agent::underlay::{self, Places};
-use task_agent::{environment, process, script, work_dir};
+use task_agent::install::builder::{self, BuildError, BuildLimits, BuildOrder};
+use task_agent::install::work_dir;
+use task_agent::logs::LogSpec;
+use task_agent::process::cgroup::{Cgroups, RunLimits};
+use task_agent::process::program;
+use task_agent::process::program::ExitStatus;
+use task_agent::process::run_dir::RunSpec;
+use task_agent::process::supervisor::Observed;
+use task_agent::setup::environment;
+use task_agent::setup::installation::RosVersion;
+use task_agent::setup::launch::Interrupt;
+use task_agent::setup::script;
+use task_agent::setup::underlay::{self, Places};
+use task_agent::system::layout::DataDir;
 use task_proto::Digest;
 use task_proto::manifest::{BuildTool, TaskManifest};
 use task_proto::report::FailureCode;
@@ -72,7 +76,7 @@ impl TestBuild {
     /// The processes that were started for this build.
     fn processes(&self) -> usize {
         let marker = format!("TASKD_RUN_DIR={}", self.order.version.root().display());
-        let table = process::ProcessEntry::all().expect("process table");
+        let table = program::ProcessEntry::all().expect("process table");
         table.iter().filter(|entry| !entry.is_zombie && entry.was_started_with(&marker)).count()
     }
 }
@@ -342,7 +346,7 @@ async fn a_process_that_got_away_from_a_build_holds_nobody_up() {
     let build = TestBuild::with_colcon(ESCAPE);
     let error = build.run().await.expect_err("colcon failed");
     let pid = std::fs::read_to_string(build.order.version.root().join("escaped")).expect("its pid");
-    let escaped = process::ProcessIdentity::of(pid.trim().parse().expect("a pid")).expect("process table");
+    let escaped = program::ProcessIdentity::of(pid.trim().parse().expect("a pid")).expect("process table");
     escaped.expect("it still lives").signal(nix::sys::signal::Signal::SIGKILL).expect("killed");
     assert!(matches!(error, BuildError::Failed { status: ExitStatus::Code(3), .. }), "{error:?}");
 }

@@ -6,12 +6,12 @@ use std::os::unix::process::CommandExt as _;
 use std::time::Duration;
 
 use nix::sys::signal::Signal;
-use task_agent::cgroup::{Cgroups, RunLimits};
-use task_agent::containment::RUN_DIR_VARIABLE;
-use task_agent::process::{ExitStatus, ProcessEntry};
-use task_agent::run_dir::RunDir;
-use task_agent::supervisor::Observed;
-use task_agent::task_user::{TaskUser, take_back};
+use task_agent::process::cgroup::{Cgroups, RunLimits};
+use task_agent::process::containment::RUN_DIR_VARIABLE;
+use task_agent::process::program::{ExitStatus, ProcessEntry};
+use task_agent::process::run_dir::RunDir;
+use task_agent::process::supervisor::Observed;
+use task_agent::system::task_user::{TaskUser, take_back};
 
 use crate::harness::{TestRun, eventually, lives, other_user, supervisor, within};
 
@@ -114,7 +114,7 @@ async fn nothing_outlives_a_task_that_ends_by_itself() {
     for run in [TestRun::of(&script), TestRun::grouped(&script)] {
         let task = start(&run).await;
         let pids = runaways(&run).await;
-        let task = task_agent::process::ProcessIdentity::of(task).expect("stat").expect("alive");
+        let task = task_agent::process::program::ProcessIdentity::of(task).expect("stat").expect("alive");
         task.signal(Signal::SIGKILL).expect("killed");
         let ended = within("the end", run.supervisor.wait(&run.run_dir())).await.expect("observed");
         assert_eq!(ended, Observed::Exited(ExitStatus::Signal(9)));

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::Stdio;
 
 use serde_json::{Value, json};
-use task_agent::ledger::{Accepted, Ledger};
+use task_agent::task::ledger::{Accepted, Ledger};
 use task_proto::desired::DesiredState;
 use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
 use task_proto::{CaPin, Generation, RobotId};

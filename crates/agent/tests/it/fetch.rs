@@ -5,8 +5,8 @@ use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use axum::body::Bytes;
-use task_agent::fetch::{FetchError, FetchSettings, Fetcher};
-use task_agent::link_meter::LinkMeter;
+use task_agent::install::fetch::{FetchError, FetchSettings, Fetcher};
+use task_agent::transfer::link_meter::LinkMeter;
 use task_proto::Digest;
 use task_proto::manifest::ContentFacts;
 use task_proto::report::{FailureCode, Progress};
@@ -369,7 +369,7 @@ async fn too_little_room_is_said_before_anything_travels() {
     let site = Site::with(&tar(), FetchSettings { reserve_bytes: u64::MAX, ..settings() }).await;
     let error = site.pull().await.unwrap_err();
     assert_eq!((error.code(), error.is_retryable()), (Some(FailureCode::DISK_FULL), true));
-    assert_eq!(error.retry_after(), Some(task_agent::disk::FULL_PAUSE));
+    assert_eq!(error.retry_after(), Some(task_agent::system::disk::FULL_PAUSE));
     assert!(error.to_string().contains("in reserve"), "{error}");
     assert_eq!(site.asked(), [0; 0]);
 

@@ -6,9 +6,9 @@ use std::path::Path;
 use std::time::Duration;
 
 use task_agent::config::{GateConfig, GateDefault};
-use task_agent::containment::Containment;
-use task_agent::gate::Gate;
-use task_agent::ledger::{GateQuestion, GateStep};
+use task_agent::process::containment::Containment;
+use task_agent::reconcile::gate::Gate;
+use task_agent::task::ledger::{GateQuestion, GateStep};
 use task_proto::report::Failure;
 use task_proto::{DeploymentId, RobotId, TaskName};
 

@@ -1,6 +1,6 @@
 //! The graph against real rclpy nodes. Each test has a domain of its own, and nothing leaves this host.
 
-use task_agent::graph::{DiagnosticLevel, Graph, GraphError, GraphSettings, Node, ParameterValue, Snapshot};
+use task_agent::ros::graph::{DiagnosticLevel, Graph, GraphError, GraphSettings, Node, ParameterValue, Snapshot};
 use task_proto::log::LogLevel;
 use task_proto::ros::{Endpoint, LifecycleState, Transition};
 
@@ -165,7 +165,7 @@ async fn rates_are_counted_of_reliable_and_of_best_effort_publishers() {
     .await;
     node.leave().await;
     eventually("both topics silent", || (chatter.rate().hz == 0.0 && scan.rate().hz == 0.0).then_some(())).await;
-    assert!(chatter.rate().since_last > Some(task_agent::graph::rate::WINDOW));
+    assert!(chatter.rate().since_last > Some(task_agent::ros::graph::rate::WINDOW));
     assert!(matches!(graph.rate(&name("/scan"), "String"), Err(GraphError::Kind(_))));
 }
 

@@ -6,10 +6,10 @@ use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use task_agent::graph::program::MEMORY_BYTES;
-use task_agent::graph::{Graph, GraphError, ParameterValue};
-use task_agent::graph_access::GraphAccess;
-use task_agent::layout::DataDir;
+use task_agent::ros::graph::program::MEMORY_BYTES;
+use task_agent::ros::graph::{Graph, GraphError, ParameterValue};
+use task_agent::ros::graph_access::GraphAccess;
+use task_agent::system::layout::DataDir;
 use task_proto::report::{FailureCode, RosFacts};
 
 use crate::harness::{eventually, lives, within};

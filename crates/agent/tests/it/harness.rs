@@ -7,15 +7,16 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
-use task_agent::cgroup::{Cgroups, RunLimits};
-use task_agent::containment::Containment;
-use task_agent::environment;
-use task_agent::launch::Interrupt;
+use task_agent::logs::LogSpec;
 use task_agent::logs::record::Record;
-use task_agent::process::ProcessEntry;
-use task_agent::run_dir::{LogSpec, RunDir, RunSpec};
-use task_agent::supervisor::Supervisor;
-use task_agent::task_user::TaskUser;
+use task_agent::process::cgroup::{Cgroups, RunLimits};
+use task_agent::process::containment::Containment;
+use task_agent::process::program::ProcessEntry;
+use task_agent::process::run_dir::{RunDir, RunSpec};
+use task_agent::process::supervisor::Supervisor;
+use task_agent::setup::environment;
+use task_agent::setup::launch::Interrupt;
+use task_agent::system::task_user::TaskUser;
 
 /// Longer than anything here takes on a loaded machine.
 const DEADLINE: Duration = Duration::from_secs(60);

@@ -5,7 +5,7 @@ use std::process::{Child, Stdio};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use task_agent::process::ProcessEntry;
+use task_agent::process::program::ProcessEntry;
 
 use crate::doctor::write_identity;
 use crate::harness::eventually;

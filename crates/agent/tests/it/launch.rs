@@ -5,10 +5,11 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use task_agent::layout::{DataDir, VersionDir};
-use task_agent::process::ExitStatus;
-use task_agent::supervisor::Observed;
-use task_agent::{launch, script};
+use task_agent::process::program::ExitStatus;
+use task_agent::process::supervisor::Observed;
+use task_agent::setup::launch;
+use task_agent::setup::script;
+use task_agent::system::layout::{DataDir, VersionDir};
 use task_proto::Digest;
 use task_proto::manifest::TaskManifest;
 
@@ -157,7 +158,8 @@ async fn a_launcher_that_dies_leaves_no_node() {
     let launched = Launched::by(&LAUNCHER.replace("text=True)", "text=True, start_new_session=True)"), &[]);
     launched.start().await;
     launched.run.wrote("launched").await;
-    let started = task_agent::run_dir::RunDir::create(&launched.run.run_dir()).expect("dir").started().expect("read");
+    let started =
+        task_agent::process::run_dir::RunDir::create(&launched.run.run_dir()).expect("dir").started().expect("read");
     started.expect("started").task.signal(nix::sys::signal::Signal::SIGKILL).expect("killed");
     let ended = within("the end", launched.run.supervisor.wait(&launched.run.run_dir())).await.expect("observed");
     assert_eq!(ended, Observed::Exited(ExitStatus::Signal(9)));

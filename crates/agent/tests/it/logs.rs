@@ -1,9 +1,10 @@
 //! What real nodes say on ROS topics is kept with the task whose process said it.
 
-use task_agent::graph_access::GraphAccess;
-use task_agent::layout::DataDir;
+use task_agent::logs::Logs;
 use task_agent::logs::archive::Wanted;
-use task_agent::logs::{Logs, ros};
+use task_agent::ros::graph_access::GraphAccess;
+use task_agent::ros::node_logs;
+use task_agent::system::layout::DataDir;
 use task_proto::log::{LogLevel, LogLine, LogSource};
 use task_proto::report::RosFacts;
 
@@ -21,7 +22,7 @@ async fn what_nodes_say_is_kept_with_their_task() {
     std::fs::create_dir_all(task.logs()).unwrap();
     let run_dir = task.run().join("1");
     let graph = open(118).await;
-    let keeping = tokio::spawn(ros::keep(graph.clone(), data.clone(), None));
+    let keeping = tokio::spawn(node_logs::keep(graph.clone(), data.clone(), None));
     let in_namespace = |namespace| ["--ros-args", "-r", namespace];
     let environment = [("TASKD_RUN_DIR", run_dir.as_path())];
     let mut ours = RosNode::start_with("talker.py", 118, &in_namespace("__ns:=/ours"), &environment).await;

@@ -10,7 +10,7 @@ use axum::body::{Body, to_bytes};
 use axum::extract::Request;
 use axum::response::Response;
 use http::Method;
-use task_agent::outputs::{OutputError, OutputOrder, Registry, bring_back};
+use task_agent::telemetry::outputs::{OutputError, OutputOrder, Registry, bring_back};
 use task_proto::Digest;
 use task_proto::report::Progress;
 use tempfile::TempDir;

@@ -4,12 +4,13 @@ use std::fs;
 use std::sync::Arc;
 use std::time::Duration;
 
-use task_agent::clock;
 use task_agent::config::MqttTransport;
-use task_agent::credential::Credential;
-use task_agent::fetch::{Asks, FetchError, FetchSettings, PartPatience};
-use task_agent::link::{Shared, Talk};
-use task_agent::mqtt::{self, MqttAccess, Ways};
+use task_agent::install::fetch::{FetchError, FetchSettings, PartPatience};
+use task_agent::link::mqtt::{self, MqttAccess, Ways};
+use task_agent::link::state::{Shared, Talk};
+use task_agent::system::clock;
+use task_agent::transfer::credential::Credential;
+use task_agent::transfer::parts::Asks;
 use task_proto::part::{Cut, Part, PartRange};
 use task_proto::report::{Progress, Status};
 use task_proto::topic::{Topic, TopicPrefix};
@@ -275,7 +276,7 @@ async fn a_subscription_that_is_refused_is_tried_again_and_not_for_ever() {
 #[tokio::test]
 async fn without_a_session_it_is_pulled_at_once_and_a_short_loss_is_waited_out() {
     let site = Site::with(&tar(), patient()).await;
-    let listening = task_agent::parts::Listening::default();
+    let listening = task_agent::transfer::parts::Listening::default();
     listening.session(false);
     let (progress, asks) = (watch::Sender::new(Progress { done: 0, total: 0 }), watch::Sender::default());
     let cancel = CancellationToken::new();

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::Duration;
 
-use task_agent::graph::{Graph, GraphProgram, GraphSettings};
+use task_agent::ros::graph::{Graph, GraphProgram, GraphSettings};
 use task_proto::ros::GraphName;
 use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader};
 use tokio::process::{Child, ChildStdin, ChildStdout, Command};

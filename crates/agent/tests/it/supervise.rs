@@ -6,10 +6,10 @@ use std::time::Duration;
 
 use nix::sys::signal::{SigHandler, Signal};
 use nix::unistd::Pid;
-use task_agent::process::ExitStatus;
-use task_agent::process::ProcessIdentity;
-use task_agent::run_dir::{RunDir, RunSpec, Started};
-use task_agent::supervisor::{Observed, SupervisorError};
+use task_agent::process::program::ExitStatus;
+use task_agent::process::program::ProcessIdentity;
+use task_agent::process::run_dir::{RunDir, RunSpec, Started};
+use task_agent::process::supervisor::{Observed, SupervisorError};
 
 use crate::harness::{TestRun, eventually, lives, supervisor, within};
 

@@ -71,7 +71,7 @@ pub async fn within<T>(patience: Duration, mut ask: impl AsyncFnMut() -> Option<
 fn client(pin: Option<CaPin>) -> reqwest::Client {
     // For clients that a test makes itself. A second install is refused because the first is in place.
     let _ = rustls::crypto::ring::default_provider().install_default();
-    let tls = Trust::by(pin).client_config(task_agent::clock::for_certificates());
+    let tls = Trust::by(pin).client_config(task_agent::system::clock::for_certificates());
     let client = reqwest::Client::builder().timeout(Duration::from_secs(20)).tls_backend_preconfigured(tls);
     client.build().expect("client")
 }
@@ -514,6 +514,7 @@ fn log_file(path: &Path) -> File {
 
 /// A request in the name of a robot, as its agent makes it after a restart in the data directory `data`.
 pub fn from_restarted_agent(request: reqwest::RequestBuilder, data: &Path) -> reqwest::RequestBuilder {
-    let place = std::fs::File::open(data.join("lock")).and_then(|lock| task_agent::place::of(&lock)).expect("a place");
+    let place =
+        std::fs::File::open(data.join("lock")).and_then(|lock| task_agent::system::place::of(&lock)).expect("a place");
     request.header(INSTANCE_HEADER, InstanceId::random().as_str()).header(PLACE_HEADER, place.to_string())
 }

@@ -1,0 +1,428 @@
+//! Whom this robot trusts to publish packages: what its settings say, and after that the newest list of publishers it was
+//! shown, which is kept on the disk. It judges lists and packages; it fetches nothing, and the server has no say in it.
+
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::{PoisonError, RwLock, RwLockReadGuard};
+
+use serde::{Deserialize, Serialize};
+use task_proto::Digest;
+use task_proto::desired::PackageRef;
+use task_proto::envelope::Envelope;
+use task_proto::publisher::{
+    MAX_LIST_BYTES, MAX_SIGNATURE_BYTES, MAX_SIGNATURES, PublisherList, Refused, Role, Unsigned, vouching,
+};
+use task_proto::report::{Failure, FailureCode};
+
+use crate::system::clock::PROGRAM_EXISTS_SINCE_MS;
+use crate::system::durable;
+use crate::system::untrusted_file;
+
+/// Whom the robot's settings trust.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct TrustSettings {
+    /// Who may publish until a list says otherwise.
+    pub publishers: Role,
+    /// Who may make the first list.
+    pub keepers: Role,
+    /// Nothing is run before there is one.
+    pub requires_list: bool,
+}
+
+/// What is to be done with a package.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Use {
+    /// It is new here.
+    Begin,
+    /// It has run here, and is started again.
+    GoOn,
+}
+
+/// Why a package is not run.
+#[derive(Debug, thiserror::Error)]
+pub enum Distrust {
+    /// Too few have signed it.
+    #[error(transparent)]
+    Unsigned(#[from] Unsigned),
+    /// The publishers have taken it back.
+    #[error("version {0} of the list of publishers withdraws it")]
+    Withdrawn(u64),
+    /// Somebody may be keeping a newer list from the robot.
+    #[error("version {version} of the list of publishers, the newest this robot was shown, has expired")]
+    Expired {
+        /// Of the list.
+        version: u64,
+    },
+    /// What list counted can't be told any more, and to go by the settings could be to go back.
+    #[error("the list of publishers in {path} can't be read: only a person can remove it")]
+    Unreadable {
+        /// The file.
+        path: PathBuf,
+    },
+    /// There must be a list and is none.
+    #[error("trusted_publishers.require_list is set, and this robot was shown no list of publishers")]
+    NoList,
+}
+
+impl Distrust {
+    /// It as a failure of what `package` was ordered for.
+    pub fn failure(&self, package: &PackageRef) -> Failure {
+        let code = if self.may_pass() { FailureCode::PUBLISHERS_EXPIRED } else { FailureCode::UNTRUSTED_PACKAGE };
+        Failure::new(code, format!("{} {} may not run here: {self}", package.name, package.version))
+    }
+
+    /// Whether a newer list alone, which may come at any time, sets it right.
+    pub fn may_pass(&self) -> bool {
+        matches!(self, Self::Expired { .. } | Self::NoList)
+    }
+}
+
+/// Why a list was not taken over.
+#[derive(Debug, thiserror::Error)]
+pub enum NotTaken {
+    /// It does not follow the one that counts.
+    #[error(transparent)]
+    Refused(#[from] Refused),
+    /// It could not be kept, and what is forgotten at the next start must not count now.
+    #[error("the list can't be kept")]
+    Disk(#[source] io::Error),
+}
+
+/// Whom a robot trusts.
+pub struct Trust {
+    settings: TrustSettings,
+    path: PathBuf,
+    /// Whether there is a list at `path` that can't be read.
+    is_unreadable: bool,
+    list: RwLock<Option<Counting>>,
+}
+
+/// The list that counts.
+struct Counting {
+    list: PublisherList,
+    /// Of the bytes it came in.
+    digest: Digest,
+}
+
+/// The file's content.
+#[derive(Serialize, Deserialize)]
+struct Kept {
+    /// The list as it was signed.
+    envelope: Envelope,
+    /// What it was fetched by.
+    digest: Digest,
+    /// The settings under which it was taken over.
+    settings: TrustSettings,
+}
+
+impl Trust {
+    /// What `settings` say, and the list at `path` if one was kept there.
+    pub fn open(settings: TrustSettings, path: PathBuf) -> Self {
+        let list = match untrusted_file::read(&path, 2 * MAX_LIST_BYTES) {
+            Ok(bytes) => Kept::read(&bytes).and_then(|kept| kept.list(&settings)),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+            Err(error) => Err(error),
+        };
+        if let Err(error) = &list {
+            tracing::error!(path = %path.display(), %error, "the list of publishers can't be read: nothing is run");
+        }
+        Self { settings, path, is_unreadable: list.is_err(), list: RwLock::new(list.unwrap_or_default()) }
+    }
+
+    /// The version of the list that counts; 0: the settings do.
+    pub fn version(&self) -> u64 {
+        self.list().as_ref().map_or(0, |counting| counting.list.version)
+    }
+
+    /// The digest of the list that counts.
+    pub fn counting(&self) -> Option<Digest> {
+        self.list().as_ref().map(|counting| counting.digest)
+    }
+
+    /// Takes over a list, which came in bytes of this digest, if it may follow the one that counts.
+    pub fn take(&self, envelope: &Envelope, digest: Digest) -> Result<(), NotTaken> {
+        if self.is_unreadable {
+            return Err(NotTaken::Disk(io::Error::other("there is one that can't be read")));
+        }
+        // Held over the write to the disk: lists are taken one after another.
+        let mut current = self.list.write().unwrap_or_else(PoisonError::into_inner);
+        let (keepers, version) =
+            current.as_ref().map_or((&self.settings.keepers, 0), |Counting { list, .. }| (&list.keepers, list.version));
+        let list = PublisherList::follow(envelope, keepers, version)?;
+        let kept = Kept { envelope: envelope.clone(), digest, settings: self.settings.clone() };
+        let bytes = serde_json::to_vec(&kept).map_err(|error| NotTaken::Disk(error.into()))?;
+        durable::write(&self.path, &bytes, 0o600).map_err(NotTaken::Disk)?;
+        *current = Some(Counting { list, digest });
+        Ok(())
+    }
+
+    /// Those of `envelopes` by which `package` may be used so; or why it may not.
+    pub fn judge<'a>(
+        &self,
+        package: &PackageRef,
+        envelopes: &'a [Envelope],
+        purpose: Use,
+        wall_ms: u64,
+    ) -> Result<Vec<&'a Envelope>, Distrust> {
+        if self.is_unreadable {
+            return Err(Distrust::Unreadable { path: self.path.clone() });
+        }
+        let list = self.list();
+        let Some(Counting { list, .. }) = &*list else {
+            if self.settings.requires_list {
+                return Err(Distrust::NoList);
+            }
+            return Ok(vouching(&self.settings.publishers, package, envelopes)?);
+        };
+        if list.withdrawn.contains(&package.manifest.digest) {
+            return Err(Distrust::Withdrawn(list.version));
+        }
+        let counted = vouching(&list.publishers, package, envelopes)?;
+        if purpose == Use::Begin && is_over(list, wall_ms) {
+            return Err(Distrust::Expired { version: list.version });
+        }
+        Ok(counted)
+    }
+
+    /// Whether the lifetime of the list that counts is over.
+    pub fn is_over(&self, wall_ms: u64) -> bool {
+        self.list().as_ref().is_some_and(|Counting { list, .. }| is_over(list, wall_ms))
+    }
+
+    fn list(&self) -> RwLockReadGuard<'_, Option<Counting>> {
+        // A list is put in its place whole.
+        self.list.read().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Kept {
+    fn read(bytes: &[u8]) -> io::Result<Self> {
+        Ok(serde_json::from_slice(bytes)?)
+    }
+
+    /// The list, if it counts under `settings`. A person who changes them has the last word: then it counts only if those
+    /// who keep the lists now have signed it.
+    fn list(&self, settings: &TrustSettings) -> io::Result<Option<Counting>> {
+        let list = if self.settings.keepers == settings.keepers {
+            Some(PublisherList::unverified(&self.envelope).map_err(io::Error::other)?)
+        } else {
+            PublisherList::follow(&self.envelope, &settings.keepers, 0).ok()
+        };
+        Ok(list.map(|list| Counting { list, digest: self.digest }))
+    }
+}
+
+/// As with desired states: a clock that shows a time before this program existed is wrong and locks nobody out.
+fn is_over(list: &PublisherList, wall_ms: u64) -> bool {
+    wall_ms >= PROGRAM_EXISTS_SINCE_MS && list.is_expired(wall_ms)
+}
+
+/// The envelopes kept about a package; none if there are none that can be read.
+pub fn read_signatures(path: &Path) -> Vec<Envelope> {
+    let bytes = untrusted_file::read(path, (MAX_SIGNATURES as u64 + 1) * MAX_SIGNATURE_BYTES).unwrap_or_default();
+    serde_json::from_slice(&bytes).unwrap_or_default()
+}
+
+/// Keeps the envelopes about a package.
+pub fn write_signatures(path: &Path, envelopes: &[&Envelope]) -> io::Result<()> {
+    if let Some(parent) = path.parent() {
+        durable::create_dir_all(parent)?;
+    }
+    durable::write(path, &serde_json::to_vec(envelopes)?, 0o600)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use task_proto::desired::BlobRef;
+    use task_proto::envelope::SigningKey;
+    use task_proto::publisher::{LIST_TYPE, PackageStatement};
+
+    use super::*;
+
+    const NOW_MS: u64 = PROGRAM_EXISTS_SINCE_MS + 1_000_000;
+
+    fn key(seed: u8) -> SigningKey {
+        SigningKey::from_bytes([seed; 32])
+    }
+
+    fn role(seeds: &[u8]) -> Role {
+        Role::new(seeds.iter().map(|seed| key(*seed).public_key()).collect(), 1).expect("a role")
+    }
+
+    fn package(name: &str) -> PackageRef {
+        let blob = |part: &str| BlobRef::of(format!("{name} {part}").as_bytes());
+        PackageRef {
+            name: name.parse().expect("valid"),
+            version: "1.0".parse().expect("valid"),
+            manifest: blob("manifest"),
+            config: blob("config"),
+            content: blob("content"),
+        }
+    }
+
+    fn signed(seed: u8, package: &PackageRef) -> Vec<Envelope> {
+        vec![PackageStatement { package: package.clone() }.seal(&key(seed))]
+    }
+
+    /// A list of publishers with one key each for the publishers and the keepers.
+    fn list(version: u64, publisher: u8, keeper: u8) -> PublisherList {
+        PublisherList {
+            version,
+            issued_at_ms: NOW_MS - 1000,
+            expires_at_ms: NOW_MS + 1000,
+            publishers: role(&[publisher]),
+            keepers: role(&[keeper]),
+            withdrawn: Vec::new(),
+        }
+    }
+
+    struct Robot {
+        trust: Trust,
+        dir: tempfile::TempDir,
+    }
+
+    impl Robot {
+        /// Publisher 1 and keeper 2, by the settings.
+        fn new() -> Self {
+            let dir = tempfile::tempdir().expect("a directory");
+            Self { trust: Self::open(&dir, 1, 2, false), dir }
+        }
+
+        fn open(dir: &tempfile::TempDir, publisher: u8, keeper: u8, requires_list: bool) -> Trust {
+            let settings = TrustSettings { publishers: role(&[publisher]), keepers: role(&[keeper]), requires_list };
+            Trust::open(settings, dir.path().join("publishers.json"))
+        }
+
+        fn take(&self, envelope: &Envelope) -> Result<(), NotTaken> {
+            self.trust.take(envelope, Digest::of(&serde_json::to_vec(envelope).expect("json")))
+        }
+
+        fn restart(&mut self) {
+            self.trust = Self::open(&self.dir, 1, 2, false);
+        }
+
+        fn judge(&self, seed: u8, purpose: Use, wall_ms: u64) -> Result<usize, String> {
+            let talker = package("talker");
+            let envelopes = signed(seed, &talker);
+            let judged = self.trust.judge(&talker, &envelopes, purpose, wall_ms);
+            judged.map(|counted| counted.len()).map_err(|distrust| distrust.failure(&talker).code.as_str().to_owned())
+        }
+
+        fn trusts(&self, seed: u8) -> bool {
+            self.judge(seed, Use::Begin, NOW_MS).is_ok()
+        }
+    }
+
+    #[test]
+    fn keys_are_rotated_and_revoked_by_a_list_and_stay_so_after_a_restart() {
+        let mut robot = Robot::new();
+        assert!(robot.trusts(1) && !robot.trusts(3));
+        robot.take(&list(1, 3, 2).seal(&key(2))).expect("follows");
+        for _ in 0..2 {
+            assert!(!robot.trusts(1) && robot.trusts(3));
+            assert_eq!(robot.judge(1, Use::GoOn, NOW_MS), Err("untrusted_package".to_owned()), "nor started again");
+            assert_eq!(robot.trust.version(), 1);
+            robot.restart();
+        }
+        // The publisher is not the keeper, nor is one who kept it before.
+        assert!(matches!(robot.take(&list(2, 9, 9).seal(&key(3))), Err(NotTaken::Refused(_))));
+        let mut handed_on = list(2, 4, 5).seal(&key(2));
+        handed_on.sign_also(LIST_TYPE, &key(5)).expect("signed");
+        robot.take(&handed_on).expect("follows");
+        robot.restart();
+        assert!(matches!(robot.take(&list(3, 1, 2).seal(&key(2))), Err(NotTaken::Refused(_))));
+        robot.take(&list(7, 6, 5).seal(&key(5))).expect("versions may be left out");
+        assert!(robot.trusts(6) && !robot.trusts(4));
+    }
+
+    #[test]
+    fn a_rollback_to_an_older_list_is_refused_also_after_a_restart() {
+        let mut robot = Robot::new();
+        let (old, new) = (list(1, 1, 2).seal(&key(2)), list(2, 3, 2).seal(&key(2)));
+        robot.take(&old).expect("follows");
+        robot.take(&new).expect("follows");
+        for _ in 0..2 {
+            let refused = robot.take(&old);
+            assert!(matches!(refused, Err(NotTaken::Refused(Refused::NotNewer { offered: 1, known: 2 }))));
+            assert!(robot.take(&new).is_err() && robot.trust.counting().is_some());
+            let forked = list(2, 1, 2).seal(&key(2));
+            assert!(robot.take(&forked).is_err(), "another of the same version");
+            assert!(!robot.trusts(1));
+            robot.restart();
+        }
+    }
+
+    #[test]
+    fn a_freeze_ends_with_the_lists_lifetime() {
+        let robot = Robot::new();
+        robot.take(&list(1, 3, 2).seal(&key(2))).expect("follows");
+        assert_eq!(robot.judge(3, Use::Begin, NOW_MS + 999), Ok(1));
+        assert_eq!(robot.judge(3, Use::Begin, NOW_MS + 1000), Err("publishers_expired".to_owned()));
+        assert_eq!(robot.judge(3, Use::GoOn, NOW_MS + 1000), Ok(1), "what runs goes on");
+        assert_eq!(robot.judge(9, Use::Begin, NOW_MS + 1000), Err("untrusted_package".to_owned()));
+        // A clock that can't be right.
+        assert_eq!(robot.judge(3, Use::Begin, 0), Ok(1));
+        let renewed = PublisherList { expires_at_ms: NOW_MS + 9000, ..list(2, 3, 2) };
+        robot.take(&renewed.seal(&key(2))).expect("follows");
+        assert_eq!(robot.judge(3, Use::Begin, NOW_MS + 1000), Ok(1));
+    }
+
+    #[test]
+    fn without_a_list_that_it_must_have_a_robot_runs_nothing() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let robot = Robot { trust: Robot::open(&dir, 1, 2, true), dir };
+        for purpose in [Use::Begin, Use::GoOn] {
+            assert_eq!(robot.judge(1, purpose, NOW_MS), Err("publishers_expired".to_owned()));
+        }
+        robot.take(&list(1, 1, 2).seal(&key(2))).expect("follows");
+        assert!(robot.trusts(1));
+    }
+
+    #[test]
+    fn a_withdrawn_package_is_not_run_whoever_signed_it() {
+        let robot = Robot::new();
+        let withdrawn = vec![Digest::of(b"talker manifest")];
+        let list = PublisherList { withdrawn, ..list(1, 1, 2) };
+        robot.take(&list.seal(&key(2))).expect("follows");
+        for purpose in [Use::Begin, Use::GoOn] {
+            assert_eq!(robot.judge(1, purpose, NOW_MS), Err("untrusted_package".to_owned()));
+        }
+        let other = package("other");
+        assert!(robot.trust.judge(&other, &signed(1, &other), Use::Begin, NOW_MS).is_ok());
+    }
+
+    #[test]
+    fn whoever_changes_the_settings_has_the_last_word() {
+        let robot = Robot::new();
+        robot.take(&list(5, 3, 2).seal(&key(2))).expect("follows");
+        // Other publishers, the same keeper: the list still counts, and so does its version.
+        let trust = Robot::open(&robot.dir, 9, 2, false);
+        assert_eq!(trust.version(), 5);
+        // Another keeper: it does not.
+        assert_eq!(Robot::open(&robot.dir, 1, 7, false).version(), 0);
+    }
+
+    #[test]
+    fn a_list_that_can_not_be_kept_or_read_does_not_count_nor_does_what_was_before() {
+        let mut robot = Robot::new();
+        let path = robot.dir.path().join("publishers.json");
+        fs::create_dir(path.with_extension("json.tmp")).expect("in the way");
+        assert!(matches!(robot.take(&list(1, 3, 2).seal(&key(2))), Err(NotTaken::Disk(_))));
+        assert_eq!((robot.trust.version(), robot.trusts(3)), (0, false));
+        fs::write(&path, "{").expect("written");
+        robot.restart();
+        assert!(!robot.trusts(1) && robot.take(&list(1, 3, 2).seal(&key(2))).is_err());
+    }
+
+    #[test]
+    fn signatures_are_kept_beside_their_version() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let path = dir.path().join("tasks/talker/x.signatures");
+        assert!(read_signatures(&path).is_empty());
+        let envelopes = signed(1, &package("talker"));
+        write_signatures(&path, &envelopes.iter().collect::<Vec<_>>()).expect("written");
+        assert_eq!(read_signatures(&path), envelopes);
+    }
+}

@@ -1,0 +1,222 @@
+//! What was unpacked and built of a version, as one digest for each tree. It is noted beside the version's directory, where
+//! only the agent writes, and compared before each start: what runs is what came with the signed package. A digest covers
+//! the names, kinds, contents, link targets and execute bits of all entries, not their owners and times.
+
+use std::ffi::OsString;
+use std::fs::{self, File};
+use std::io::{self, Read as _};
+use std::os::unix::ffi::OsStrExt as _;
+use std::os::unix::fs::PermissionsExt as _;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+use sha2::{Digest as _, Sha256};
+use task_proto::Digest;
+
+use crate::system::durable;
+use crate::system::layout::VersionDir;
+use crate::system::task_user;
+use crate::system::untrusted_file;
+
+/// The longest note that is read.
+const MAX_BYTES: u64 = 64 * 1024;
+/// How deep a tree may be.
+const MAX_DEPTH: usize = task_user::MAX_DEPTH;
+
+/// The digests of a version's trees.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Seal {
+    /// Of the unpacked package.
+    src: Digest,
+    /// Of what was built; absent: nothing was.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    install: Option<Digest>,
+}
+
+/// What does not agree with a seal.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Broken {
+    /// The unpacked package.
+    Source,
+    /// What was built.
+    Install,
+}
+
+impl Seal {
+    /// The seal of what is on the disk.
+    pub fn of(version: &VersionDir) -> io::Result<Self> {
+        let install = match tree(&version.install()) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => None,
+            digest => Some(digest?),
+        };
+        Ok(Self { src: tree(&version.src())?, install })
+    }
+
+    /// The seal that was noted at `path`. One that can't be understood is none that anything agrees with.
+    pub fn read(path: &Path) -> io::Result<Option<Result<Self, serde_json::Error>>> {
+        match untrusted_file::read(path, MAX_BYTES) {
+            Ok(bytes) => Ok(Some(serde_json::from_slice(&bytes))),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// Notes it at `path`.
+    pub fn write(&self, path: &Path) -> io::Result<()> {
+        durable::write(path, &serde_json::to_vec(self)?, 0o600)
+    }
+
+    /// What of `version` is not as it was sealed.
+    pub fn broken(&self, version: &VersionDir) -> io::Result<Option<Broken>> {
+        let now = match Self::of(version) {
+            // The package itself is gone, or has what no package has.
+            Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::InvalidData) => {
+                return Ok(Some(Broken::Source));
+            }
+            now => now?,
+        };
+        Ok(match (now.src == self.src, now.install == self.install) {
+            (true, true) => None,
+            (false, _) => Some(Broken::Source),
+            (true, false) => Some(Broken::Install),
+        })
+    }
+}
+
+impl std::fmt::Display for Broken {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Source => "src is not what was unpacked",
+            Self::Install => "install is not what was built",
+        })
+    }
+}
+
+/// The digest of the tree at `root`.
+fn tree(root: &Path) -> io::Result<Digest> {
+    if !fs::symlink_metadata(root)?.is_dir() {
+        return Err(io::Error::new(io::ErrorKind::InvalidData, "it is no directory"));
+    }
+    let mut hasher = Sha256::new();
+    add_directory(&mut hasher, root, 0)?;
+    Ok(Digest::from_sha256(hasher.finalize().into()))
+}
+
+/// Each entry is its kind, its name and what is in it, all of known length or ended, so that no two trees give the same bytes.
+fn add_directory(hasher: &mut Sha256, dir: &Path, depth: usize) -> io::Result<()> {
+    if depth > MAX_DEPTH {
+        return Err(io::Error::new(io::ErrorKind::InvalidData, format!("it is more than {MAX_DEPTH} levels deep")));
+    }
+    let names = fs::read_dir(dir)?.map(|entry| Ok(entry?.file_name()));
+    let mut names = names.collect::<io::Result<Vec<OsString>>>()?;
+    names.sort();
+    for name in names {
+        let path = dir.join(&name);
+        let about = fs::symlink_metadata(&path)?;
+        if about.is_dir() {
+            add_text(hasher, b'd', name.as_bytes());
+            add_directory(hasher, &path, depth + 1)?;
+            hasher.update(b"u");
+        } else if about.is_symlink() {
+            add_text(hasher, b'l', name.as_bytes());
+            add_text(hasher, b't', fs::read_link(&path)?.as_os_str().as_bytes());
+        } else {
+            let is_executable = about.permissions().mode() & 0o100 != 0;
+            add_text(hasher, if is_executable { b'x' } else { b'f' }, name.as_bytes());
+            add_content(hasher, untrusted_file::open(&path)?)?;
+        }
+    }
+    Ok(())
+}
+
+fn add_text(hasher: &mut Sha256, kind: u8, text: &[u8]) {
+    hasher.update([kind]);
+    hasher.update((text.len() as u64).to_le_bytes());
+    hasher.update(text);
+}
+
+fn add_content(hasher: &mut Sha256, mut file: File) -> io::Result<()> {
+    let (mut size, mut buffer) = (0_u64, vec![0; 128 * 1024]);
+    loop {
+        match file.read(&mut buffer)? {
+            // The size comes last: a file that grows while it is read is no other file with a known end.
+            0 => {
+                hasher.update(size.to_le_bytes());
+                return Ok(());
+            }
+            count => {
+                hasher.update(&buffer[..count]);
+                size += count as u64;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::symlink;
+
+    use super::*;
+    use crate::system::layout::DataDir;
+
+    fn version(root: &Path) -> VersionDir {
+        let version = DataDir::new(root).expect("a directory").task(&"talker".parse().expect("valid"));
+        let version = version.version(&Digest::of(b"manifest"));
+        fs::create_dir_all(version.src().join("bin")).expect("made");
+        fs::create_dir_all(version.install().join("lib")).expect("made");
+        fs::write(version.src().join("bin/run"), "echo one").expect("written");
+        fs::write(version.install().join("lib/node.py"), "print()").expect("written");
+        symlink("bin/run", version.src().join("run")).expect("linked");
+        version
+    }
+
+    #[test]
+    fn every_change_to_a_tree_breaks_its_seal() {
+        let temp = tempfile::tempdir().expect("a directory");
+        type Change = fn(&VersionDir) -> io::Result<()>;
+        let changes: [(Broken, Change); 9] = [
+            (Broken::Source, |v| fs::write(v.src().join("bin/run"), "echo two")),
+            (Broken::Source, |v| fs::write(v.src().join("more"), "")),
+            (Broken::Source, |v| fs::remove_file(v.src().join("run"))),
+            (Broken::Source, |v| fs::rename(v.src().join("bin/run"), v.src().join("bin/walk"))),
+            (Broken::Source, |v| fs::create_dir(v.src().join("empty"))),
+            (Broken::Source, |v| fs::remove_dir_all(v.src())),
+            (Broken::Source, |v| fs::set_permissions(v.src().join("bin/run"), fs::Permissions::from_mode(0o755))),
+            (Broken::Source, |v| {
+                fs::remove_file(v.src().join("run"))?;
+                symlink("/bin/sh", v.src().join("run"))
+            }),
+            (Broken::Install, |v| fs::write(v.install().join("lib/node.py"), "print(1)")),
+        ];
+        for (number, (expected, change)) in changes.into_iter().enumerate() {
+            let version = version(&temp.path().join(number.to_string()));
+            let note = version.root().join("seal");
+            Seal::of(&version).expect("sealed").write(&note).expect("written");
+            let seal = Seal::read(&note).expect("read").expect("there").expect("understood");
+            assert_eq!(seal.broken(&version).expect("compared"), None);
+            change(&version).expect("changed");
+            assert_eq!(seal.broken(&version).expect("compared"), Some(expected), "change {number}");
+        }
+    }
+
+    #[test]
+    fn name_that_reads_like_content_makes_no_equal_tree() {
+        let temp = tempfile::tempdir().expect("a directory");
+        let [one, two] = ["one", "two"].map(|name| temp.path().join(name));
+        for dir in [&one, &two] {
+            fs::create_dir(dir).expect("made");
+        }
+        fs::write(one.join("a"), "b").expect("written");
+        fs::write(two.join("ab"), "").expect("written");
+        assert_ne!(tree(&one).expect("read"), tree(&two).expect("read"));
+    }
+
+    #[test]
+    fn pipe_in_a_tree_breaks_its_seal_and_keeps_nobody_waiting() {
+        let temp = tempfile::tempdir().expect("a directory");
+        let version = version(temp.path());
+        let seal = Seal::of(&version).expect("sealed");
+        nix::unistd::mkfifo(&version.src().join("pipe"), nix::sys::stat::Mode::S_IRWXU).expect("a pipe");
+        assert_eq!(seal.broken(&version).expect("compared"), Some(Broken::Source));
+    }
+}

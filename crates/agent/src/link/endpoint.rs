@@ -1,0 +1,46 @@
+//! Where the robot's MQTT session goes: as the enrolment said, until the server says otherwise. Nothing of it is written
+//! down, for whoever starts asks again. It never connects to a broker.
+
+use std::time::Duration;
+
+use crate::link::state::Shared;
+use crate::system::error_chain::chain;
+use crate::transfer::server::Server;
+
+/// Asks the server where its robots' sessions go: at the start, whenever none comes about, and every `interval` while they go
+/// to a broker that lives on when the server is told to use another. Until the agent ends.
+pub async fn follow(server: Server, shared: Shared, interval: Duration) {
+    loop {
+        tokio::select! {
+            // A request that is dropped at the agent's end changes nothing.
+            () = ask(&server, &shared) => {}
+            () = shared.shutdown.cancelled() => return,
+        }
+        let is_external = shared.endpoint.borrow().as_ref().is_some_and(|endpoint| endpoint.external.is_some());
+        let spread = 0.5 + rand::random::<f64>();
+        tokio::select! {
+            // Cancel-safe: a timer that is made anew each time.
+            () = tokio::time::sleep(interval.mul_f64(spread)), if is_external => {}
+            // Cancel-safe: a permit that was not taken stays.
+            () = shared.find.notified() => {}
+            // Cancel-safe: a token can be awaited again.
+            () = shared.shutdown.cancelled() => return,
+        }
+    }
+}
+
+async fn ask(server: &Server, shared: &Shared) {
+    match server.mqtt_endpoint().await {
+        Ok(endpoint) => {
+            shared.endpoint.send_if_modified(|known| {
+                let is_news = known.as_ref() != Some(&endpoint);
+                if is_news {
+                    tracing::info!(?endpoint, "the server says where MQTT is");
+                    *known = Some(endpoint);
+                }
+                is_news
+            });
+        }
+        Err(error) => tracing::debug!(error = %chain(&error), "the server does not say where MQTT is"),
+    }
+}

@@ -1,0 +1,523 @@
+//! The MQTT half of the link, and the only place that names rumqttc: one session after another, each with a last will;
+//! the doorbell, questions and the parts of packages in, status, the newest report, answers and log lines out. A report
+//! is confirmed by its PUBACK, which the server sends once the report is stored; a broker that is not the server's own
+//! gets none. It never decides what to do with what it hears.
+//!
+//! What is heard is acknowledged by hand: a part once it was written, all else at once. A part that nobody takes is all
+//! that is held here; until somebody does, nothing more is read.
+
+mod destination;
+mod room;
+mod subscriptions;
+mod ways;
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use rumqttc::{
+    AsyncClient, ConnectReturnCode, ConnectionError, Event, EventLoop, LastWill, MqttOptions, Outgoing, Packet,
+    Publish, QoS, StateError, Transport,
+};
+use task_proto::RobotId;
+use task_proto::api::ExternalBroker;
+use task_proto::desired::{Doorbell, MAX_DOORBELL_BYTES};
+use task_proto::report::{MAX_REPORT_BYTES, Status};
+use task_proto::request::Request;
+use task_proto::topic::{RobotTopic, Topic, TopicPrefix};
+use task_transport::{Line, LineError, Route};
+use tokio::sync::mpsc;
+use tokio::time::Instant;
+
+use self::destination::{moved, place_count};
+use self::room::MessageRoom;
+use self::subscriptions::Subscriptions;
+pub use self::ways::Ways;
+use crate::link::state::{Heard, Message, Shared, Talk};
+use crate::system::error_chain::chain;
+use crate::task::plan::backoff_ms;
+use crate::transfer::credential::Credential;
+use crate::transfer::parts::{Acknowledgement, Arrived, Due};
+
+/// How often the broker hears from an idle robot.
+const KEEP_ALIVE: Duration = Duration::from_secs(20);
+/// How long connecting may take.
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(10);
+/// The longest wait between two tries to connect.
+const MAX_BACKOFF_MS: u64 = 60 * 1000;
+/// The longest wait after the broker refused this robot.
+const MAX_REFUSED_BACKOFF_MS: u64 = 5 * 60 * 1000;
+/// The shortest; up to half as much is added.
+const MIN_REFUSED_BACKOFF_MS: u64 = 10 * 1000;
+/// A session that lasted this long shows that the way is good: the backoff begins anew.
+const GOOD_SESSION: Duration = Duration::from_secs(60);
+/// Requests between this task and rumqttc.
+const QUEUED_REQUESTS: usize = 16;
+/// What has been read and not been looked at yet.
+const QUEUED_EVENTS: usize = 2;
+/// Messages that were dealt with and whose acknowledgements wait; brokers have fewer in flight.
+const QUEUED_ACKNOWLEDGEMENTS: usize = 1024;
+/// The largest packet that is sent: the largest report.
+const MAX_SENT_BYTES: usize = MAX_REPORT_BYTES + AROUND_MESSAGE_BYTES;
+/// The largest message that is read unless the server is seen to send whole packages as one: a part of 1 MiB.
+pub const MESSAGE_BYTES: usize = 1024 * 1024 + AROUND_MESSAGE_BYTES;
+/// The largest that MQTT has.
+const MAX_MESSAGE_BYTES: u64 = 256 * 1024 * 1024 - 1;
+/// What a message has around its bytes: topic, packet id, a part's header.
+const AROUND_MESSAGE_BYTES: usize = 4096;
+
+/// Where and as whom to connect, if [`Shared::endpoint`] says nothing else.
+#[derive(Clone)]
+pub struct MqttAccess {
+    /// Host name or address; also of an endpoint that names none.
+    pub host: String,
+    /// TCP port.
+    pub port: u16,
+    /// What all topics start with.
+    pub prefix: TopicPrefix,
+    /// User name, and the client id unless the endpoint names another one.
+    pub robot: RobotId,
+    /// The password at the server's own broker.
+    pub token: Credential,
+    /// What every status says; `connection` counts up from it.
+    pub status: Status,
+    /// The largest message that is read at first, [`MESSAGE_BYTES`]. Only for a wanted package it gets larger.
+    pub message_bytes: usize,
+    /// How to get there.
+    pub ways: Ways,
+}
+
+/// Why a session ended.
+enum Ended {
+    /// The broker does not accept this robot.
+    Refused,
+    /// A part of a wanted package is larger than what this session can read.
+    TooNarrow,
+    /// The server says that it goes elsewhere.
+    Moved,
+    /// The way to the broker is not open.
+    Unreachable(LineError),
+    /// Anything else.
+    Lost(ConnectionError),
+    /// The agent ends.
+    Closed,
+}
+
+/// Keeps a session up until the agent ends; after each end it waits with full jitter.
+pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Heard>, mut talk: Talk) {
+    let mut failures = 0u32;
+    // Whether the server has been seen to send packages as messages larger than usual.
+    let mut sends_large = false;
+    let mut endpoint = shared.endpoint.subscribe();
+    let (mut told, mut place) = (None, 0);
+    loop {
+        access.status.connection += 1;
+        let begun = Instant::now();
+        let room = MessageRoom::of(&access, &shared, sends_large);
+        let newest = endpoint.borrow_and_update().clone();
+        if newest != told {
+            (told, place) = (newest, 0);
+        }
+        let (there, places) = (access.destination(told.as_ref(), place), place_count(told.as_ref()));
+        let (at, external) = (access.at(&there), there.external.as_ref());
+        let way = access.ways.next(&there.host, there.port, there.is_encrypted, external);
+        let session = session(&at, external, way, &shared, &heard, &mut talk, room);
+        let ended = tokio::select! {
+            // Cancel-safe: nothing follows. The broker notices that the session is gone.
+            ended = session => ended,
+            () = moved(&mut endpoint, &access, &there) => Ended::Moved,
+        };
+        let was_up = shared.mqtt_up.send_replace(false);
+        shared.mqtt_stores.send_replace(false);
+        shared.mqtt_tried.send_replace(true);
+        if !was_up {
+            shared.find.notify_one();
+            place = (place + 1) % places;
+            if matches!(ended, Ended::Lost(_) | Ended::Unreachable(_)) {
+                access.ways.turn();
+            }
+        }
+        // Whoever waits for parts need not give up if the next session comes at once.
+        shared.listening.session(matches!(ended, Ended::TooNarrow));
+        failures = if begun.elapsed() >= GOOD_SESSION { 1 } else { failures.saturating_add(1) };
+        let (min_ms, max_ms) = match ended {
+            Ended::Closed => return,
+            Ended::TooNarrow => {
+                sends_large = true;
+                continue;
+            }
+            Ended::Moved => {
+                access.ways.begin_anew();
+                failures = 0;
+                continue;
+            }
+            Ended::Refused => {
+                tracing::warn!("the MQTT broker refuses this robot");
+                // Whether the robot was removed is asked over HTTP, whose answer is the server's own.
+                shared.poll.notify_one();
+                (MIN_REFUSED_BACKOFF_MS + rand::random_range(0..=MIN_REFUSED_BACKOFF_MS / 2), MAX_REFUSED_BACKOFF_MS)
+            }
+            Ended::Unreachable(error) => {
+                tracing::info!(error = %chain(&error), "no MQTT session");
+                (0, MAX_BACKOFF_MS)
+            }
+            Ended::Lost(error) => {
+                tracing::info!(%error, "no MQTT session");
+                if was_up {
+                    shared.meter.reconnected(Instant::now());
+                }
+                (0, MAX_BACKOFF_MS)
+            }
+        };
+        // The wait grows with each round of all places.
+        let rounds = failures.div_ceil(places as u32);
+        let wait = Duration::from_millis(backoff_ms(rounds, max_ms, rand::random()).max(min_ms));
+        tokio::select! {
+            // Cancel-safe: a timer that is made anew each time.
+            () = tokio::time::sleep(wait) => {}
+            // Cancel-safe: a watch remembers that it changed.
+            Ok(()) = endpoint.changed() => failures = 0,
+            // Cancel-safe: a token can be awaited again.
+            () = shared.shutdown.cancelled() => return,
+        }
+    }
+}
+
+/// What was published and is not acknowledged, the first one first.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Published {
+    Status,
+    Report { seq: u64 },
+    Message,
+    Lines,
+}
+
+async fn session(
+    access: &MqttAccess,
+    external: Option<&ExternalBroker>,
+    way: Route,
+    shared: &Shared,
+    heard: &mpsc::Sender<Heard>,
+    talk: &mut Talk,
+    room: MessageRoom,
+) -> Ended {
+    let Talk { requests, messages, lines } = talk;
+    let line = match Line::open(&way, CONNECT_TIMEOUT).await {
+        Ok(line) => line,
+        Err(error) => return Ended::Unreachable(error),
+    };
+    let options = options(access, external, &line, room);
+    let (client, mut event_loop) = AsyncClient::new(options, QUEUED_REQUESTS);
+    event_loop.network_options.set_connection_timeout(CONNECT_TIMEOUT.as_secs());
+    let (events_in, mut events) = mpsc::channel(QUEUED_EVENTS);
+    let (acknowledge, due) = mpsc::channel(QUEUED_ACKNOWLEDGEMENTS);
+    let (mut reports, mut wishes) = (shared.reports.subscribe(), shared.listening.changes());
+    let (pump, acknowledgements) =
+        (pump(&mut event_loop, events_in, room, shared), acknowledge_all(client.clone(), due));
+    let carrying = line.carry();
+    tokio::pin!(pump, acknowledgements, carrying);
+    let mut session = Session {
+        access,
+        is_external: external.is_some(),
+        shared,
+        heard,
+        requests,
+        client,
+        up: false,
+        unsent: VecDeque::new(),
+        sent: VecDeque::new(),
+        subscriptions: Subscriptions::default(),
+        acknowledge,
+        parked: None,
+        pinged_at: None,
+    };
+    loop {
+        if room.is_too_narrow(shared) {
+            return Ended::TooNarrow;
+        }
+        let parked = session.parked.as_ref().map(|(way, _)| way.clone());
+        tokio::select! {
+            // Cancel-safe: the future is pinned outside of the loop and goes on where it was.
+            ended = &mut pump => return ended,
+            // Cancel-safe, likewise. Neither ends before the session does.
+            () = &mut acknowledgements => {}
+            () = &mut carrying => {}
+            // Cancel-safe: a message stays in the channel until it is received.
+            Some(event) = events.recv(), if session.parked.is_none() => session.take(event).await,
+            // Cancel-safe: a place that was not taken stays free.
+            place = place_for(parked) => session.unpark(place),
+            // Cancel-safe: a watch remembers that it changed.
+            Ok(()) = wishes.changed() => session.tune(),
+            // Cancel-safe: a timer that is made anew each time.
+            () = tokio::time::sleep_until(session.subscriptions.next_try()) => session.tune(),
+            // Cancel-safe: a watch remembers that it changed.
+            Ok(()) = reports.changed() => session.publish_report(),
+            // Cancel-safe: a message stays in the channel until it is received.
+            Some(Message { topic, payload }) = messages.recv(), if session.has_room() => {
+                session.publish(topic, payload, Published::Message);
+            }
+            // Cancel-safe, likewise.
+            Some(payload) = lines.recv(), if session.has_room() && !session.is_under_way(|it| *it == Published::Lines) => {
+                session.publish(RobotTopic::Log, payload, Published::Lines);
+            }
+            // Cancel-safe: a token can be awaited again.
+            () = shared.shutdown.cancelled() => {
+                // Without DISCONNECT the broker publishes the will, which says just what is true.
+                return Ended::Closed;
+            }
+        }
+    }
+}
+
+/// Reads and writes until the session ends. rumqttc's poll must not be dropped half way, so it runs in one future that
+/// lives as long as the session.
+async fn pump(event_loop: &mut EventLoop, events: mpsc::Sender<Event>, room: MessageRoom, shared: &Shared) -> Ended {
+    loop {
+        match event_loop.poll().await {
+            Ok(event) => {
+                if events.send(event).await.is_err() {
+                    return Ended::Closed;
+                }
+            }
+            Err(ConnectionError::ConnectionRefused(
+                ConnectReturnCode::BadUserNamePassword
+                | ConnectReturnCode::NotAuthorized
+                | ConnectReturnCode::BadClientId,
+            )) => return Ended::Refused,
+            Err(ConnectionError::MqttState(StateError::Deserialization(rumqttc::Error::PayloadSizeLimitExceeded(
+                bytes,
+            )))) if room.was_too_narrow(bytes, shared) => return Ended::TooNarrow,
+            Err(error) => return Ended::Lost(error),
+        }
+    }
+}
+
+/// Acknowledges what is due, until nobody can say any more what is.
+async fn acknowledge_all(client: AsyncClient, mut due: mpsc::Receiver<Due>) {
+    while let Some(due) = due.recv().await {
+        // A session that is over has nobody to acknowledge anything to; the pump notices it.
+        let _ = client.ack(&answered(due)).await;
+    }
+}
+
+struct Session<'a> {
+    access: &'a MqttAccess,
+    is_external: bool,
+    shared: &'a Shared,
+    heard: &'a mpsc::Sender<Heard>,
+    requests: &'a mpsc::Sender<(Request, Instant)>,
+    client: AsyncClient,
+    up: bool,
+    /// Handed to rumqttc, which has not given them a packet id yet.
+    unsent: VecDeque<Published>,
+    /// Sent under this packet id.
+    sent: VecDeque<(u16, Published)>,
+    subscriptions: Subscriptions,
+    acknowledge: mpsc::Sender<Due>,
+    /// A part that there is no room for, and where it goes.
+    parked: Option<(mpsc::Sender<Arrived>, Arrived)>,
+    pinged_at: Option<Instant>,
+}
+
+/// A place for the part that waits for one; `None` if nobody wants it any more.
+async fn place_for(way: Option<mpsc::Sender<Arrived>>) -> Option<mpsc::OwnedPermit<Arrived>> {
+    match way {
+        Some(way) => way.reserve_owned().await.ok(),
+        None => std::future::pending().await,
+    }
+}
+
+/// As much of a message as its acknowledgement takes.
+fn answered(due: Due) -> Publish {
+    let qos = rumqttc::qos(due.qos).unwrap_or(QoS::AtMostOnce);
+    let mut message = Publish::new("", qos, Vec::new());
+    message.pkid = due.packet_id;
+    message
+}
+
+impl Session<'_> {
+    async fn take(&mut self, event: Event) {
+        match event {
+            Event::Incoming(Packet::ConnAck(_)) => self.begin(),
+            Event::Incoming(Packet::Publish(message)) => self.hear(message).await,
+            Event::Incoming(Packet::PubAck(ack)) => self.confirm(ack.pkid).await,
+            Event::Incoming(Packet::SubAck(answer)) => {
+                if let Some(took) = self.subscriptions.answered(&answer, &self.shared.listening) {
+                    self.shared.meter.round_trip(took);
+                }
+            }
+            Event::Incoming(Packet::PingResp) => {
+                if let Some(pinged_at) = self.pinged_at.take() {
+                    self.shared.meter.round_trip(pinged_at.elapsed());
+                }
+            }
+            Event::Outgoing(Outgoing::PingReq) => self.pinged_at = Some(Instant::now()),
+            Event::Outgoing(Outgoing::Subscribe(id)) => self.subscriptions.sent(id),
+            Event::Outgoing(Outgoing::Publish(id)) => {
+                // Without a packet id nothing comes back.
+                if let Some(published) = self.unsent.pop_front().filter(|_| id != 0) {
+                    self.sent.push_back((id, published));
+                }
+            }
+            _ => {}
+        }
+    }
+
+    fn begin(&mut self) {
+        self.up = true;
+        self.shared.mqtt_up.send_replace(true);
+        self.shared.mqtt_stores.send_replace(!self.is_external);
+        self.shared.mqtt_tried.send_replace(true);
+        tracing::info!(host = self.access.host, port = self.access.port, "connected to MQTT");
+        for topic in [RobotTopic::Desired, RobotTopic::Request] {
+            // The queue is empty at the start of a session, and a lost session is noticed by the pump.
+            if self.client.try_subscribe(topic_name(self.access, topic), QoS::AtLeastOnce).is_ok() {
+                self.subscriptions.asked_for_own();
+            }
+        }
+        self.shared.listening.session(true);
+        self.publish(RobotTopic::Status, status_payload(self.access, true), Published::Status);
+        self.publish_report();
+    }
+
+    /// Subscribes to what is wanted and not subscribed to, and ends what is not wanted any more.
+    fn tune(&mut self) {
+        if self.up {
+            self.subscriptions.tune(&self.client, &self.access.prefix, &self.shared.listening);
+        }
+    }
+
+    async fn hear(&mut self, message: Publish) {
+        let acknowledgement =
+            Acknowledgement::new(Due { packet_id: message.pkid, qos: message.qos as u8 }, self.acknowledge.clone());
+        match self.access.prefix.parse(&message.topic) {
+            Some(Topic::Package(digest)) => {
+                if let Some(way) = self.shared.listening.way_to(&digest) {
+                    self.pass_on(way, Arrived { message: message.payload, acknowledgement });
+                }
+            }
+            Some(Topic::Robot(robot, RobotTopic::Request)) if robot == self.access.robot => {
+                self.hear_request(&message.payload);
+            }
+            Some(Topic::Robot(robot, RobotTopic::Desired)) if robot == self.access.robot => {
+                self.hear_desired(&message.payload).await;
+                if self.is_external {
+                    // It is also how a server that has lost sight of its robots finds out who is there.
+                    self.publish(RobotTopic::Status, status_payload(self.access, true), Published::Status);
+                }
+            }
+            _ => {}
+        }
+    }
+
+    fn pass_on(&mut self, way: mpsc::Sender<Arrived>, part: Arrived) {
+        match way.try_send(part) {
+            Err(mpsc::error::TrySendError::Full(part)) => self.parked = Some((way, part)),
+            // Nobody wants it any more: letting go of it acknowledges it.
+            Ok(()) | Err(mpsc::error::TrySendError::Closed(_)) => {}
+        }
+    }
+
+    fn unpark(&mut self, place: Option<mpsc::OwnedPermit<Arrived>>) {
+        if let (Some((_, part)), Some(place)) = (self.parked.take(), place) {
+            place.send(part);
+        }
+    }
+
+    async fn hear_desired(&self, payload: &[u8]) {
+        if payload.len() > MAX_DOORBELL_BYTES {
+            tracing::warn!(bytes = payload.len(), "a desired state is too large for a message");
+            return self.shared.poll.notify_one();
+        }
+        match serde_json::from_slice::<Doorbell>(payload) {
+            Ok(Doorbell::State { envelope, inline }) => {
+                // The driver ends before this task: nobody listens only when the agent ends.
+                let heard = Heard::Desired { envelope: Box::new(envelope), inline, was_asked_for: false };
+                let _ = self.heard.send(heard).await;
+            }
+            Ok(Doorbell::Notice { .. }) => self.shared.poll.notify_one(),
+            Err(error) => tracing::warn!(%error, "the desired topic holds something else"),
+        }
+    }
+
+    fn hear_request(&self, payload: &[u8]) {
+        match serde_json::from_slice::<Request>(payload) {
+            // Who asks waits only so long; a question that finds no room may be asked again.
+            Ok(request) => {
+                if self.requests.try_send((request, Instant::now())).is_err() {
+                    tracing::warn!("too many questions at a time");
+                }
+            }
+            Err(error) => tracing::warn!(%error, "the request topic holds something else"),
+        }
+    }
+
+    async fn confirm(&mut self, id: u16) {
+        let Some(at) = self.sent.iter().position(|(sent, _)| *sent == id) else { return };
+        if let Some((_, Published::Report { seq })) = self.sent.remove(at) {
+            let _ = self.heard.send(Heard::Confirmed { seq, reply: None }).await;
+            self.shared.confirmed.send_if_modified(|confirmed| {
+                let newer = seq > *confirmed;
+                *confirmed = (*confirmed).max(seq);
+                newer
+            });
+            self.publish_report();
+        }
+    }
+
+    /// Whether something may be published without taking a report's place.
+    fn has_room(&self) -> bool {
+        self.up && self.unsent.len() < QUEUED_REQUESTS / 2
+    }
+
+    fn is_under_way(&self, kind: impl Fn(&Published) -> bool) -> bool {
+        self.unsent.iter().any(&kind) || self.sent.iter().any(|(_, published)| kind(published))
+    }
+
+    /// Publishes the newest report, unless one is under way: its acknowledgement calls this again.
+    fn publish_report(&mut self) {
+        let busy = self.is_under_way(|published| matches!(published, Published::Report { .. }));
+        let Some(report) = self.shared.reports.borrow().clone() else { return };
+        if !self.up || self.is_external || busy || report.seq <= *self.shared.confirmed.borrow() {
+            return;
+        }
+        match serde_json::to_vec(&*report) {
+            // The server would cut the robot off for it. Over HTTP it says what is wrong, and the session stays.
+            Ok(payload) if payload.len() > MAX_REPORT_BYTES => self.shared.post.notify_one(),
+            Ok(payload) => self.publish(RobotTopic::Report, payload, Published::Report { seq: report.seq }),
+            Err(error) => tracing::error!(%error, "a report can't be written as JSON"),
+        }
+    }
+
+    fn publish(&mut self, topic: RobotTopic, payload: Vec<u8>, published: Published) {
+        let name = topic_name(self.access, topic);
+        // Of vitals the next ones say more than a repetition.
+        let qos = if topic == RobotTopic::Telemetry { QoS::AtMostOnce } else { QoS::AtLeastOnce };
+        if self.client.try_publish(name, qos, false, payload).is_ok() {
+            self.unsent.push_back(published);
+        }
+    }
+}
+
+fn options(access: &MqttAccess, external: Option<&ExternalBroker>, line: &Line, room: MessageRoom) -> MqttOptions {
+    let client_id = external.and_then(|external| external.client_id.as_deref()).unwrap_or(access.robot.as_str());
+    let mut options = MqttOptions::new(client_id, line.name(), access.port);
+    options.set_transport(Transport::Unix);
+    let password = external.map_or_else(|| access.token.current(), |external| external.password.clone());
+    options.set_credentials(access.robot.as_str(), password);
+    options.set_clean_session(true);
+    options.set_keep_alive(KEEP_ALIVE);
+    options.set_manual_acks(true);
+    options.set_max_packet_size(room.bytes, MAX_SENT_BYTES);
+    let will = status_payload(access, false);
+    options.set_last_will(LastWill::new(topic_name(access, RobotTopic::Status), will, QoS::AtLeastOnce, false));
+    options
+}
+
+fn topic_name(access: &MqttAccess, topic: RobotTopic) -> String {
+    access.prefix.format(&Topic::Robot(access.robot.clone(), topic))
+}
+
+fn status_payload(access: &MqttAccess, online: bool) -> Vec<u8> {
+    // A status is plain numbers and texts: it can always be written.
+    serde_json::to_vec(&Status { online, ..access.status.clone() }).unwrap_or_default()
+}

@@ -1,0 +1,115 @@
+//! The ways an MQTT session may take to the server: over the broker's own port, or as a WebSocket over the HTTP port, which
+//! is open wherever a robot can reach its server at all. One that fails is given up for the other. It opens nothing.
+
+use std::sync::Arc;
+
+use reqwest::Url;
+use rustls::ClientConfig;
+use task_proto::api::ExternalBroker;
+use task_transport::{Route, Trust};
+
+use crate::config::MqttTransport;
+use crate::system::clock;
+
+/// Which ways there are, and which is tried next.
+#[derive(Clone)]
+pub struct Ways {
+    transport: MqttTransport,
+    /// How TLS is spoken, to whichever port.
+    tls: Arc<ClientConfig>,
+    /// The WebSocket at the server.
+    websocket: Route,
+    /// Whether the broker's own port is passed over.
+    is_turned: bool,
+}
+
+impl Ways {
+    /// To the server at `base`.
+    pub fn new(base: &Url, tls: Arc<ClientConfig>, transport: MqttTransport) -> Self {
+        let websocket = Route {
+            host: base.host_str().map(str::to_owned).unwrap_or_default(),
+            port: base.port_or_known_default().unwrap_or_default(),
+            tls: (base.scheme() == "https").then(|| tls.clone()),
+            websocket: Some(format!("{}/mqtt", base.path().trim_end_matches('/'))),
+        };
+        Self { transport, tls, websocket, is_turned: false }
+    }
+
+    /// The next way. A broker that is not the server's own has nothing but its port, and a certificate by somebody else.
+    pub(super) fn next(&self, host: &str, port: u16, is_encrypted: bool, external: Option<&ExternalBroker>) -> Route {
+        let by_websocket = match self.transport {
+            MqttTransport::Auto => self.is_turned,
+            MqttTransport::Tcp => false,
+            MqttTransport::Websocket => true,
+        };
+        let tls = match external {
+            None if by_websocket => return self.websocket.clone(),
+            _ if !is_encrypted => None,
+            None => Some(self.tls.clone()),
+            Some(broker) => Some(Arc::new(Trust::by(broker.ca_pin).client_config(clock::for_certificates()))),
+        };
+        Route { host: host.to_owned(), port, tls, websocket: None }
+    }
+
+    /// No session came about.
+    pub(super) fn turn(&mut self) {
+        self.is_turned = !self.is_turned;
+    }
+
+    /// The server names another place: it may be reached there.
+    pub(super) fn begin_anew(&mut self) {
+        self.is_turned = false;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use task_transport::Clock;
+
+    use super::*;
+
+    fn ways(base: &str, transport: MqttTransport) -> Ways {
+        let tls = Trust::System.client_config(Clock::new(|| 0));
+        Ways::new(&base.parse().expect("a URL"), Arc::new(tls), transport)
+    }
+
+    /// Host, port, path of the WebSocket, and whether it encrypts.
+    fn shown(route: Route) -> (String, u16, Option<String>, bool) {
+        (route.host, route.port, route.websocket, route.tls.is_some())
+    }
+
+    #[test]
+    fn what_fails_is_given_up_for_the_other() {
+        let mut ways = ways("https://fleet.lab/tasks/", MqttTransport::Auto);
+        let direct = |ways: &Ways| shown(ways.next("fleet.lab", 8883, true, None));
+        let own_port = ("fleet.lab".to_owned(), 8883, None, true);
+        let websocket = ("fleet.lab".to_owned(), 443, Some("/tasks/mqtt".to_owned()), true);
+        assert_eq!(direct(&ways), own_port);
+        ways.turn();
+        assert_eq!(direct(&ways), websocket);
+        let broker = ExternalBroker { password: "secret".to_owned(), client_id: None, ca_pin: None };
+        assert_eq!(
+            shown(ways.next("broker.lab", 1883, false, Some(&broker))),
+            ("broker.lab".to_owned(), 1883, None, false),
+            "an external broker has no such way"
+        );
+        let encrypted = ("broker.lab".to_owned(), 8883, None, true);
+        assert_eq!(shown(ways.next("broker.lab", 8883, true, Some(&broker))), encrypted);
+        ways.turn();
+        assert_eq!(direct(&ways), own_port);
+        ways.turn();
+        ways.begin_anew();
+        assert_eq!(direct(&ways), own_port);
+        assert_eq!(shown(ways.next("fleet.lab", 1883, false, None)), ("fleet.lab".to_owned(), 1883, None, false));
+    }
+
+    #[test]
+    fn a_setting_leaves_no_choice() {
+        let mut tcp = ways("http://10.0.0.7:8080", MqttTransport::Tcp);
+        tcp.turn();
+        assert_eq!(shown(tcp.next("10.0.0.7", 1883, false, None)), ("10.0.0.7".to_owned(), 1883, None, false));
+        let websocket = ways("http://10.0.0.7:8080", MqttTransport::Websocket);
+        let way = ("10.0.0.7".to_owned(), 8080, Some("/mqtt".to_owned()), false);
+        assert_eq!(shown(websocket.next("10.0.0.7", 1883, false, None)), way);
+    }
+}

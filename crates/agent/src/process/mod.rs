@@ -1,0 +1,10 @@
+//! Processes: they are started, confined, supervised by a shim, and found again after a restart of the agent. It decides nothing.
+
+pub mod call_filter;
+pub mod cgroup;
+pub mod confinement;
+pub mod containment;
+pub mod program;
+pub mod run_dir;
+pub mod shim;
+pub mod supervisor;

@@ -1,0 +1,258 @@
+//! The process between agent and task: `task-agent shim --dir RUNDIR`. It starts the task, owns its output, collects
+//! every orphan below it and writes down how it all ended. It lives exactly as long as its task, needs nothing of the
+//! agent after the start and never decides anything: no restart, no stop.
+//!
+//! It has no async runtime: two threads copy the output, the main thread waits for children.
+
+use std::io::{self, PipeWriter, Write};
+use std::path::Path;
+use std::sync::mpsc;
+use std::time::{Duration, Instant};
+
+use nix::sys::signal::Signal;
+use serde::{Deserialize, Serialize};
+
+use crate::logs::capture;
+use crate::process::cgroup::Cgroup;
+use crate::process::confinement::{self, Confinement};
+use crate::process::containment::Containment;
+use crate::process::program::ExitStatus;
+use crate::process::program::{self, ChildEvent, ProcessIdentity};
+use crate::process::run_dir::{Ended, RunDir, RunDirError, RunSpec, Started};
+use crate::system::clock;
+use crate::system::durable;
+
+/// How long what a task leaves behind may take to end after SIGTERM.
+const LEFTOVER_GRACE: Duration = Duration::from_secs(2);
+/// How long it may take after SIGKILL; what is still there then hangs in the kernel.
+const KILL_TIMEOUT: Duration = Duration::from_secs(10);
+/// How often the end is tried to be written to a full disk, and how long it rests in between: an hour in all.
+const MAX_WRITES: u32 = 720;
+const ROOM_PAUSE: Duration = Duration::from_secs(5);
+/// How long the rest of the output may take once nobody is left to write any.
+const DRAIN_TIMEOUT: Duration = Duration::from_secs(2);
+
+/// What the shim tells the supervisor, one JSON line on its standard output.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Answer {
+    /// The task was started; `pid.json` is on disk.
+    Started(Started),
+    /// It was not, and nothing is left of the try.
+    Failed(String),
+}
+
+/// Why a shim could not do its work.
+#[derive(Debug, thiserror::Error)]
+pub enum ShimError {
+    /// A file of the run directory failed.
+    #[error(transparent)]
+    RunDir(#[from] RunDirError),
+    /// The directory has no `spec.json`.
+    #[error("{0} has no spec.json")]
+    NoSpec(String),
+    /// The task's process could not be started.
+    #[error("cannot start {script} in {directory}")]
+    Start {
+        /// The script.
+        script: String,
+        /// Where it was to run.
+        directory: String,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// Something that every process may do was refused.
+    #[error("cannot watch the task's processes")]
+    Io(#[from] io::Error),
+}
+
+/// A started task and the end of its output.
+struct Task {
+    started: Started,
+    containment: Containment,
+    memory_bytes: Option<u64>,
+    /// Whether it wrote files that will be brought back.
+    has_outputs: bool,
+    drained: mpsc::Receiver<()>,
+}
+
+/// Runs the task of the run directory at `path` to its end. Call it before any other thread exists.
+pub fn run(path: &Path) -> Result<(), ShimError> {
+    confinement::protect_this_process();
+    let dir = RunDir::create(path)?;
+    let begun = program::become_shim().map_err(ShimError::Io).and_then(|()| begin(&dir));
+    let answer = match &begun {
+        Ok(task) => Answer::Started(task.started.clone()),
+        Err(error) => Answer::Failed(with_causes(error)),
+    };
+    tell(&answer);
+    program::close_standard_streams()?;
+    let task = begun?;
+    let status = wait_for_task(task.started.task.pid)?;
+    // How it ended is known whatever becomes of what it left, and so it is said.
+    let _ = end_leftovers(&task.containment);
+    // What is still unread after this is in the hands of a process that hangs in the kernel.
+    let _ = task.drained.recv_timeout(DRAIN_TIMEOUT);
+    let at_uptime_ms = u64::try_from(clock::uptime()?.as_millis()).unwrap_or(u64::MAX);
+    let out_of_memory_bytes = task.memory_bytes.filter(|_| task.containment.is_out_of_memory());
+    if task.has_outputs {
+        // The agent brings the files back once it reads that the run ended, also after a power cut. The run directory lies
+        // on the same file system, and no task can put anything else in its place.
+        let _ = durable::sync_file_system(dir.path());
+    }
+    let ended = Ended { status, at_uptime_ms, out_of_memory_bytes };
+    once_there_is_room(ROOM_PAUSE, || dir.write_ended(&ended))?;
+    // The next stop of this run or the next boot removes what is left here.
+    let _ = task.containment.remove();
+    Ok(())
+}
+
+/// The task may have filled the disk itself, and how it ended must not be lost for that.
+fn once_there_is_room(pause: Duration, mut write: impl FnMut() -> Result<(), RunDirError>) -> Result<(), RunDirError> {
+    for _ in 1..MAX_WRITES {
+        match write() {
+            Err(error) if error.is_full() => std::thread::park_timeout(pause),
+            written => return written,
+        }
+    }
+    write()
+}
+
+fn begin(dir: &RunDir) -> Result<Task, ShimError> {
+    let spec = dir.spec()?.ok_or_else(|| ShimError::NoSpec(dir.path().display().to_string()))?;
+    let own = identity(std::process::id())?;
+    let containment = Containment::new(dir.path(), Some(own.clone()), spec.cgroup.clone());
+    let (output, writer) = io::pipe()?;
+    let (errors, error_writer) = io::pipe()?;
+    // A power cut may come before it is on the disk who runs it, and a job must not run twice.
+    dir.write_begun()?;
+    let pid = match start(&spec, writer, error_writer) {
+        Ok(pid) => pid,
+        Err(source) => {
+            // Where it stays, the run counts as one that was lost: that of a job is not made again.
+            let _ = dir.forget_begun();
+            let (script, directory) = (spec.script.display().to_string(), spec.directory.display().to_string());
+            return Err(ShimError::Start { script, directory, source });
+        }
+    };
+    let (done, drained) = mpsc::channel();
+    std::thread::spawn(move || {
+        capture::copy(spec.log, output, errors);
+        // The main thread no longer listens when it has given up on the rest.
+        let _ = done.send(());
+    });
+    let written = identity(pid).and_then(|task| {
+        let started = Started { shim: own.clone(), task };
+        dir.write_started(&started).map_err(ShimError::RunDir).map(|()| started)
+    });
+    match written {
+        Ok(started) => {
+            let (memory_bytes, has_outputs) = (spec.limits.memory_bytes, spec.has_outputs);
+            Ok(Task { started, containment, memory_bytes, has_outputs, drained })
+        }
+        Err(error) => {
+            // A task that nobody could find again must not run.
+            let _ = end_leftovers(&containment);
+            Err(error)
+        }
+    }
+}
+
+fn start(spec: &RunSpec, output: PipeWriter, errors: PipeWriter) -> io::Result<u32> {
+    let cgroup = spec.cgroup.clone().map(Cgroup::at);
+    if let Some(cgroup) = &cgroup {
+        // Where it can't be, the shim stays with the agent and ends with all of its group, should that be ended.
+        let _ = cgroup.enter_shims();
+    }
+    let confinement = Confinement::new(&spec.script, cgroup.as_ref(), &spec.limits, spec.user.as_ref())?;
+    if let Some(user) = &spec.user {
+        // A task may open its output by name, as `/dev/stdout`.
+        user.own(&output)?;
+        user.own(&errors)?;
+    }
+    program::spawn_task(&spec.script, &spec.directory, &spec.environment, confinement, output, errors)
+}
+
+fn identity(pid: u32) -> Result<ProcessIdentity, ShimError> {
+    ProcessIdentity::of(pid)?.ok_or_else(|| io::Error::from(io::ErrorKind::NotFound).into())
+}
+
+/// The supervisor may be gone; the task runs on all the same.
+fn tell(answer: &Answer) {
+    if let Ok(mut line) = serde_json::to_vec(answer) {
+        line.push(b'\n');
+        let mut output = io::stdout();
+        let _ = output.write_all(&line).and_then(|()| output.flush());
+    }
+}
+
+fn wait_for_task(task: u32) -> io::Result<ExitStatus> {
+    loop {
+        match program::next_child(None)? {
+            ChildEvent::Ended(pid, status) if pid == task => return Ok(status),
+            ChildEvent::NoChildren => return Err(io::Error::other("the task was collected by someone else")),
+            ChildEvent::Ended(..) | ChildEvent::TimedOut => {}
+        }
+    }
+}
+
+/// Ends what the task left behind: first asked, then killed.
+fn end_leftovers(containment: &Containment) -> io::Result<()> {
+    if containment.members()?.is_empty() {
+        return Ok(());
+    }
+    containment.signal_all(Signal::SIGTERM)?;
+    // A stopped process does not see the SIGTERM before it continues.
+    containment.signal_all(Signal::SIGCONT)?;
+    if collect_until_empty(containment, LEFTOVER_GRACE)? {
+        return Ok(());
+    }
+    containment.kill()?;
+    collect_until_empty(containment, KILL_TIMEOUT).map(|_| ())
+}
+
+/// Collects children until the containment is empty; false when it is not within `timeout`.
+fn collect_until_empty(containment: &Containment, timeout: Duration) -> io::Result<bool> {
+    let deadline = Instant::now() + timeout;
+    loop {
+        if containment.members()?.is_empty() {
+            return Ok(true);
+        }
+        let rest = deadline.saturating_duration_since(Instant::now());
+        match program::next_child(Some(rest))? {
+            ChildEvent::Ended(..) => {}
+            ChildEvent::NoChildren | ChildEvent::TimedOut => return Ok(containment.members()?.is_empty()),
+        }
+    }
+}
+
+fn with_causes(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(inner) = cause {
+        text.push_str(": ");
+        text.push_str(&inner.to_string());
+        cause = inner.source();
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn how_a_task_ended_is_written_once_the_disk_has_room_again() {
+        let refused = |kind: io::ErrorKind| RunDirError::Io { path: "exit.json".into(), source: kind.into() };
+        let mut answers =
+            vec![Ok(()), Err(refused(io::ErrorKind::StorageFull)), Err(refused(io::ErrorKind::QuotaExceeded))];
+        once_there_is_room(Duration::ZERO, || answers.pop().expect("asked three times")).expect("written");
+        assert!(answers.is_empty());
+        let mut count = 0;
+        let never = once_there_is_room(Duration::ZERO, || {
+            count += 1;
+            Err(refused(if count == 2 { io::ErrorKind::PermissionDenied } else { io::ErrorKind::StorageFull }))
+        });
+        assert!(never.is_err() && count == 2, "what room does not mend is told at once");
+    }
+}

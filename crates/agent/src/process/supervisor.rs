@@ -1,0 +1,342 @@
+//! Starts runs, finds them again and ends them. The run directory is all it knows: a new agent sees what the last one
+//! saw. It never restarts anything by itself and never decides what should run.
+//!
+//! ```text
+//!   NeverStarted ── start ──▶ Running ── task ends ──▶ Exited
+//!                                │ shim killed, or the machine rebooted
+//!                                └──▶ Gone
+//! ```
+
+use std::io::{self, PipeReader};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use nix::sys::signal::Signal;
+use tokio::io::AsyncReadExt as _;
+use tokio::net::unix::pipe;
+use tokio::time::Instant;
+use tokio_util::sync::CancellationToken;
+
+use crate::process::cgroup::Cgroups;
+use crate::process::containment::{ASSIGNMENT_VARIABLE, Containment, ContainmentError, RUN_DIR_VARIABLE, signal_each};
+use crate::process::program;
+use crate::process::program::{ExitStatus, ProcessIdentity};
+use crate::process::run_dir::{RunDir, RunDirError, RunSpec, Started};
+use crate::process::shim::Answer;
+use crate::setup::launch::Interrupt;
+
+/// How long a start may take; it is a fork, an exec and two small files.
+const START_TIMEOUT: Duration = Duration::from_secs(20);
+/// When to try again to take the lock of a run whose start is in progress.
+const LOCK_PAUSE: Duration = Duration::from_millis(20);
+/// How long killed processes may take to be gone.
+const KILL_TIMEOUT: Duration = Duration::from_secs(10);
+/// The longest answer a shim gives.
+const MAX_ANSWER_BYTES: u64 = 64 * 1024;
+
+/// Starts shims and talks to what they leave on disk.
+#[derive(Debug, Clone)]
+pub struct Supervisor {
+    program: PathBuf,
+    cgroups: Option<Cgroups>,
+}
+
+/// What a run directory and the process table say together.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Observed {
+    /// Nothing was ever started in it.
+    NeverStarted,
+    /// Its shim lives.
+    Running {
+        /// The task's first process.
+        pid: u32,
+        /// How long ago it was started.
+        age: Duration,
+    },
+    /// The task ended and the shim wrote down how.
+    Exited(ExitStatus),
+    /// The kernel killed it because it used more memory than its limit.
+    OutOfMemory {
+        /// The limit.
+        limit_bytes: u64,
+    },
+    /// It was started, but how it ended is not known: its shim was killed, or the machine went down. None of its
+    /// processes is left.
+    Gone,
+}
+
+/// How far a start has come.
+enum Begun {
+    /// It was made before.
+    Runs(Started),
+    /// The shim says on this pipe what comes of it.
+    Asked(PipeReader),
+}
+
+/// Why a run could not be started, looked at or ended.
+#[derive(Debug, thiserror::Error)]
+pub enum SupervisorError {
+    /// A file of the run directory failed.
+    #[error(transparent)]
+    RunDir(#[from] RunDirError),
+    /// The run directory holds an earlier run that has ended.
+    #[error("{} belongs to a run that has ended; a start needs a directory of its own", .0.display())]
+    Used(PathBuf),
+    /// The shim said why not.
+    #[error("the task was not started: {0}")]
+    Refused(String),
+    /// The shim said nothing within its time.
+    #[error("the task's shim did not answer within {} s", START_TIMEOUT.as_secs())]
+    NoAnswer,
+    /// Nobody can tell yet what comes of it.
+    #[error("a start of the task is in progress, or hangs")]
+    Starting,
+    /// Processes could not be found or ended.
+    #[error(transparent)]
+    Containment(#[from] ContainmentError),
+    /// The system refused something.
+    #[error("cannot {what}")]
+    Io {
+        /// What was tried.
+        what: &'static str,
+        /// What it said.
+        source: io::Error,
+    },
+}
+
+impl SupervisorError {
+    /// Whether a file of the run directory is there and can't be understood.
+    pub fn is_malformed(&self) -> bool {
+        matches!(self, Self::RunDir(RunDirError::Malformed { .. }))
+    }
+}
+
+impl Supervisor {
+    /// A supervisor whose shims are `program shim`, and whose runs get their control groups from `cgroups`.
+    pub fn new(program: impl Into<PathBuf>, cgroups: Option<Cgroups>) -> Self {
+        Self { program: program.into(), cgroups }
+    }
+
+    /// A supervisor whose shims are this very program, also after its file was replaced by a newer version.
+    pub fn of_this_program(cgroups: Option<Cgroups>) -> Self {
+        Self::new("/proc/self/exe", cgroups)
+    }
+
+    /// Starts `spec` in the run directory at `path`; a run that already runs there is left as it is. The run survives
+    /// the caller from the moment the shim exists: dropping this future takes it back only before that. After
+    /// [`SupervisorError::NoAnswer`] it may be one or the other, and [`Self::observe`] tells which.
+    pub async fn start(&self, path: &Path, spec: &RunSpec) -> Result<Started, SupervisorError> {
+        let started = tokio::time::timeout(START_TIMEOUT, self.start_shim(path, spec));
+        started.await.unwrap_or(Err(SupervisorError::NoAnswer))
+    }
+
+    async fn start_shim(&self, path: &Path, spec: &RunSpec) -> Result<Started, SupervisorError> {
+        let (program, cgroups) = (self.program.clone(), self.cgroups.clone());
+        let (path, mut spec) = (path.to_owned(), spec.clone());
+        let (dir, lock) = once_locked(&path, START_TIMEOUT, |dir| Ok(dir.try_lock()?)).await?;
+        let given_up = CancellationToken::new();
+        let _when_dropped = given_up.clone().drop_guard();
+        let begun = in_background("start the shim", move || {
+            let started = dir.started()?;
+            if started.is_some() || dir.has_begun() {
+                let runs = dir.ended()?.is_none();
+                let running = started.filter(|started| runs && started.shim.is_alive());
+                return running.map(Begun::Runs).ok_or(SupervisorError::Used(path));
+            }
+            spec.environment.insert(ASSIGNMENT_VARIABLE.to_owned(), spec.assignment.to_string());
+            spec.environment.insert(RUN_DIR_VARIABLE.to_owned(), dir.path().display().to_string());
+            spec.cgroup = cgroups.as_ref().map(|cgroups| cgroups.group(dir.path()).path().to_owned());
+            dir.write_spec(&spec)?;
+            if let Some(cgroups) = cgroups {
+                cgroups.create(dir.path(), &spec.limits).map_err(failed("make the task's control group"))?;
+            }
+            // Whoever gave up and looks meanwhile finds the spec, and waits for the lock.
+            if given_up.is_cancelled() {
+                return Err(SupervisorError::NoAnswer);
+            }
+            program::spawn_shim(&program, dir.path(), lock).map(Begun::Asked).map_err(failed("start the shim"))
+        });
+        let answer = match begun.await? {
+            Begun::Runs(started) => return Ok(started),
+            Begun::Asked(answer) => answer,
+        };
+        let unread = failed("read the shim's answer");
+        let answer = pipe::Receiver::from_owned_fd(answer.into()).map_err(&unread)?;
+        let mut line = Vec::new();
+        answer.take(MAX_ANSWER_BYTES).read_to_end(&mut line).await.map_err(&unread)?;
+        match serde_json::from_slice(&line) {
+            Ok(Answer::Started(started)) => Ok(started),
+            Ok(Answer::Failed(reason)) => Err(SupervisorError::Refused(reason)),
+            Err(_) => Err(SupervisorError::Refused("its shim ended without a word".to_owned())),
+        }
+    }
+
+    /// What has become of the run at `path`. Waits for a start in progress. When the shim was killed, what it left
+    /// behind is ended here: nobody reads its output any more or could tell how it ends.
+    pub async fn observe(&self, path: &Path) -> Result<Observed, SupervisorError> {
+        self.observe_within(path, START_TIMEOUT).await
+    }
+
+    /// The same, but waits for a start in progress no longer than that.
+    pub async fn observe_within(&self, path: &Path, patience: Duration) -> Result<Observed, SupervisorError> {
+        if !path.join("spec.json").exists() {
+            return Ok(Observed::NeverStarted);
+        }
+        let (dir, started, cgroup) = read_within(path, patience).await?;
+        let Some(started) = started else {
+            // The shim died, or the machine went down, before it was written who runs it.
+            Containment::new(dir.path(), None, cgroup).end(KILL_TIMEOUT).await?;
+            return Ok(if dir.has_begun() { Observed::Gone } else { Observed::NeverStarted });
+        };
+        // The order matters: a shim that is gone has written `exit.json` before, if it could.
+        let shim_lives = started.shim.is_alive();
+        if let Some(ended) = dir.ended()? {
+            let killed = ended.out_of_memory_bytes.map(|limit_bytes| Observed::OutOfMemory { limit_bytes });
+            return Ok(killed.unwrap_or(Observed::Exited(ended.status)));
+        }
+        if shim_lives {
+            let age = started.task.age().map_err(failed("read the machine's uptime"))?;
+            return Ok(Observed::Running { pid: started.task.pid, age });
+        }
+        Containment::new(dir.path(), None, cgroup).end(KILL_TIMEOUT).await?;
+        Ok(Observed::Gone)
+    }
+
+    /// Resolves when the run at `path` does not run any more, at once if it doesn't now. Nothing is polled. Cancel-safe.
+    pub async fn wait(&self, path: &Path) -> Result<Observed, SupervisorError> {
+        loop {
+            let observed = self.observe(path).await?;
+            if !matches!(observed, Observed::Running { .. }) {
+                return Ok(observed);
+            }
+            let Some(started) = read(path).await?.1 else { continue };
+            if let Some(shim) = started.shim.open().map_err(failed("watch the shim"))? {
+                shim.ended().await.map_err(failed("watch the shim"))?;
+            }
+        }
+    }
+
+    /// The processes that the run at `path` has now.
+    pub async fn pids(&self, path: &Path) -> Result<Vec<u32>, SupervisorError> {
+        let (dir, started, cgroup) = read(path).await?;
+        let containment = Containment::new(dir.path(), started.map(|started| started.shim), cgroup);
+        let members = containment.in_background(Containment::members).await;
+        let members = members.map_err(failed("look for the task's processes"))?;
+        Ok(members.iter().map(|member| member.pid).collect())
+    }
+
+    /// Ends the run at `path`: SIGINT to the task's process group, or to its first process alone where its launcher wants
+    /// that; `grace`; SIGTERM to all of it; `grace`; SIGKILL.
+    /// Afterwards none of its processes is left, wherever they had hidden. Dropping the future leaves a run that may
+    /// still be ending; calling again begins with SIGINT again, and on a run that has ended only makes sure.
+    pub async fn stop(&self, path: &Path, grace: Duration) -> Result<Observed, SupervisorError> {
+        let mut observed = match self.observe(path).await {
+            Err(SupervisorError::Starting) => {
+                self.end_start(path).await?;
+                self.observe(path).await?
+            }
+            observed => observed?,
+        };
+        if observed == Observed::NeverStarted && !path.exists() {
+            return Ok(observed);
+        }
+        let (dir, started, cgroup) = read(path).await?;
+        let containment = Containment::new(dir.path(), started.as_ref().map(|started| started.shim.clone()), cgroup);
+        if let (Observed::Running { .. }, Some(started)) = (&observed, &started) {
+            observed = self.end_run(&dir, &containment, &started.task, grace).await?;
+        }
+        containment.end(KILL_TIMEOUT).await?;
+        Ok(observed)
+    }
+
+    /// Kills what is in the control group of a run whose start does not end: it hangs before the task's own program, as on
+    /// a file system that does not answer. Its shim then takes it for a task that has ended, and lets go of the lock.
+    async fn end_start(&self, path: &Path) -> Result<(), SupervisorError> {
+        let Some(cgroups) = self.cgroups.clone() else { return Err(SupervisorError::Starting) };
+        let path = path.to_owned();
+        in_background("end the start", move || {
+            let group = cgroups.group(RunDir::create(&path)?.path());
+            group.kill().map_err(failed("end the start"))
+        })
+        .await
+    }
+
+    async fn end_run(
+        &self,
+        dir: &RunDir,
+        containment: &Containment,
+        task: &ProcessIdentity,
+        grace: Duration,
+    ) -> Result<Observed, SupervisorError> {
+        let (path, signalled) = (dir.path(), failed("signal the task"));
+        match dir.spec()?.map(|spec| spec.interrupt).unwrap_or_default() {
+            // The task's first process leads its group.
+            Interrupt::Group => {
+                let group = task.pid;
+                containment.in_background(move |all| all.signal_group(group, Signal::SIGINT)).await
+            }
+            Interrupt::Leader => signal_each([task], Signal::SIGINT),
+        }
+        .map_err(&signalled)?;
+        if let Ok(ended) = tokio::time::timeout(grace, self.wait(path)).await {
+            return ended;
+        }
+        containment.in_background(|all| all.signal_all(Signal::SIGTERM)).await.map_err(&signalled)?;
+        if let Ok(ended) = tokio::time::timeout(grace, self.wait(path)).await {
+            return ended;
+        }
+        containment.end(KILL_TIMEOUT).await?;
+        // The shim needs a moment to write the end down; should it hang, the run is over all the same.
+        tokio::time::timeout(KILL_TIMEOUT, self.wait(path)).await.unwrap_or(Ok(Observed::Gone))
+    }
+}
+
+/// The run directory, who runs it and in which control group, once no start is in progress; an error where one never ends.
+async fn read(path: &Path) -> Result<(RunDir, Option<Started>, Option<PathBuf>), SupervisorError> {
+    read_within(path, START_TIMEOUT).await
+}
+
+async fn read_within(
+    path: &Path,
+    patience: Duration,
+) -> Result<(RunDir, Option<Started>, Option<PathBuf>), SupervisorError> {
+    let (dir, (started, spec)) = once_locked(path, patience, |dir| {
+        let Some(_no_start_in_progress) = dir.try_lock_shared()? else { return Ok(None) };
+        Ok(Some((dir.started()?, dir.spec()?)))
+    })
+    .await?;
+    Ok((dir, started, spec.and_then(|spec| spec.cgroup)))
+}
+
+/// What `attempt` gives for the run directory once it has its lock. It is made again and again, since a thread that waited
+/// for the lock of a start that hangs would be gone for good.
+async fn once_locked<T: Send + 'static>(
+    path: &Path,
+    patience: Duration,
+    attempt: impl Fn(&RunDir) -> Result<Option<T>, SupervisorError> + Copy + Send + 'static,
+) -> Result<(RunDir, T), SupervisorError> {
+    let deadline = Instant::now() + patience;
+    loop {
+        let path = path.to_owned();
+        let tried = in_background("read the run directory", move || {
+            let dir = RunDir::create(&path)?;
+            Ok(attempt(&dir)?.map(|found| (dir, found)))
+        });
+        match tried.await? {
+            Some(found) => return Ok(found),
+            None if Instant::now() >= deadline => return Err(SupervisorError::Starting),
+            None => tokio::time::sleep(LOCK_PAUSE).await,
+        }
+    }
+}
+
+async fn in_background<T: Send + 'static>(
+    what: &'static str,
+    work: impl FnOnce() -> Result<T, SupervisorError> + Send + 'static,
+) -> Result<T, SupervisorError> {
+    tokio::task::spawn_blocking(work).await.map_err(|error| failed(what)(error.into()))?
+}
+
+fn failed(what: &'static str) -> impl Fn(io::Error) -> SupervisorError {
+    move |source| SupervisorError::Io { what, source }
+}

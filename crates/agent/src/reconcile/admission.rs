@@ -1,0 +1,164 @@
+//! Which desired states this robot obeys: signed by the pinned key, for this robot, not older than what it has, still in
+//! force. Pure; a refusal says why, and the state before it stays.
+
+use std::collections::BTreeSet;
+
+use task_proto::RobotId;
+use task_proto::desired::DesiredState;
+use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, EnvelopeError, PublicKey};
+use task_proto::{Generation, TaskName};
+
+use crate::system::clock::PROGRAM_EXISTS_SINCE_MS;
+
+/// The most tasks one robot is sent.
+const MAX_TASKS: usize = 1024;
+
+/// Why a desired state is not obeyed.
+#[derive(Debug, thiserror::Error)]
+pub enum Refused {
+    /// Not signed by the server this robot registered at.
+    #[error("it is not signed by the server this robot registered at")]
+    Signature(#[source] EnvelopeError),
+    /// Signed, but not a desired state.
+    #[error("it is signed, but no desired state")]
+    Malformed(#[source] serde_json::Error),
+    /// For another robot.
+    #[error("it is for robot {0}")]
+    OtherRobot(RobotId),
+    /// Older than what the robot has.
+    #[error("its generation {offered} is older than {accepted}, which this robot has")]
+    Stale {
+        /// The generation offered.
+        offered: Generation,
+        /// The generation accepted before.
+        accepted: Generation,
+    },
+    /// Same number, other content.
+    #[error("its generation {0} was accepted before with other content")]
+    Contradicts(Generation),
+    /// Its time is over.
+    #[error("it expired at {0} ms since 1970")]
+    Expired(u64),
+    /// It names a task twice, or too many.
+    #[error("it names task {0} twice, or a package of another name for it, or more than {MAX_TASKS} tasks")]
+    Tasks(TaskName),
+}
+
+/// The desired state in `envelope`, if this robot may obey it. `accepted` is the state it obeys now.
+pub fn admit(
+    envelope: &Envelope,
+    key: &PublicKey,
+    robot: &RobotId,
+    accepted: Option<&DesiredState>,
+    wall_ms: u64,
+) -> Result<DesiredState, Refused> {
+    let state = open(envelope, key, robot)?;
+    if let Some(accepted) = accepted {
+        let (offered, accepted_generation) = (state.generation, accepted.generation);
+        if offered < accepted_generation {
+            return Err(Refused::Stale { offered, accepted: accepted_generation });
+        }
+        // The server signs a state anew before it expires; the content must be the same.
+        if offered == accepted_generation && state.tasks != accepted.tasks {
+            return Err(Refused::Contradicts(offered));
+        }
+        if offered == accepted_generation && state.issued_at_ms < accepted.issued_at_ms {
+            return Ok(accepted.clone());
+        }
+    }
+    if is_expired(&state, wall_ms) {
+        return Err(Refused::Expired(state.expires_at_ms));
+    }
+    Ok(state)
+}
+
+/// The desired state in `envelope`, signature, robot and shape verified, its age not.
+pub fn open(envelope: &Envelope, key: &PublicKey, robot: &RobotId) -> Result<DesiredState, Refused> {
+    let payload = envelope.open(DESIRED_STATE_TYPE, key).map_err(Refused::Signature)?;
+    let state: DesiredState = serde_json::from_slice(&payload).map_err(Refused::Malformed)?;
+    if state.robot_id != *robot {
+        return Err(Refused::OtherRobot(state.robot_id));
+    }
+    let mut names = BTreeSet::new();
+    for (count, task) in state.tasks.iter().enumerate() {
+        if count >= MAX_TASKS || task.package.name != task.task || !names.insert(&task.task) {
+            return Err(Refused::Tasks(task.task.clone()));
+        }
+    }
+    Ok(state)
+}
+
+/// Whether the state's time is over. A clock that shows a time before this program existed is wrong, as on a robot
+/// without a battery clock, and must not lock it out.
+pub fn is_expired(state: &DesiredState, wall_ms: u64) -> bool {
+    wall_ms >= PROGRAM_EXISTS_SINCE_MS && wall_ms >= state.expires_at_ms
+}
+
+#[cfg(test)]
+mod tests {
+    use task_proto::desired::{BlobRef, Delivery, DesiredTask, PackageRef, Wanted};
+    use task_proto::envelope::SigningKey;
+    use task_proto::{DeploymentId, Digest};
+
+    use super::*;
+
+    const NOW_MS: u64 = PROGRAM_EXISTS_SINCE_MS + 1000;
+
+    fn task(name: &str) -> DesiredTask {
+        let blob = BlobRef { digest: Digest::of(name.as_bytes()), size: 1 };
+        let name: TaskName = name.parse().expect("valid");
+        let version = "1".parse().expect("valid");
+        DesiredTask {
+            task: name.clone(),
+            deployment: DeploymentId::random(),
+            package: PackageRef { name, version, manifest: blob, config: blob, content: blob },
+            wanted: Wanted::Running,
+            run: 1,
+            delivery: Delivery::PushPull,
+            priority: 0,
+        }
+    }
+
+    fn state(robot: &RobotId, generation: u64) -> DesiredState {
+        DesiredState {
+            robot_id: robot.clone(),
+            generation: Generation(generation),
+            issued_at_ms: NOW_MS,
+            expires_at_ms: NOW_MS + 1,
+            tasks: vec![task("a"), task("b")],
+            evidence: Default::default(),
+            settings: Default::default(),
+        }
+    }
+
+    fn seal(state: &DesiredState, key: &SigningKey) -> Envelope {
+        Envelope::seal(DESIRED_STATE_TYPE, &serde_json::to_vec(state).expect("json"), key)
+    }
+
+    #[test]
+    fn only_a_signed_newer_state_of_this_robot_is_obeyed() {
+        let (key, robot) = (SigningKey::random(), RobotId::random());
+        let accepted = state(&robot, 5);
+        let ask = |state: &DesiredState, key_used: &SigningKey| {
+            admit(&seal(state, key_used), &key.public_key(), &robot, Some(&accepted), NOW_MS)
+        };
+        assert_eq!(ask(&state(&robot, 6), &key).expect("newer").generation, Generation(6));
+        assert!(matches!(ask(&state(&robot, 6), &SigningKey::random()), Err(Refused::Signature(_))));
+        assert!(matches!(ask(&state(&RobotId::random(), 6), &key), Err(Refused::OtherRobot(_))));
+        assert!(matches!(ask(&state(&robot, 4), &key), Err(Refused::Stale { .. })));
+        assert!(matches!(ask(&state(&robot, 5), &key), Err(Refused::Contradicts(_))));
+        let resigned = DesiredState { issued_at_ms: NOW_MS + 9, expires_at_ms: NOW_MS + 99, ..accepted.clone() };
+        assert_eq!(ask(&resigned, &key).expect("signed anew"), resigned);
+        let expired = DesiredState { expires_at_ms: NOW_MS, ..state(&robot, 6) };
+        assert!(matches!(ask(&expired, &key), Err(Refused::Expired(_))));
+        let doubled = DesiredState { tasks: vec![task("a"), task("a")], ..state(&robot, 6) };
+        assert!(matches!(ask(&doubled, &key), Err(Refused::Tasks(_))));
+    }
+
+    #[test]
+    fn a_clock_that_is_plainly_wrong_locks_nobody_out() {
+        let (key, robot) = (SigningKey::random(), RobotId::random());
+        let old = DesiredState { expires_at_ms: 1, ..state(&robot, 1) };
+        assert!(admit(&seal(&old, &key), &key.public_key(), &robot, None, 0).is_ok());
+    }
+}

@@ -1,0 +1,124 @@
+//! What the driver makes of what it hears from the server: desired states, confirmations, refusals.
+
+use bytes::Bytes;
+use task_proto::api::ReportReply;
+use task_proto::desired::Inline;
+use task_proto::envelope::Envelope;
+use task_proto::id::Labels;
+use task_proto::report::{Condition, Report};
+
+use super::{Driver, Speaker, requires_labels};
+use crate::link::state::Heard;
+use crate::reconcile::admission::{self, Refused};
+use crate::system::error_chain::chain;
+use crate::task::effects::Effects;
+use crate::task::ledger::Accepted;
+
+/// The condition of a robot that does not obey what it was sent.
+const STATE_REFUSED: &str = "state_refused";
+/// The conditions that end once a state is accepted.
+pub(super) const REFUSALS: [&str; 2] = [STATE_REFUSED, Report::STATE_CONTRADICTED];
+/// How much of the server's reason for refusing the token is kept.
+const MOST_REASON_CHARS: usize = 300;
+
+impl<E: Effects> Driver<E> {
+    pub(super) fn hear(&mut self, message: Heard) {
+        match message {
+            Heard::Desired { envelope, inline, was_asked_for } => {
+                if was_asked_for {
+                    self.known_by_server();
+                }
+                self.consider(*envelope, &inline);
+            }
+            Heard::Unchanged => self.known_by_server(),
+            Heard::Confirmed { reply, .. } => {
+                if let Some(reply) = reply {
+                    self.known_by_server();
+                    self.settle_settings(&reply);
+                }
+            }
+            Heard::TokenRefused(why) => {
+                let why: String = why.chars().filter(|c| !c.is_control()).take(MOST_REASON_CHARS).collect();
+                if !self.ledger.removed || self.ledger.removed_because != why {
+                    tracing::warn!(why, "the server does not accept this robot's token: nothing new is begun");
+                    (self.ledger.removed, self.ledger.removed_because) = (true, why);
+                    self.dirty = true;
+                }
+            }
+            Heard::Withheld { code, text } => {
+                if self.withheld.as_ref().is_none_or(|known| known.code != code) {
+                    tracing::info!(code, text, "the server sends no state");
+                }
+                self.withheld = Some(Condition { code, text });
+            }
+        }
+    }
+
+    /// The server has answered this robot, or signed something new for it: it has not removed it, or not for good.
+    fn known_by_server(&mut self) {
+        self.withheld = None;
+        if self.ledger.removed {
+            (self.ledger.removed, self.ledger.removed_because) = (false, String::new());
+            self.dirty = true;
+        }
+    }
+
+    /// Accepts a desired state or says why not.
+    fn consider(&mut self, envelope: Envelope, inline: &Inline) {
+        let Speaker { server_key, robot_id, .. } = &self.speaker;
+        let wall_ms = self.effects.now().wall_ms;
+        match admission::admit(&envelope, server_key, robot_id, self.desired.as_ref(), wall_ms) {
+            Ok(state) => {
+                REFUSALS.iter().for_each(|code| drop(self.conditions.remove(code)));
+                self.withheld = None;
+                if !inline.is_empty() {
+                    let packages = state.tasks.iter().flat_map(|task| [task.package.config, task.package.content]);
+                    let blobs = packages.chain(state.evidence.blobs());
+                    let came = blobs.filter_map(|blob| Some((blob, Bytes::copy_from_slice(inline.get(&blob)?))));
+                    self.effects.offer(came.collect());
+                }
+                self.effects.heed(&state);
+                if self.desired.as_ref() != Some(&state) {
+                    self.known_by_server();
+                    tracing::info!(generation = %state.generation, tasks = state.tasks.len(), "accepted a desired state");
+                    self.ledger.accepted = Some(Accepted { generation: state.generation, envelope });
+                    // The order may be for a label that the robot was given just before it: ask again.
+                    // Likewise for what a person has installed since the last one.
+                    (self.robot.labels, self.robot.installations) = (None, None);
+                    if self.views.values().filter_map(|view| view.prepared.as_ref()).any(requires_labels) {
+                        self.shared.post.notify_one();
+                    }
+                    self.desired = Some(state);
+                    self.dirty = true;
+                }
+            }
+            Err(refused) => {
+                let text = format!("a desired state was refused: {}", chain(&refused));
+                tracing::warn!("{text}");
+                let is_other = matches!(refused, Refused::Contradicts(_));
+                self.conditions.insert(if is_other { Report::STATE_CONTRADICTED } else { STATE_REFUSED }, text);
+            }
+        }
+    }
+
+    /// What the server holds wins; what the robot's own settings say otherwise is reported.
+    fn settle_settings(&mut self, reply: &ReportReply) {
+        let mut differences = Vec::new();
+        if let Some(own) = self.speaker.name.as_ref().filter(|own| **own != reply.name) {
+            differences.push(format!("name is {own} here and {} there", reply.name));
+        }
+        if let Some(own) = self.speaker.labels.as_ref().filter(|own| **own != reply.labels) {
+            let text = |labels: &Labels| {
+                labels.iter().map(|(key, value)| format!("{key}={value}")).collect::<Vec<_>>().join(",")
+            };
+            differences.push(format!("labels are {:?} here and {:?} there", text(own), text(&reply.labels)));
+        }
+        if differences.is_empty() {
+            self.conditions.remove("settings_differ");
+        } else {
+            let text = format!("the server's settings hold, the robot's own differ: {}", differences.join("; "));
+            self.conditions.insert("settings_differ", text);
+        }
+        self.robot.labels = Some(reply.labels.clone());
+    }
+}

@@ -1,0 +1,182 @@
+//! What the driver reports: a snapshot of the ledger in the wire's types, published when it says something new.
+
+use std::sync::Arc;
+
+use task_proto::TaskName;
+use task_proto::report::{ActiveVersion, Condition, Failure, FailureCode, Phase, Report, TaskReport};
+use tokio::time::Instant;
+
+use super::hearing::REFUSALS;
+use super::{Driver, View};
+use crate::reconcile::admission;
+use crate::system::clock;
+use crate::task::effects::Effects;
+use crate::task::ledger::{LostFiles, TaskRecord};
+use crate::task::observed::{Health, ProcessState, Vouched};
+use crate::task::plan::Lane;
+use crate::transfer::link_meter;
+
+/// A battery that has lost less is no news.
+const BATTERY_STEP_PERCENT: u8 = 5;
+
+impl<E: Effects> Driver<E> {
+    /// Publishes a snapshot, if it says anything that the last one did not.
+    pub(super) fn publish_report(&mut self) {
+        let report = self.report();
+        let again = std::mem::take(&mut self.asks_again);
+        let news = self.shared.reports.borrow().as_ref().is_none_or(|last| !says_the_same(last, &report));
+        if news || again {
+            self.seq = report.seq;
+            self.shared.reports.send_replace(Some(Arc::new(report)));
+        }
+        let settled = self.is_settled();
+        self.shared.settled.send_if_modified(|last| std::mem::replace(last, settled) != settled);
+    }
+
+    fn report(&self) -> Report {
+        let now_ms = self.effects.now().boot_ms;
+        let tasks = self.ledger.tasks.iter();
+        Report {
+            robot_id: self.speaker.robot_id.clone(),
+            start: self.ledger.start,
+            instance: self.speaker.instance.clone(),
+            place: self.speaker.place,
+            boot_id: self.speaker.boot_id.clone(),
+            seq: self.seq + 1,
+            observed_generation: self.observed,
+            uptime_ms: u64::try_from(self.started.elapsed().as_millis()).unwrap_or(u64::MAX),
+            host: self.effects.host_facts(),
+            conditions: self.all_conditions(),
+            link: self.shared.meter.facts(Instant::now()),
+            tasks: tasks.map(|(task, record)| task_report(task, record, self.views.get(task), now_ms)).collect(),
+        }
+    }
+
+    fn all_conditions(&self) -> Vec<Condition> {
+        let condition = |code: &str, text: &str| Condition { code: code.to_owned(), text: text.to_owned() };
+        let mut conditions: Vec<Condition> = self.conditions.iter().map(|(code, text)| condition(code, text)).collect();
+        if self.held {
+            conditions.push(condition("held", "a person at the robot said hold: nothing is started or switched"));
+        }
+        conditions.extend(self.ledger.removal().map(|text| condition("removed", &text)));
+        if let Some(text) = &self.robot.no_task_user {
+            conditions.push(condition(FailureCode::NO_TASK_USER.as_str(), text));
+        }
+        let wall_ms = self.effects.now().wall_ms;
+        if self.desired.as_ref().is_some_and(|state| admission::is_expired(state, wall_ms)) {
+            conditions.push(condition("state_expired", "the desired state has expired: nothing new is begun"));
+        }
+        if wall_ms < clock::PROGRAM_EXISTS_SINCE_MS {
+            let text = format!(
+                "this robot's clock is wrong: it shows {}, when this agent did not exist yet",
+                &task_proto::time::timestamp(wall_ms)[..10]
+            );
+            conditions.push(condition("clock_wrong", &text));
+        }
+        if let Some(text) = &self.trust.refused_list {
+            conditions.push(condition("publishers_refused", text));
+        }
+        let undone: Vec<&str> = self.views.values().filter_map(|view| view.undone.as_deref()).collect();
+        if !undone.is_empty() {
+            conditions.push(condition("step_failed", &undone.join("; ")));
+        }
+        conditions.extend(self.withheld.clone());
+        conditions
+    }
+
+    /// Whether the server need not send what it has sent before: not once half of the state's lifetime is over, so that
+    /// the server sends it signed anew, and not while the robot refuses what it was sent.
+    fn is_settled(&self) -> bool {
+        let Some(state) = &self.desired else { return false };
+        let half_ms = state.issued_at_ms + state.expires_at_ms.saturating_sub(state.issued_at_ms) / 2;
+        let refused = REFUSALS.iter().any(|code| self.conditions.contains_key(code));
+        !refused && self.effects.now().wall_ms < half_ms
+    }
+}
+
+/// Whether two snapshots differ only in what always changes.
+fn says_the_same(last: &Report, next: &Report) -> bool {
+    let without_times = |report: &Report| {
+        let mut report = report.clone();
+        (report.seq, report.uptime_ms, report.host.disk_free_bytes) = (0, 0, 0);
+        (report.host.battery_percent, report.link) = (None, None);
+        report.tasks.iter_mut().for_each(|task| task.phase_ms = 0);
+        report
+    };
+    let battery = |report: &Report| report.host.battery_percent.map(|percent| percent / BATTERY_STEP_PERCENT);
+    without_times(last) == without_times(next)
+        && battery(last) == battery(next)
+        && !link_meter::is_news(last.link.as_ref(), next.link.as_ref())
+}
+
+/// Why the run that is kept alive is not as it should be: something is missing that it once had, or the robot does not
+/// let an older one than ordered start again, or its files do not come back.
+fn degraded(record: &TaskRecord, view: Option<&View>) -> Option<Failure> {
+    let ready = record.active.as_ref().and_then(|active| active.process.as_ref()).is_some_and(|process| process.ready);
+    match view.map(|view| &view.health) {
+        Some(Health::Missing(missing)) if ready => Some(missing.failure()),
+        _ => {
+            let refusal = record.refusal().filter(|(question, _)| !record.concerns_order(question));
+            let of_order =
+                |lost: &&LostFiles| lost.deployment == record.order.deployment && lost.run == record.order.run;
+            let files = record.collections.iter().find_map(|files| files.failure.as_ref());
+            let lost = record.lost.as_ref().filter(of_order).map(|lost| &lost.failure);
+            let distrusted = distrusted(record, view).filter(|_| ready);
+            distrusted.or(refusal.map(|(_, why)| why).or(files).or(lost).cloned())
+        }
+    }
+}
+
+/// That what runs would not be started again.
+fn distrusted(record: &TaskRecord, view: Option<&View>) -> Option<Failure> {
+    let active = record.active.as_ref().filter(|active| active.package == record.order.package)?;
+    let vouched = view?.prepared.as_ref()?.vouched;
+    let text = format!(
+        "the trusted publishers' signatures are not enough for {} {} any more: it goes on, and is not started again",
+        active.package.name, active.package.version
+    );
+    (vouched == Vouched::No).then(|| Failure::new(FailureCode::UNTRUSTED_PACKAGE, text))
+}
+
+fn task_report(task: &TaskName, record: &TaskRecord, view: Option<&View>, now_ms: u64) -> TaskReport {
+    let (phase, failure) = record.standing();
+    let lane = match phase {
+        Phase::Fetching => Some(Lane::Prepare),
+        Phase::Running => Some(Lane::Collect),
+        _ => None,
+    };
+    let progress = lane.and_then(|lane| view?.progress.get(&lane).copied());
+    // All bytes are there: what is left of a pull is unpacking.
+    let unpacking = phase == Phase::Fetching && progress.is_some_and(|progress| progress.done >= progress.total);
+    let active = record.active.as_ref();
+    let for_order = active.filter(|active| active.is_for(&record.order));
+    TaskReport {
+        task: task.clone(),
+        deployment: record.order.deployment.clone(),
+        package: record.order.package.clone(),
+        wanted: record.order.wanted,
+        run: record.order.run,
+        kind: for_order.map(|active| active.rules.kind).or(record.preparation.kind),
+        phase: if unpacking { Phase::Unpacking } else { phase },
+        phase_ms: now_ms.saturating_sub(record.phase_since_ms),
+        progress: progress.filter(|_| !unpacking),
+        missing_parts: view.and_then(|view| view.asked.as_ref()?.borrow().missing.clone()),
+        attempts: record.preparation.attempts,
+        restarts: for_order.map_or(0, |active| active.restarts),
+        failure: failure.cloned(),
+        degraded: degraded(record, view),
+        active: active.and_then(|active| {
+            let process = active.process.as_ref()?;
+            let pid = match view.and_then(|view| view.process.as_ref()) {
+                Some(ProcessState::Alive { pid }) => Some(*pid),
+                _ => process.pid,
+            };
+            Some(ActiveVersion {
+                deployment: active.deployment.clone(),
+                version: active.package.version.clone(),
+                manifest: Some(active.package.manifest.digest),
+                pid: pid?,
+            })
+        }),
+    }
+}

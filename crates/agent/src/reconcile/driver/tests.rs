@@ -1,0 +1,550 @@
+//! The driver's logic, with a robot whose effects only take notes.
+
+mod fake;
+mod hanging;
+mod removed;
+
+use task_proto::api::ReportReply;
+use task_proto::desired::{BlobRef, Delivery, Inline, PackageRef, Wanted};
+use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
+use task_proto::part::PartRange;
+use task_proto::report::{Failure, FailureCode, Phase, Report};
+use task_proto::{DeploymentId, Digest};
+
+use self::fake::Fake;
+use super::*;
+use crate::task::ledger::GateStep;
+use crate::task::observed::Missing;
+
+/// How long a test waits for what should come at once.
+const PATIENCE: Duration = Duration::from_secs(20);
+
+fn order(version: &str) -> DesiredTask {
+    let blob = BlobRef { digest: Digest::of(version.as_bytes()), size: 1 };
+    let name: TaskName = "talker".parse().expect("valid");
+    let version = version.parse().expect("valid");
+    DesiredTask {
+        task: name.clone(),
+        deployment: DeploymentId::random(),
+        package: PackageRef { name, version, manifest: blob, config: blob, content: blob },
+        wanted: Wanted::Running,
+        run: 1,
+        delivery: Delivery::PushPull,
+        priority: 0,
+    }
+}
+
+/// A driver at work, and the server's side of it.
+struct Bench {
+    fake: Arc<Fake>,
+    shared: Shared,
+    heard: mpsc::Sender<Heard>,
+    key: SigningKey,
+    robot: RobotId,
+    driver: tokio::task::JoinHandle<()>,
+}
+
+impl Bench {
+    async fn new() -> Self {
+        let (key, robot) = (SigningKey::random(), RobotId::random());
+        let fake = Arc::new(Fake::default());
+        fake.sees(Health::Holds { since_ms: 0 });
+        Self::with(fake, Ledger::new(0), key, robot).await
+    }
+
+    async fn with(fake: Arc<Fake>, ledger: Ledger, key: SigningKey, robot: RobotId) -> Self {
+        let shared = Shared::new(CancellationToken::new());
+        let speaker = Speaker {
+            robot_id: robot.clone(),
+            server_key: key.public_key(),
+            instance: InstanceId::random(),
+            place: None,
+            boot_id: "boot".to_owned(),
+            name: Some("atlas".parse().expect("valid")),
+            labels: None,
+        };
+        let driver = Driver::new(fake.clone(), speaker, shared.clone(), ledger, None).await;
+        let (heard, messages) = mpsc::channel(4);
+        Self { fake, shared, heard, key, robot, driver: tokio::spawn(driver.run(messages)) }
+    }
+
+    fn sealed(&self, generation: u64, tasks: Vec<DesiredTask>, key: &SigningKey) -> Heard {
+        let now_ms = crate::system::clock::wall_ms();
+        let state = DesiredState {
+            robot_id: self.robot.clone(),
+            generation: Generation(generation),
+            issued_at_ms: now_ms,
+            expires_at_ms: now_ms + 1_000_000,
+            tasks,
+            evidence: Default::default(),
+            settings: Default::default(),
+        };
+        let payload = serde_json::to_vec(&state).expect("json");
+        let envelope = Box::new(Envelope::seal(DESIRED_STATE_TYPE, &payload, key));
+        Heard::Desired { envelope, inline: Inline::default(), was_asked_for: false }
+    }
+
+    async fn order(&self, generation: u64, tasks: Vec<DesiredTask>) {
+        self.say(self.sealed(generation, tasks, &self.key)).await;
+    }
+
+    async fn say(&self, message: Heard) {
+        self.heard.send(message).await.expect("the driver listens");
+    }
+
+    /// The first report of which `expected` is true.
+    async fn report(&self, expected: impl Fn(&Report) -> bool) -> Report {
+        let mut reports = self.shared.reports.subscribe();
+        let found = reports.wait_for(|report| report.as_ref().is_some_and(|report| expected(report)));
+        let found = tokio::time::timeout(PATIENCE, found).await.expect("it is reported").expect("the driver lives");
+        Report::clone(found.as_ref().expect("waited for"))
+    }
+
+    async fn phase(&self, phase: Phase) -> Report {
+        self.report(|report| report.tasks.first().is_some_and(|task| task.phase == phase)).await
+    }
+
+    async fn end(self) -> Ledger {
+        self.shared.shutdown.cancel();
+        self.driver.await.expect("no panic");
+        self.fake.state(|state| state.ledgers.last().cloned()).expect("a ledger")
+    }
+}
+
+fn has(report: &Report, code: &str) -> bool {
+    report.conditions.iter().any(|condition| condition.code == code)
+}
+
+#[tokio::test]
+async fn an_order_runs_and_its_withdrawal_removes_it() {
+    let bench = Bench::new().await;
+    bench.order(1, vec![order("1.0")]).await;
+    let report = bench.phase(Phase::Running).await;
+    assert_eq!(report.observed_generation, Generation(1));
+    assert_eq!(report.tasks[0].active.as_ref().expect("active").pid, 7);
+    bench.order(2, Vec::new()).await;
+    bench.report(|report| report.tasks.is_empty()).await;
+    assert!(bench.fake.state(|state| state.alive.is_empty()));
+    assert!(bench.end().await.tasks.is_empty());
+}
+
+#[tokio::test]
+async fn a_robot_that_lacks_a_package_says_so_before_it_pulls_and_runs_it_once_it_is_installed() {
+    let bench = Bench::new().await;
+    bench.fake.state(|state| {
+        state.exec_depends = ["nav2_bringup", "python3-numpy", "std_msgs", "slam_toolbox"].map(str::to_owned).into();
+        state.ros_packages = ["std_msgs".to_owned()].into();
+    });
+    bench.order(1, vec![order("1.0")]).await;
+    let report = bench.phase(Phase::Unmet).await;
+    let failure = report.tasks[0].failure.clone().expect("why");
+    assert_eq!(failure.code, FailureCode::REQUIREMENTS_UNMET);
+    let list = "lacks what talker 1.0 requires: ROS package nav2_bringup, ROS package slam_toolbox";
+    assert!(failure.text.contains(list), "{failure}");
+    assert!(bench.fake.state(|state| state.contents.is_empty()), "nothing was pulled");
+    // A person installs them; the same package is ordered again.
+    bench.fake.state(|state| state.ros_packages.extend(["nav2_bringup", "slam_toolbox"].map(str::to_owned)));
+    bench.order(2, vec![order("1.0")]).await;
+    bench.phase(Phase::Running).await;
+}
+
+#[tokio::test]
+async fn what_nobody_trusted_has_signed_fails_before_anything_is_pulled() {
+    let bench = Bench::new().await;
+    let (unsigned, signed) = (order("1.0"), order("2.0"));
+    bench.fake.state(|state| state.untrusted.insert(unsigned.package.manifest.digest));
+    bench.order(1, vec![unsigned.clone()]).await;
+    let report = bench.phase(Phase::Failed).await;
+    assert_eq!(report.tasks[0].failure.as_ref().expect("why").code, FailureCode::UNTRUSTED_PACKAGE);
+    bench.fake.state(|state| {
+        assert!(state.manifests.is_empty() && state.contents.is_empty() && state.started.is_empty());
+        assert_eq!((&state.heeded, &state.checked), (&vec![Generation(1)], &vec![unsigned.package.manifest.digest]));
+    });
+    bench.order(2, vec![signed.clone()]).await;
+    bench.phase(Phase::Running).await;
+    // Its publisher is revoked: it goes on, and the report says what that is worth.
+    bench.fake.state(|state| {
+        state.untrusted.insert(signed.package.manifest.digest);
+        state.trust = TrustFacts { epoch: 1, refused_list: Some("it is old".to_owned()), ..TrustFacts::default() };
+    });
+    let report = bench.report(|report| report.tasks[0].degraded.is_some()).await;
+    assert_eq!(report.tasks[0].phase, Phase::Running);
+    assert_eq!(report.tasks[0].degraded.as_ref().expect("waited for").code, FailureCode::UNTRUSTED_PACKAGE);
+    assert!(has(&report, "publishers_refused"));
+}
+
+#[tokio::test]
+async fn what_was_staged_waits_once_the_list_of_its_publishers_is_over() {
+    let bench = Bench::new().await;
+    let held = order("1.0");
+    bench.fake.state(|state| state.held = true);
+    bench.order(1, vec![held.clone()]).await;
+    bench.phase(Phase::Deferred).await;
+    bench.fake.state(|state| {
+        state.untrusted.insert(held.package.manifest.digest);
+        state.trust.list_is_over = true;
+    });
+    bench.phase(Phase::Failed).await;
+    let (checked, started) = bench.fake.state(|state| (state.checked.len(), state.started.len()));
+    assert_eq!((checked, started), (1, 0), "it is looked at again, and not started");
+}
+
+#[tokio::test]
+async fn a_cancel_interrupts_a_pull_and_leaves_the_old_version_running() {
+    let bench = Bench::new().await;
+    let (old, fake) = (order("1.0"), bench.fake.clone());
+    bench.order(1, vec![old.clone()]).await;
+    bench.phase(Phase::Running).await;
+    bench.fake.slow.store(true, std::sync::atomic::Ordering::SeqCst);
+    bench.order(2, vec![order("2.0")]).await;
+    let fetching = bench.phase(Phase::Fetching).await;
+    assert_eq!(fetching.tasks[0].active.as_ref().expect("the old one").version, old.package.version);
+    bench.order(3, vec![old.clone()]).await;
+    bench.report(|report| report.observed_generation == Generation(3) && report.tasks[0].phase == Phase::Running).await;
+    let (started, alive) = bench.fake.state(|state| (state.started.len(), state.alive.len()));
+    assert_eq!((started, alive), (1, 1));
+    bench.end().await;
+    let kept = fake.state(|state| state.kept_parts.clone());
+    assert!(kept.iter().any(|kept| *kept == [order("2.0").package.content.digest]), "{kept:?}");
+    assert_eq!(kept.last(), Some(&vec![]), "what was gathered of 2.0 is deleted, and 1.0 is there");
+}
+
+fn missing(since_ms: u64) -> Health {
+    Health::Missing(Missing {
+        is_its_own: true,
+        since_ms,
+        code: FailureCode::NODE_VANISHED,
+        what: "`/mapper` is gone".to_owned(),
+        seen: "on the graph: `/lidar`".to_owned(),
+    })
+}
+
+#[tokio::test]
+async fn what_ros_says_makes_a_task_ready_degraded_and_whole_again() {
+    let bench = Bench::new().await;
+    bench.fake.sees(Health::Unknown);
+    let order = order("1.0");
+    bench.order(1, vec![order.clone()]).await;
+    bench.phase(Phase::Starting).await;
+    bench.fake.sees(Health::Holds { since_ms: bench.fake.now().boot_ms });
+    bench.phase(Phase::Running).await;
+    bench.fake.sees(missing(bench.fake.now().boot_ms));
+    let report = bench.report(|report| report.tasks[0].degraded.is_some()).await;
+    assert_eq!(report.tasks[0].phase, Phase::Running);
+    let degraded = report.tasks[0].degraded.as_ref().expect("waited for").to_string();
+    assert_eq!(degraded, "node_vanished: `/mapper` is gone; on the graph: `/lidar`");
+    bench.fake.sees(Health::Holds { since_ms: bench.fake.now().boot_ms });
+    bench.report(|report| report.tasks[0].degraded.is_none()).await;
+    assert_eq!(bench.fake.state(|state| state.started.len()), 1);
+    bench.fake.sees(Health::Refused(Failure::new(FailureCode::LIFECYCLE_FAILED, "it will not")));
+    bench.order(2, vec![DesiredTask { run: 2, ..order }]).await;
+    let report = bench.phase(Phase::Failed).await;
+    assert_eq!(report.tasks[0].failure.as_ref().expect("why").code, FailureCode::LIFECYCLE_FAILED);
+    assert!(bench.fake.state(|state| state.alive.is_empty()), "it is stopped before it has failed");
+}
+
+#[tokio::test]
+async fn the_old_version_comes_back_when_the_new_one_does_not_get_ready() {
+    let bench = Bench::new().await;
+    let (old, new) = (order("1.0"), order("2.0"));
+    bench.order(1, vec![old.clone()]).await;
+    bench.phase(Phase::Running).await;
+    bench.fake.state(|state| state.bad.insert(new.package.manifest.digest));
+    bench.order(2, vec![new.clone()]).await;
+    let back = |report: &Report| report.tasks[0].phase == Phase::RolledBack && report.tasks[0].active.is_some();
+    let report = bench.report(back).await;
+    let task = &report.tasks[0];
+    assert_eq!((&task.deployment, task.run), (&new.deployment, 1));
+    assert_eq!(task.failure.as_ref().expect("why").to_string(), "lifecycle_failed: it will not");
+    assert_eq!(task.active.as_ref().expect("the old one").deployment, old.deployment);
+    // Neither a report nor a new agent makes it try again; a new run does.
+    let (fake, key, robot) = (bench.fake.clone(), SigningKey::from_bytes(bench.key.to_bytes()), bench.robot.clone());
+    let ledger = bench.end().await;
+    let bench = Bench::with(fake, ledger, key, robot).await;
+    bench.report(back).await;
+    assert_eq!(bench.fake.state(|state| state.started.len()), 3);
+    bench.fake.state(|state| state.bad.clear());
+    bench.order(3, vec![DesiredTask { run: 2, ..new }]).await;
+    bench.phase(Phase::Running).await;
+}
+
+#[tokio::test]
+async fn the_gate_is_asked_first_and_its_reason_is_reported() {
+    let bench = Bench::new().await;
+    bench.fake.state(|state| state.gate = Some(Err("carries a load".to_owned())));
+    let order = order("1.0");
+    bench.order(1, vec![order.clone()]).await;
+    let report = bench.phase(Phase::Deferred).await;
+    assert_eq!(report.tasks[0].failure.as_ref().expect("why").to_string(), "gate_refused: carries a load");
+    assert!(bench.fake.state(|state| state.started.is_empty()));
+    bench.fake.state(|state| state.gate = Some(Ok(())));
+    bench.phase(Phase::Running).await;
+    bench.fake.state(|state| state.gate = Some(Err("busy".to_owned())));
+    bench.order(2, vec![DesiredTask { wanted: Wanted::Stopped, ..order }]).await;
+    let report = bench.phase(Phase::Deferred).await;
+    assert!(report.tasks[0].active.is_some(), "it runs on");
+    bench.fake.state(|state| state.gate = None);
+    bench.phase(Phase::Stopped).await;
+    let asked = bench.fake.state(|state| state.asked.clone());
+    assert!(asked.starts_with(&[GateStep::Start]) && asked.ends_with(&[GateStep::Stop]), "{asked:?}");
+}
+
+#[tokio::test]
+async fn a_job_has_succeeded_once_its_files_are_at_the_server() {
+    let bench = Bench::new().await;
+    bench.fake.state(|state| state.jobs = true);
+    let order = order("1.0");
+    bench.order(1, vec![order.clone()]).await;
+    bench.phase(Phase::Running).await;
+    bench.fake.exit(0);
+    let sending = |report: &Report| report.tasks[0].progress == Some(Progress { done: 1, total: 2 });
+    let report = bench.report(sending).await;
+    assert_eq!((report.tasks[0].phase, &report.tasks[0].active), (Phase::Running, &None));
+    // The agent dies meanwhile: the job is not run again, its files are sent again, and this time refused.
+    let (fake, key, robot) = (bench.fake.clone(), SigningKey::from_bytes(bench.key.to_bytes()), bench.robot.clone());
+    let ledger = bench.end().await;
+    let failure = Failure::new(FailureCode::OUTPUTS_LOST, "too much");
+    fake.state(|state| state.upload = Some(Err(StepFailure { failure, retry_after_ms: None })));
+    let bench = Bench::with(fake, ledger, key, robot).await;
+    let report = bench.phase(Phase::Succeeded).await;
+    let lost = report.tasks[0].degraded.as_ref().expect("said").to_string();
+    assert_eq!(lost, "outputs_lost: files of run 1 did not come back: outputs_lost: too much");
+    bench.fake.state(|state| state.upload = Some(Ok(())));
+    bench.order(2, vec![DesiredTask { run: 2, ..order }]).await;
+    bench.phase(Phase::Running).await;
+    bench.fake.exit(3);
+    let report = bench.phase(Phase::Failed).await;
+    assert_eq!(report.tasks[0].degraded, None);
+    let (collected, started) = bench.fake.state(|state| (state.collected.clone(), state.started.len()));
+    assert_eq!((collected, started), (vec![1, 2], 2));
+}
+
+#[tokio::test]
+async fn a_refused_state_is_named_and_the_old_one_stays() {
+    let bench = Bench::new().await;
+    bench.order(5, vec![order("1.0")]).await;
+    bench.phase(Phase::Running).await;
+    let forged = bench.sealed(6, Vec::new(), &SigningKey::random());
+    bench.say(forged).await;
+    bench.report(|report| has(report, "state_refused")).await;
+    bench.order(6, vec![order("1.1")]).await;
+    bench.report(|report| !has(report, "state_refused") && report.observed_generation == Generation(6)).await;
+    bench.order(4, Vec::new()).await;
+    let report = bench.report(|report| has(report, "state_refused")).await;
+    assert_eq!((report.observed_generation, report.tasks.len()), (Generation(6), 1));
+    assert_eq!(report.reached_generation(), Generation(6));
+    // What a server orders that was put back to an older copy and has forgotten its sixth.
+    bench.order(6, Vec::new()).await;
+    let report = bench.report(|report| has(report, Report::STATE_CONTRADICTED)).await;
+    assert_eq!((report.reached_generation(), report.tasks.len()), (Generation(7), 1));
+    bench.order(8, Vec::new()).await;
+    bench.report(|report| report.conditions.is_empty() && report.reached_generation() == Generation(8)).await;
+}
+
+#[tokio::test]
+async fn what_is_not_stopped_or_deleted_is_said_until_it_is() {
+    let bench = Bench::new().await;
+    bench.order(1, vec![order("1.0")]).await;
+    bench.phase(Phase::Running).await;
+    let failing =
+        |text: &str| StepFailure { failure: Failure::new(FailureCode::IO_ERROR, text), retry_after_ms: Some(0) };
+    bench.fake.state(|state| {
+        state.stop = Some(failing("it does not end"));
+        state.removal = Some(failing("read-only file system"));
+    });
+    bench.order(2, Vec::new()).await;
+    let said = |report: &Report, text: &str| {
+        report.conditions.iter().any(|condition| condition.code == "step_failed" && condition.text == text)
+    };
+    bench.report(|report| said(report, "stop talker: io_error: it does not end")).await;
+    bench.fake.state(|state| state.stop = None);
+    bench.report(|report| said(report, "remove talker: io_error: read-only file system")).await;
+    bench.fake.state(|state| state.removal = None);
+    bench.report(|report| report.tasks.is_empty() && report.conditions.is_empty()).await;
+}
+
+#[tokio::test]
+async fn a_restarted_agent_adopts_what_runs_and_what_was_ordered() {
+    let bench = Bench::new().await;
+    bench.order(1, vec![order("1.0")]).await;
+    bench.phase(Phase::Running).await;
+    let (fake, key, robot) = (bench.fake.clone(), SigningKey::from_bytes(bench.key.to_bytes()), bench.robot.clone());
+    let ledger = bench.end().await;
+    let bench = Bench::with(fake, ledger, key, robot).await;
+    let report = bench.phase(Phase::Running).await;
+    assert_eq!((report.start, report.observed_generation), (2, Generation(1)));
+    assert_eq!(bench.fake.state(|state| state.started.len()), 1, "nothing is started again");
+}
+
+#[tokio::test]
+async fn nothing_is_begun_until_the_ledger_can_be_written() {
+    let bench = Bench::new().await;
+    bench.fake.state(|state| state.disk_full = true);
+    bench.order(1, vec![order("1.0")]).await;
+    let report = bench.report(|report| has(report, "ledger_unwritable")).await;
+    let text = &report.conditions[0].text;
+    assert!(text.contains("/dev/null/ledger.json"), "{text}");
+    assert!(bench.fake.state(|state| state.manifests.is_empty()));
+    bench.fake.state(|state| state.disk_full = false);
+    let report = bench.phase(Phase::Running).await;
+    assert!(!has(&report, "ledger_unwritable"));
+    assert_eq!(bench.fake.state(|state| state.started.len()), 1);
+}
+
+#[tokio::test]
+async fn what_is_ordered_to_end_ends_although_the_ledger_can_not_be_written() {
+    let bench = Bench::new().await;
+    bench.order(1, vec![order("1.0")]).await;
+    bench.phase(Phase::Running).await;
+    bench.fake.state(|state| state.held = true);
+    bench.order(2, vec![order("2.0")]).await;
+    bench.phase(Phase::Deferred).await;
+    bench.fake.state(|state| (state.disk_full, state.held) = (true, false));
+    // The new version's start would have to be written down: the old one is not stopped for what may never come.
+    bench.report(|report| has(report, "ledger_unwritable")).await;
+    assert_eq!(bench.fake.state(|state| (state.alive.len(), state.started.len())), (1, 1));
+    bench.order(3, Vec::new()).await;
+    let report = bench.report(|report| report.tasks.is_empty()).await;
+    assert!(has(&report, "ledger_unwritable") && bench.fake.state(|state| state.alive.is_empty()));
+    assert_eq!(report.observed_generation, Generation(2), "what a power cut would take was not observed");
+    bench.fake.state(|state| state.disk_full = false);
+    bench.report(|report| report.observed_generation == Generation(3)).await;
+}
+
+#[tokio::test]
+async fn a_robot_whose_clock_starts_in_1970_says_so_and_works() {
+    let bench = Bench::new().await;
+    bench.fake.state(|state| state.wall_ms = Some(5_000));
+    bench.order(1, vec![order("1.0")]).await;
+    let report = bench.phase(Phase::Running).await;
+    let condition = report.conditions.iter().find(|condition| condition.code == "clock_wrong").expect("it says so");
+    assert!(condition.text.contains("it shows 1970-01-01,"), "{}", condition.text);
+    bench.fake.state(|state| state.wall_ms = None);
+    bench.order(2, vec![order("2.0")]).await;
+    bench.report(|report| !has(report, "clock_wrong")).await;
+}
+
+#[tokio::test]
+async fn hold_keeps_a_staged_version_from_starting() {
+    let bench = Bench::new().await;
+    bench.fake.state(|state| state.held = true);
+    bench.order(1, vec![order("1.0")]).await;
+    let report = bench.phase(Phase::Deferred).await;
+    assert!(has(&report, "held"));
+    assert!(bench.fake.state(|state| state.started.is_empty()));
+    bench.fake.state(|state| state.held = false);
+    bench.phase(Phase::Running).await;
+}
+
+#[tokio::test]
+async fn the_servers_name_wins_and_the_difference_is_said() {
+    let bench = Bench::new().await;
+    let reply = |name: &str| ReportReply {
+        generation: Generation(0),
+        name: name.parse().expect("valid"),
+        labels: Labels::new(),
+    };
+    bench.say(Heard::Confirmed { seq: 1, reply: Some(reply("bolt")) }).await;
+    bench.report(|report| has(report, "settings_differ")).await;
+    bench.say(Heard::Confirmed { seq: 2, reply: Some(reply("atlas")) }).await;
+    bench.report(|report| !has(report, "settings_differ")).await;
+}
+
+#[tokio::test]
+async fn a_robot_that_is_told_to_wait_stays_fetching_without_a_failure() {
+    let bench = Bench::new().await;
+    bench.fake.state(|state| state.told_to_wait = vec![1, 3_600_000]);
+    bench.order(1, vec![order("1.0")]).await;
+    let waits = |report: &Report| report.tasks.first().is_some_and(|task| task.progress.is_some());
+    let report = bench.report(waits).await;
+    let task = &report.tasks[0];
+    assert_eq!((task.phase, task.attempts, &task.failure), (Phase::Fetching, 1, &None));
+    assert_eq!(task.progress, Some(Progress { done: 1, total: 2 }));
+    // It waits in its record, so that a new agent of this boot waits on, and another order need not.
+    let ledger = bench.fake.state(|state| state.ledgers.last().cloned()).expect("a ledger");
+    let preparation = &ledger.tasks.values().next().expect("a task").preparation;
+    assert!(preparation.retry_at_ms > bench.fake.now().boot_ms + 3_000_000 && preparation.failure.is_none());
+    bench.order(2, vec![order("1.1")]).await;
+    bench.phase(Phase::Running).await;
+    assert_eq!(*bench.fake.pulls.borrow(), 2);
+}
+
+#[tokio::test]
+async fn what_came_with_an_order_is_offered_if_the_order_is_accepted_and_names_it() {
+    let bench = Bench::new().await;
+    let blob = |bytes: &[u8]| BlobRef { digest: Digest::of(bytes), size: bytes.len() as u64 };
+    let mut order = order("1.0");
+    (order.package.config, order.package.content) = (blob(b"config"), blob(b"content"));
+    let mut came = Inline::default();
+    came.insert(Digest::of(b"config"), b"config".to_vec());
+    came.insert(Digest::of(b"content"), b"others".to_vec());
+    came.insert(Digest::of(b"not asked for"), b"not asked for".to_vec());
+    let rung = |heard: Heard| match heard {
+        Heard::Desired { envelope, .. } => Heard::Desired { envelope, inline: came.clone(), was_asked_for: false },
+        other => other,
+    };
+    bench.say(rung(bench.sealed(1, vec![order.clone()], &SigningKey::random()))).await;
+    bench.report(|report| has(report, "state_refused")).await;
+    assert!(bench.fake.state(|state| state.offered.is_empty()));
+    bench.say(rung(bench.sealed(1, vec![order.clone()], &bench.key))).await;
+    bench.phase(Phase::Running).await;
+    let offered = bench.fake.state(|state| state.offered.clone());
+    assert_eq!(offered, [(order.package.config, bytes::Bytes::from_static(b"config"))]);
+}
+
+#[tokio::test]
+async fn parts_that_are_lacking_are_reported_each_time_they_are_asked_for() {
+    let bench = Bench::new().await;
+    let pushed = DesiredTask { delivery: Delivery::DirectPush, ..order("1.0") };
+    bench.order(1, vec![pushed.clone()]).await;
+    bench.phase(Phase::Fetching).await;
+    let says = |missing: Option<Vec<PartRange>>, times| bench.fake.asks.send_replace(Asks { missing, times });
+    let missing = |report: &Report| report.tasks[0].missing_parts.clone();
+    says(Some(Vec::new()), 1);
+    let first = bench.report(|report| missing(report) == Some(Vec::new())).await;
+    let ranges = vec![PartRange { from: 3, to: 5 }];
+    says(Some(ranges.clone()), 2);
+    let second = bench.report(|report| missing(report).as_ref() == Some(&ranges)).await;
+    says(Some(ranges.clone()), 3);
+    let third = bench.report(|report| report.seq > second.seq && missing(report).as_ref() == Some(&ranges)).await;
+    assert!(first.seq < second.seq && second.seq < third.seq);
+    // The server says that it should pull instead: what it gathers by is ended, and it pulls.
+    bench.order(2, vec![DesiredTask { delivery: Delivery::PushPull, ..pushed }]).await;
+    let report = bench.phase(Phase::Running).await;
+    assert_eq!(missing(&report), None);
+    assert_eq!(bench.fake.state(|state| state.pulled.len()), 1);
+}
+
+#[tokio::test]
+async fn tasks_of_higher_priority_are_prepared_first() {
+    let bench = Bench::new().await;
+    let named = |name: &str, priority| {
+        let mut order = order("1.0");
+        order.task = name.parse().expect("valid");
+        order.package.name = order.task.clone();
+        order.package.manifest.digest = Digest::of(name.as_bytes());
+        DesiredTask { priority, ..order }
+    };
+    // Two at a time are prepared; these wait on a person, so that only the order of the pulls is seen.
+    bench.fake.state(|state| state.held = true);
+    let tasks = [("a", -5), ("b", 0), ("c", 7), ("d", 100), ("e", 0), ("f", 7)];
+    bench.order(1, tasks.map(|(name, priority)| named(name, priority)).into()).await;
+    let all_wait = |report: &Report| report.tasks.iter().filter(|task| task.phase == Phase::Deferred).count() == 6;
+    bench.report(all_wait).await;
+    let begun = bench.fake.state(|state| state.pulled.clone());
+    let place = |name: &str| begun.iter().position(|task| task.as_str() == name).expect("pulled") / 2;
+    let places = ["d", "c", "f", "b", "e", "a"].map(place);
+    assert_eq!(places, [0, 0, 1, 1, 2, 2], "{begun:?}");
+}
+
+#[tokio::test]
+async fn a_report_has_what_was_measured_of_the_link() {
+    let bench = Bench::new().await;
+    let report = bench.report(|_| true).await;
+    assert_eq!(report.link, None);
+    bench.shared.meter.transferred(1 << 20, std::time::Duration::from_secs(1));
+    bench.shared.meter.reconnected(Instant::now());
+    let report = bench.report(|report| report.link.is_some()).await;
+    let link = report.link.expect("waited for");
+    assert_eq!((link.throughput_bytes_per_s, link.reconnects), (Some(1 << 20), 1));
+}

@@ -1,0 +1,102 @@
+//! The watchers of live processes: two for each, one for its end and one for what ROS says of it. They only tell the
+//! driver what they see; what is made of it is the plan's to say.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use task_proto::TaskName;
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+
+use super::{Driver, Seen, Sight, Watched};
+use crate::task::effects::Effects;
+use crate::task::ledger::ActiveRun;
+use crate::task::observed::{Health, ProcessState};
+
+/// After what time ROS is asked again when that has ended by itself.
+const WATCH_AGAIN: Duration = Duration::from_secs(5);
+
+impl<E: Effects> Driver<E> {
+    /// Sees to it that each live process is watched.
+    pub(super) fn watch_processes(&mut self) {
+        for (task, record) in &self.ledger.tasks {
+            let Some(view) = self.views.get_mut(task) else { continue };
+            let Some(active) = &record.active else { continue };
+            let Some(process) = &active.process else { continue };
+            let lives = matches!(view.process, Some(ProcessState::Alive { .. }));
+            // A start that is under way still changes the record that its watcher is given.
+            let starts = self.under_way.contains_key(&(task.clone(), crate::task::plan::Lane::Run));
+            if !lives || starts || view.watched.as_ref().is_some_and(|watched| watched.dir == process.dir) {
+                continue;
+            }
+            let until_dropped = CancellationToken::new();
+            let watcher = Watcher {
+                effects: self.effects.clone(),
+                task: task.clone(),
+                run: active.clone(),
+                dir: process.dir.clone(),
+                sights: self.sights.clone(),
+            };
+            view.watched =
+                Some(Watched { dir: process.dir.clone(), _until_dropped: until_dropped.clone().drop_guard() });
+            tokio::spawn(async move {
+                // Cancel-safe: whatever was not sent is of no use any more.
+                tokio::select! {
+                    () = watcher.watch_end() => {}
+                    () = watcher.watch_health() => {}
+                    () = until_dropped.cancelled() => return,
+                }
+                watcher.tell(Sight::Over).await;
+            });
+        }
+    }
+
+    /// Takes what a watcher has seen, unless it is of a process that another has followed.
+    pub(super) fn see(&mut self, seen: Seen) {
+        let Some(view) = self.views.get_mut(&seen.task) else { return };
+        if view.watched.as_ref().is_none_or(|watched| watched.dir != seen.dir) {
+            return;
+        }
+        match seen.what {
+            Sight::Over => (view.process, view.watched) = (None, None),
+            Sight::Health(health) => view.health = health,
+        }
+    }
+}
+
+/// Who watches one process.
+struct Watcher<E> {
+    effects: Arc<E>,
+    task: TaskName,
+    run: ActiveRun,
+    dir: String,
+    sights: mpsc::Sender<Seen>,
+}
+
+impl<E: Effects> Watcher<E> {
+    async fn watch_end(&self) {
+        if let Some(process) = &self.run.process {
+            self.effects.process_ended(&self.task, process).await;
+        }
+    }
+
+    /// Passes on what ROS says, until nobody asks it any more.
+    async fn watch_health(&self) {
+        let mut health = self.effects.watch(&self.task, &self.run);
+        loop {
+            let now = health.borrow_and_update().clone();
+            self.tell(Sight::Health(now)).await;
+            if health.changed().await.is_err() {
+                break;
+            }
+        }
+        tracing::warn!(task = %self.task, "what ROS says of it is not watched any more; it soon is again");
+        self.tell(Sight::Health(Health::Unknown)).await;
+        tokio::time::sleep(WATCH_AGAIN).await;
+    }
+
+    /// The driver no longer listens when the agent ends.
+    async fn tell(&self, what: Sight) {
+        let _ = self.sights.send(Seen { task: self.task.clone(), dir: self.dir.clone(), what }).await;
+    }
+}

@@ -1,0 +1,249 @@
+//! Answers about the robot's ROS graph: what it shows, and calls to its nodes that people asked for. It looks through
+//! the agent's own node and decides nothing.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::time::Duration;
+
+use task_proto::TaskName;
+use task_proto::report::Failure;
+use task_proto::request::{Answer, Refusal};
+use task_proto::ros::{GraphName, LifecycleState, NodeDetail, NodeSummary, Parameter, TopicSummary, Transition};
+use tokio::task::JoinSet;
+
+use crate::reconcile::robot::Robot;
+use crate::ros::graph::{Graph, GraphError, Node, ParameterValue, ParticipantId, Snapshot};
+
+/// How long a node may take to answer a question.
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(3);
+/// How long a transition, or setting a parameter, may take: a node may open a device in it.
+const WORK_TIMEOUT: Duration = Duration::from_secs(15);
+/// The most lifecycle nodes whose state a list shows.
+const MAX_STATES: usize = 64;
+
+/// Who answers.
+#[derive(Clone)]
+pub struct GraphAnswers {
+    /// The robot.
+    pub robot: Arc<Robot>,
+}
+
+/// The graph at one moment, and which task each participant is of.
+struct Picture {
+    graph: Graph,
+    snapshot: Arc<Snapshot>,
+    tasks: BTreeMap<ParticipantId, TaskName>,
+}
+
+impl GraphAnswers {
+    /// The nodes, lifecycle nodes with their states.
+    pub async fn nodes(&self) -> Result<Answer, Refusal> {
+        let picture = self.picture().await?;
+        let states = picture.states(picture.snapshot.nodes.iter()).await;
+        let nodes = picture.snapshot.nodes.iter().map(|node| picture.summary(node, &states)).collect();
+        Ok(Answer::Nodes { age_ms: picture.age_ms(), nodes })
+    }
+
+    /// One node with its endpoints; several, if several have the name.
+    pub async fn node(&self, name: &GraphName) -> Result<Answer, Refusal> {
+        let picture = self.picture().await?;
+        let found: Vec<&Node> = picture.snapshot.nodes.iter().filter(|node| node.name == *name).collect();
+        if found.is_empty() {
+            return Err(picture.no_such_node(name));
+        }
+        let states = picture.states(found.iter().copied()).await;
+        let detail = |node: &&Node| NodeDetail {
+            node: picture.summary(node, &states),
+            publishers: node.publishers.clone(),
+            subscriptions: node.subscriptions.clone(),
+            services: node.services.clone(),
+            clients: node.clients.clone(),
+        };
+        Ok(Answer::Node { age_ms: picture.age_ms(), nodes: found.iter().map(detail).collect() })
+    }
+
+    /// The topics, with who is at their ends.
+    pub async fn topics(&self) -> Result<Answer, Refusal> {
+        let picture = self.picture().await?;
+        let topics = topics(&picture.snapshot.nodes);
+        Ok(Answer::Topics { age_ms: picture.age_ms(), topics })
+    }
+
+    /// All parameters of a node.
+    pub async fn parameters(&self, node: &GraphName) -> Result<Answer, Refusal> {
+        let graph = self.graph_with(node).await?;
+        let mut parameters: Vec<_> = graph.parameters(node, ANSWER_TIMEOUT).await.map_err(refused)?;
+        parameters.sort_by(|one, other| one.0.cmp(&other.0));
+        let parameter = |(name, value): (String, ParameterValue)| Parameter { name, value: value.to_json() };
+        Ok(Answer::Parameters { parameters: parameters.into_iter().map(parameter).collect() })
+    }
+
+    /// One parameter of a node.
+    pub async fn parameter(&self, node: &GraphName, name: &str) -> Result<Answer, Refusal> {
+        let graph = self.graph_with(node).await?;
+        match graph.parameter(node, name, ANSWER_TIMEOUT).await.map_err(refused)? {
+            ParameterValue::NotSet => Err(refusal("no_such_parameter", format!("{node} has no parameter {name}"))),
+            value => {
+                Ok(Answer::Parameters { parameters: vec![Parameter { name: name.to_owned(), value: value.to_json() }] })
+            }
+        }
+    }
+
+    /// Sets a parameter, and gives the value it has then.
+    pub async fn set_parameter(&self, node: &GraphName, parameter: &Parameter) -> Result<Answer, Refusal> {
+        let graph = self.graph_with(node).await?;
+        let Parameter { name, value } = parameter;
+        let no_value = || refusal("rejected", format!("{value} is no value that a parameter can have"));
+        let current = graph.parameter(node, name, ANSWER_TIMEOUT).await.map_err(refused)?;
+        let wanted = ParameterValue::from_json(value).ok_or_else(no_value)?.fitting(&current);
+        let results = graph.set_parameters(node, vec![(name.clone(), wanted)], WORK_TIMEOUT).await.map_err(refused)?;
+        if let Some(result) = results.iter().find(|result| !result.successful) {
+            let reason = if result.reason.is_empty() { "it gives no reason" } else { &result.reason };
+            return Err(refusal("rejected", format!("{node} does not accept {name} = {value}: {reason}")));
+        }
+        let now = graph.parameter(node, name, ANSWER_TIMEOUT).await.map_err(refused)?;
+        Ok(Answer::ParameterSet { parameter: Parameter { name: name.clone(), value: now.to_json() } })
+    }
+
+    /// Asks for a transition, and gives the state after it.
+    pub async fn lifecycle(&self, node: &GraphName, transition: Transition) -> Result<Answer, Refusal> {
+        let graph = self.graph_with(node).await?;
+        let before = graph.lifecycle_state(node, ANSWER_TIMEOUT).await.map_err(refused)?;
+        let done = graph.change_state(node, transition, WORK_TIMEOUT).await.map_err(refused)?;
+        if !done {
+            let text = format!("{node} does not {}: it is {}", transition.as_str(), before.as_str());
+            return Err(refusal("rejected", text));
+        }
+        match graph.lifecycle_state(node, ANSWER_TIMEOUT).await {
+            Ok(state) => Ok(Answer::Lifecycle { state }),
+            // A node that was shut down may be gone before it can say so.
+            Err(_) if transition == Transition::Shutdown => Ok(Answer::Lifecycle { state: LifecycleState::Finalized }),
+            Err(error) => Err(refused(error)),
+        }
+    }
+
+    async fn picture(&self) -> Result<Picture, Refusal> {
+        let graph = self.robot.graph().await.map_err(|failure| no_graph(&failure))?;
+        let snapshot = graph.snapshot();
+        let mut tasks = BTreeMap::new();
+        for (task, pids) in self.robot.task_pids().await {
+            let owners = Graph::owners(snapshot.clone(), pids).await;
+            tasks.extend(owners.theirs.into_iter().map(|id| (id, task.clone())));
+        }
+        Ok(Picture { graph, snapshot, tasks })
+    }
+
+    /// The graph, if it has such a node.
+    async fn graph_with(&self, node: &GraphName) -> Result<Graph, Refusal> {
+        let picture = self.picture().await?;
+        let is_there = picture.snapshot.nodes.iter().any(|known| known.name == *node);
+        if is_there { Ok(picture.graph) } else { Err(picture.no_such_node(node)) }
+    }
+}
+
+impl Picture {
+    fn age_ms(&self) -> u64 {
+        u64::try_from(self.snapshot.at.elapsed().as_millis()).unwrap_or(u64::MAX)
+    }
+
+    fn no_such_node(&self, name: &GraphName) -> Refusal {
+        let mut there: Vec<&str> = self.snapshot.nodes.iter().map(|node| node.name.as_str()).collect();
+        there.truncate(20);
+        let there = if there.is_empty() { "nothing".to_owned() } else { there.join(", ") };
+        refusal("no_such_node", format!("there is no node {name}; on the graph: {there}"))
+    }
+
+    /// The states of those nodes that have one and say it in time, all asked at once.
+    async fn states(&self, nodes: impl Iterator<Item = &Node>) -> BTreeMap<GraphName, LifecycleState> {
+        let with_state: BTreeSet<GraphName> =
+            nodes.filter(|node| node.has_lifecycle()).map(|node| node.name.clone()).take(MAX_STATES).collect();
+        let mut asked = JoinSet::new();
+        for name in with_state {
+            let graph = self.graph.clone();
+            asked.spawn(async move {
+                let state = graph.lifecycle_state(&name, ANSWER_TIMEOUT).await;
+                Some((name, state.ok()?))
+            });
+        }
+        asked.join_all().await.into_iter().flatten().collect()
+    }
+
+    fn summary(&self, node: &Node, states: &BTreeMap<GraphName, LifecycleState>) -> NodeSummary {
+        NodeSummary {
+            name: node.name.clone(),
+            task: self.tasks.get(&node.participant).cloned(),
+            lifecycle: states.get(&node.name).copied(),
+        }
+    }
+}
+
+fn topics(nodes: &[Node]) -> Vec<TopicSummary> {
+    let mut topics: BTreeMap<&GraphName, TopicSummary> = BTreeMap::new();
+    for node in nodes {
+        for (endpoints, publishes) in [(&node.publishers, true), (&node.subscriptions, false)] {
+            for endpoint in endpoints {
+                let topic = topics.entry(&endpoint.name).or_insert_with(|| TopicSummary {
+                    name: endpoint.name.clone(),
+                    types: Vec::new(),
+                    publishers: Vec::new(),
+                    subscriptions: Vec::new(),
+                });
+                if !topic.types.contains(&endpoint.kind) {
+                    topic.types.push(endpoint.kind.clone());
+                }
+                let ends = if publishes { &mut topic.publishers } else { &mut topic.subscriptions };
+                // A node with two publishers of a topic is listed once.
+                if ends.last() != Some(&node.name) {
+                    ends.push(node.name.clone());
+                }
+            }
+        }
+    }
+    topics.into_values().collect()
+}
+
+fn refusal(code: &str, text: impl Into<String>) -> Refusal {
+    Refusal { code: code.to_owned(), text: text.into() }
+}
+
+fn no_graph(failure: &Failure) -> Refusal {
+    refusal("no_ros", failure.text.clone())
+}
+
+fn refused(error: GraphError) -> Refusal {
+    let code = match &error {
+        GraphError::NoServer { .. } | GraphError::NoAnswer { .. } => "timeout",
+        GraphError::TooMany { .. } => "too_large",
+        _ => "rejected",
+    };
+    refusal(code, crate::system::error_chain::chain(&error))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use task_proto::ros::Endpoint;
+
+    #[test]
+    fn a_topic_lists_each_of_its_nodes_once() {
+        let endpoint = |kind: &str| Endpoint { name: "/scan".parse().expect("valid"), kind: kind.to_owned() };
+        let node = |name: &str, publishers: Vec<Endpoint>, subscriptions: Vec<Endpoint>| Node {
+            name: name.parse().expect("valid"),
+            participant: ParticipantId([0; 12]),
+            publishers,
+            subscriptions,
+            services: Vec::new(),
+            clients: Vec::new(),
+        };
+        let scan = "sensor_msgs/msg/LaserScan";
+        let found = topics(&[
+            node("/lidar", vec![endpoint(scan), endpoint(scan)], vec![]),
+            node("/mapper", vec![], vec![endpoint(scan)]),
+            node("/odd", vec![], vec![endpoint("std_msgs/msg/String")]),
+        ]);
+        let [topic] = &found[..] else { panic!("{found:?}") };
+        assert_eq!(topic.types, [scan, "std_msgs/msg/String"]);
+        assert_eq!(topic.publishers.len(), 1);
+        assert_eq!(topic.subscriptions.iter().map(GraphName::as_str).collect::<Vec<_>>(), ["/mapper", "/odd"]);
+    }
+}

@@ -1,0 +1,605 @@
+//! The real robot: each effect is a call to the module that owns it, and its error becomes a failure's code and text.
+//! It holds no state beside its settings.
+
+use std::collections::BTreeMap;
+use std::error::Error;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, RwLock};
+use std::time::Duration;
+
+use bytes::Bytes;
+use task_proto::desired::{BlobRef, DesiredState, PackageRef};
+use task_proto::manifest::{BuildTool, TaskManifest};
+use task_proto::report::{Failure, FailureCode, HostFacts, Isolation, Progress, TaskAccounts};
+use task_proto::settings::RobotSettings;
+use task_proto::{Digest, MacAddress, RobotId, TaskName};
+use tokio::sync::watch;
+use tokio_util::sync::CancellationToken;
+
+use self::held::Held;
+use self::outcomes::{build_failure, fetch_failure, later, millis, on_disk, outputs_code, pulled};
+use self::trees::Purpose;
+use crate::config::Config;
+use crate::config::trust::{Trust, Use};
+use crate::install::builder::{self, BuildLimits, BuildOrder};
+use crate::install::fetch::{self, FetchError, Fetcher};
+use crate::install::signature_policy::Vouching;
+use crate::logs;
+use crate::logs::LogSpec;
+use crate::logs::forwarder::ForwardSettings;
+use crate::process::call_filter;
+use crate::process::cgroup::{Cgroups, RunLimits};
+use crate::process::program::ExitStatus;
+use crate::process::run_dir::RunSpec;
+use crate::process::supervisor::{Observed, Supervisor, SupervisorError};
+use crate::reconcile::gate::Gate;
+use crate::ros::graph::GraphProgram;
+use crate::ros::graph_access::GraphAccess;
+use crate::ros::readiness::Promise;
+use crate::ros::watcher::{Watched, Watcher};
+use crate::setup::environment;
+use crate::setup::installation;
+use crate::setup::installation::Installation;
+use crate::setup::launch;
+use crate::setup::script;
+use crate::system::accounts::Accounts;
+use crate::system::battery;
+use crate::system::clock;
+use crate::system::disk;
+use crate::system::disk::Need;
+use crate::system::durable;
+use crate::system::error_chain::chain;
+use crate::system::layout::{DataDir, VersionDir};
+use crate::system::task_user::{TaskUser, TaskUserError};
+use crate::task::effects::{Effects, Now};
+use crate::task::ledger::{ActiveRun, Collection, GateQuestion, Ledger, LedgerError, ProcessRecord};
+use crate::task::observed::{Exit, Health, Prepared, ProcessState, RobotFacts, TrustFacts, Vouched};
+use crate::task::plan::{Done, StepFailure};
+use crate::telemetry::outputs::{self, OutputOrder, Registry};
+use crate::transfer::parts::Asks;
+use crate::transfer::parts::Listening;
+
+mod graph;
+mod held;
+mod outcomes;
+mod ros;
+mod runs;
+mod signers;
+mod trees;
+
+/// Written into a version's directory once it is built.
+const BUILT_MARKER: &str = "built";
+/// Written into a run's directory before its start: what the ledger says of the run, should the ledger be lost.
+const RUN_RECORD: &str = "run.json";
+/// How much of a log's end goes, without its times, into a failure's text.
+const TAIL_BYTES: u64 = 3072;
+
+/// This robot.
+pub struct Robot {
+    data: DataDir,
+    fetcher: Arc<Fetcher>,
+    /// Who vouches for packages, where the robot asks for more than its server's word.
+    vouching: Option<Arc<Vouching>>,
+    listening: Listening,
+    gate: Option<Gate>,
+    registry: Registry,
+    robot: RobotId,
+    supervisor: Supervisor,
+    watcher: Watcher,
+    graph: GraphAccess,
+    /// The ROS that was last seen.
+    ros: RwLock<Vec<Installation>>,
+    /// Its own settings.
+    own: Config,
+    /// What holds of them and of what the server says.
+    held: RwLock<Arc<Held>>,
+    forward: watch::Sender<ForwardSettings>,
+    cgroups: Option<Cgroups>,
+    task_user: Result<Option<TaskUser>, TaskUserError>,
+    /// Whether tasks and builds are denied system calls.
+    filter_calls: bool,
+    accounts: Accounts,
+    mac: MacAddress,
+}
+
+impl Robot {
+    /// The robot whose data is in `data`.
+    pub fn new(
+        data: DataDir,
+        (fetcher, listening): (Fetcher, Listening),
+        registry: Registry,
+        config: &Config,
+        robot: &RobotId,
+        mac: MacAddress,
+    ) -> Self {
+        let held = Held::of(config, RobotSettings::default());
+        let cgroups = Cgroups::find();
+        let task_user = TaskUser::find(config.task_user.as_deref());
+        let user = task_user.as_ref().ok().and_then(Option::as_ref);
+        let program = GraphProgram::of_this_agent(data.root(), cgroups.clone(), user);
+        let graph = GraphAccess::of_robot(mac, data.clone(), program);
+        graph.limit(config.limits.log_bytes);
+        let fetcher = Arc::new(fetcher);
+        let vouching = config.trust.clone().map(|settings| {
+            let trust = Trust::open(settings, data.publishers());
+            Arc::new(Vouching::new(trust, fetcher.clone(), data.clone()))
+        });
+        let task_user = TaskUser::find(config.task_user.as_deref())
+            .and_then(|user| user.map(|user| user.admitted_to(data.root())).transpose());
+        if let Err(error) = &task_user {
+            tracing::warn!(%error, "nothing can be run");
+        }
+        let accounts_data = data.clone();
+        let gate = config.gate.clone().map(|gate| Gate::new(gate, robot.clone(), data.root()));
+        Self {
+            data,
+            fetcher,
+            vouching,
+            listening,
+            gate,
+            registry,
+            robot: robot.clone(),
+            watcher: Watcher::new(graph.clone(), Supervisor::of_this_program(cgroups.clone())),
+            graph,
+            supervisor: Supervisor::of_this_program(cgroups.clone()),
+            cgroups,
+            filter_calls: call_filter::is_wanted(config.seccomp, matches!(&task_user, Ok(Some(_)))),
+            task_user,
+            accounts: Accounts::new(accounts_data, config.task_uids.clone()),
+            ros: RwLock::new(held.installations()),
+            own: config.clone(),
+            forward: watch::Sender::new(config.forward),
+            held: RwLock::new(held),
+            mac,
+        }
+    }
+
+    fn version(&self, package: &PackageRef) -> VersionDir {
+        self.data.task(&package.name).version(&package.manifest.digest)
+    }
+
+    /// The manifest that lies on the disk, verified as if it came from the server.
+    async fn manifest(&self, package: &PackageRef) -> Result<TaskManifest, StepFailure> {
+        self.fetcher.manifest(package, &CancellationToken::new()).await.map_err(fetch_failure)
+    }
+
+    fn run_dir(&self, task: &TaskName, process: &ProcessRecord) -> PathBuf {
+        self.data.task(task).run().join(&process.dir)
+    }
+
+    fn log(&self, task: &TaskName) -> LogSpec {
+        let mut log = LogSpec::at(self.data.task(task).output_log());
+        log.max_bytes = self.held().config.limits.log_bytes.unwrap_or(log.max_bytes);
+        log
+    }
+
+    /// What this version promises about the ROS graph; nothing, where its manifest is gone.
+    fn promise(&self, package: &PackageRef) -> Promise {
+        fetch::stored_manifest(&self.data, package).map_or_else(Promise::default, |manifest| Promise::of(&manifest))
+    }
+
+    /// What processes have that run as `user` with the home directory `home`, once the way to the task's directories is open.
+    fn environment_of(
+        &self,
+        task: &TaskName,
+        user: Option<&TaskUser>,
+        home: &Path,
+    ) -> Result<BTreeMap<String, String>, StepFailure> {
+        let mut environment = self.held().environment.clone();
+        if let Some(user) = user {
+            let opened = user.make_home(home).and_then(|()| user.let_through(&self.data.way_to(task)));
+            opened.map_err(|error| later(FailureCode::IO_ERROR, &error, 0))?;
+            environment.insert("HOME".to_owned(), home.display().to_string());
+            environment.extend(["USER", "LOGNAME"].map(|name| (name.to_owned(), user.name.clone())));
+        }
+        Ok(environment)
+    }
+
+    /// What the task may use: what its package says, else what this robot's settings say.
+    fn limits(&self, manifest: &TaskManifest) -> RunLimits {
+        let (limits, settings) = (&manifest.limits, self.held().task_limits);
+        RunLimits {
+            memory_bytes: limits.memory_mb.map(|megabytes| megabytes << 20).or(settings.memory_bytes),
+            cpu_weight: limits.cpu_weight,
+            pids: limits.pids.map(u64::from).or(settings.pids),
+            filter_calls: self.filter_calls,
+        }
+    }
+}
+
+impl Effects for Robot {
+    fn now(&self) -> Now {
+        Now { boot_ms: clock::boot_ms(), wall_ms: clock::wall_ms() }
+    }
+
+    fn write_ledger(&self, ledger: &Ledger) -> Result<(), LedgerError> {
+        ledger.write(&self.data.ledger())
+    }
+
+    fn is_held(&self) -> bool {
+        self.data.root().join(crate::system::layout::HOLD_FILE).exists()
+    }
+
+    fn is_gated(&self) -> bool {
+        self.gate.is_some()
+    }
+
+    fn robot_facts(&self) -> RobotFacts {
+        let installations = Some(self.installations());
+        let no_task_user = self.task_user.as_ref().err().map(TaskUserError::to_string);
+        RobotFacts { arch: std::env::consts::ARCH.to_owned(), labels: None, installations, no_task_user }
+    }
+
+    async fn look_for_ros(&self) {
+        self.survey().await;
+    }
+
+    fn host_facts(&self) -> HostFacts {
+        let (installations, held) = (self.installations(), self.held());
+        let isolates = self.cgroups.as_ref().is_some_and(Cgroups::isolates);
+        HostFacts {
+            agent_version: env!("CARGO_PKG_VERSION").to_owned(),
+            hostname: std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default().trim().to_owned(),
+            arch: std::env::consts::ARCH.to_owned(),
+            mac: Some(self.mac),
+            ros_distros: installation::all_distros(&installations),
+            disk_free_bytes: disk::room(self.data.root()).map_or(0, |room| room.free),
+            ros: environment::ros_facts(&installations, &held.environment),
+            battery_percent: battery::percent(Path::new(battery::SUPPLIES)),
+            isolation: if isolates { Isolation::Cgroup } else { Isolation::None },
+            accounts: self.task_user.as_ref().ok().map(|user| match user {
+                Some(_) if self.accounts.are_per_task() => TaskAccounts::PerTask,
+                Some(_) => TaskAccounts::Shared,
+                None => TaskAccounts::Agent,
+            }),
+            publishers: self.vouching.as_ref().map(|vouching| vouching.version()),
+            settings: held.effective.clone(),
+        }
+    }
+
+    async fn survivors(&self) -> Vec<(TaskName, ActiveRun)> {
+        let mut survivors = Vec::new();
+        for task in self.data.task_names().unwrap_or_default() {
+            let mut last = None;
+            for entry in std::fs::read_dir(self.data.task(&task).run()).into_iter().flatten().flatten() {
+                let record = std::fs::read(entry.path().join(RUN_RECORD)).ok();
+                let Some(run) = record.and_then(|bytes| serde_json::from_slice::<ActiveRun>(&bytes).ok()) else {
+                    continue;
+                };
+                match self.supervisor.observe(&entry.path()).await {
+                    Ok(Observed::Running { .. }) => last = Some((true, run)),
+                    Ok(Observed::Exited(_) | Observed::OutOfMemory { .. } | Observed::Gone)
+                        if !matches!(last, Some((true, _))) =>
+                    {
+                        last = Some((false, run));
+                    }
+                    _ => {}
+                }
+            }
+            survivors.extend(last.map(|(_, run)| (task, run)));
+        }
+        survivors
+    }
+
+    async fn prepared(&self, package: &PackageRef) -> Prepared {
+        let task = self.data.task(&package.name);
+        let version = self.version(package);
+        let manifest = fetch::stored_manifest(&self.data, package);
+        let content = version.src().is_dir();
+        let needs_build = manifest.as_ref().is_none_or(|manifest| manifest.build.tool != BuildTool::None);
+        Prepared {
+            content,
+            built: content && (!needs_build || version.root().join(BUILT_MARKER).exists()),
+            manifest,
+            versions: task.versions().unwrap_or_default(),
+            vouched: self.vouching.as_ref().map_or(Vouched::Yes, |vouching| vouching.look(package)),
+        }
+    }
+
+    async fn process(&self, task: &TaskName, process: &ProcessRecord) -> ProcessState {
+        let exit = |status, out_of_memory_bytes| {
+            let last_lines = logs::last_lines(&self.log(task).path, TAIL_BYTES);
+            ProcessState::Ended(Exit { status, out_of_memory_bytes, last_lines })
+        };
+        // Whoever asks is not kept waiting by a start that may hang: it asks again.
+        match self.supervisor.observe_within(&self.run_dir(task, process), Duration::ZERO).await {
+            Ok(Observed::NeverStarted) => ProcessState::NeverStarted,
+            Ok(Observed::Running { pid, .. }) => ProcessState::Alive { pid },
+            Ok(Observed::Exited(status)) => exit(Some(status), None),
+            Ok(Observed::OutOfMemory { limit_bytes }) => exit(Some(ExitStatus::Signal(9)), Some(limit_bytes)),
+            Ok(Observed::Gone) => exit(None, None),
+            Err(error) if error.is_malformed() && runs::went_down_with_its_boot(process) => exit(None, None),
+            Err(error) => {
+                tracing::error!(%task, error = %chain(&error), "cannot tell what became of the process");
+                ProcessState::Unknown
+            }
+        }
+    }
+
+    async fn process_ended(&self, task: &TaskName, process: &ProcessRecord) {
+        if let Err(error) = self.supervisor.wait(&self.run_dir(task, process)).await {
+            tracing::error!(%task, error = %chain(&error), "cannot watch the process");
+        }
+    }
+
+    fn watch(&self, task: &TaskName, run: &ActiveRun) -> watch::Receiver<Health> {
+        let watched = run.process.as_ref().map(|process| Watched {
+            dir: self.run_dir(task, process),
+            started_ms: process.started_ms,
+            was_ready: process.ready,
+        });
+        let watched = watched.unwrap_or_default();
+        let facts = self.ros_facts_of(&watched.dir);
+        self.listen_to(&run.package, facts.as_ref());
+        self.watcher.watch(watched, self.promise(&run.package), facts)
+    }
+
+    fn parallel_tasks(&self) -> usize {
+        self.held().config.parallel_tasks
+    }
+
+    fn heed(&self, state: &DesiredState) {
+        self.adopt(&state.settings);
+        self.vouching.iter().for_each(|vouching| vouching.heed(state));
+    }
+
+    fn trust_facts(&self) -> TrustFacts {
+        self.vouching.as_ref().map(|vouching| vouching.facts()).unwrap_or_default()
+    }
+
+    async fn check_signers(&self, package: &PackageRef, cancel: &CancellationToken) -> Result<(), StepFailure> {
+        self.vouched(package, Use::Begin, cancel).await
+    }
+
+    fn keep_parts(&self, wanted: &[Digest]) {
+        if let Err(error) = self.data.clean_parts(wanted) {
+            tracing::warn!(%error, "bytes of packages that are no longer ordered can't be removed");
+        }
+    }
+
+    async fn pull_manifest(&self, package: &PackageRef, cancel: &CancellationToken) -> Result<Done, StepFailure> {
+        self.still_vouched(package)?;
+        pulled(self.fetcher.manifest(package, cancel).await.map(drop))
+    }
+
+    fn offer(&self, blobs: Vec<(BlobRef, Bytes)>) {
+        self.fetcher.offer(blobs);
+    }
+
+    async fn pull_content(
+        &self,
+        package: &PackageRef,
+        progress: &watch::Sender<Progress>,
+        cancel: &CancellationToken,
+    ) -> Result<Done, StepFailure> {
+        self.still_vouched(package)?;
+        let manifest = match self.fetcher.manifest(package, cancel).await {
+            Ok(manifest) => manifest,
+            Err(error) => return pulled(Err(error)),
+        };
+        let done = pulled(self.fetcher.content(package, &manifest, progress, cancel).await)?;
+        self.seal_pulled(package, &manifest, done).await
+    }
+
+    async fn gather_content(
+        &self,
+        package: &PackageRef,
+        progress: &watch::Sender<Progress>,
+        asks: &watch::Sender<Asks>,
+        cancel: &CancellationToken,
+    ) -> Result<Done, StepFailure> {
+        self.still_vouched(package)?;
+        let manifest = match self.fetcher.manifest(package, cancel).await {
+            Ok(manifest) => manifest,
+            Err(error) => return pulled(Err(error)),
+        };
+        let told = (progress, asks);
+        let done = pulled(self.fetcher.pushed_content(package, &manifest, &self.listening, told, cancel).await)?;
+        self.seal_pulled(package, &manifest, done).await
+    }
+
+    async fn build(&self, package: &PackageRef, cancel: &CancellationToken) -> Result<(), StepFailure> {
+        self.still_vouched(package)?;
+        let manifest = self.manifest(package).await?;
+        let (version, tool) = (self.version(package), manifest.build.tool);
+        self.verify(package, tool, Purpose::Build).await?;
+        let user = self.accounts_of(&package.name)?.map(|pair| pair.build);
+        let home = self.data.task(&package.name).build_home();
+        let environment = self.environment_of(&package.name, user.as_ref(), &home)?;
+        let order = BuildOrder {
+            tool,
+            underlays: self.setup_files(&manifest)?,
+            environment,
+            log: self.data.task(&package.name).build_log(),
+            limits: BuildLimits { filter_calls: self.filter_calls, ..self.held().build_limits },
+            version: version.clone(),
+            user,
+            cgroups: self.cgroups.clone(),
+        };
+        builder::build(&order, cancel).await.map_err(|error| build_failure(error, self.data.root()))?;
+        self.seal(package, tool).await?;
+        let marker = version.root().join(BUILT_MARKER);
+        durable::write(&marker, b"", 0o600).map_err(|source| {
+            let error = FetchError::disk(&marker, source);
+            fetch_failure(error.for_want_of_room(self.data.root(), Need::of_file(0)))
+        })
+    }
+
+    async fn ask_gate(&self, task: &TaskName, question: &GateQuestion) -> Result<(), StepFailure> {
+        let Some(gate) = &self.gate else { return Ok(()) };
+        let answer = gate.ask(task, question, &self.held().environment).await;
+        answer.map_err(|failure| StepFailure { failure, retry_after_ms: Some(0) })
+    }
+
+    async fn start(&self, task: &TaskName, run: &ActiveRun) -> Result<u32, StepFailure> {
+        let failed = |error: &dyn Error| later(FailureCode::START_FAILED, error, 0);
+        let Some(process) = &run.process else {
+            return Err(failed(&std::io::Error::other("the ledger names no process to start")));
+        };
+        // What was staged long ago may have waited for a person or the gate until its publishers' list was over.
+        let purpose = if run.has_started() { Use::GoOn } else { Use::Begin };
+        self.vouched(&run.package, purpose, &CancellationToken::new()).await?;
+        let manifest = self.manifest(&run.package).await?;
+        let (version, tool) = (self.version(&run.package), manifest.build.tool);
+        let text = script::run_script(&manifest, &version, &self.setup_files_of(run, &manifest)?);
+        let task_dir = self.data.task(task);
+        let run_dir = self.run_dir(task, process);
+        // What still ran of it could change what is looked at below.
+        self.end_other_runs(&task_dir.run(), Some(&run_dir)).await.map_err(|error| failed(&error))?;
+        self.verify(&run.package, tool, Purpose::Start).await?;
+        let user = self.accounts_of(task)?.map(|pair| pair.run);
+        let mut environment = self.environment_of(task, user.as_ref(), &task_dir.home())?;
+        self.make_work_dir(&run.package, tool, user.clone()).await?;
+        environment.extend(ros::node_logs(&version, user.as_ref()).await);
+        durable::write(&version.run_script(), text.as_bytes(), 0o755).map_err(|error| failed(&error))?;
+        task_dir.set_current(&run.package.manifest.digest).map_err(|error| failed(&error))?;
+        durable::create_dir_all(&task_dir.logs()).map_err(|error| failed(&error))?;
+        let spec = RunSpec {
+            assignment: run.deployment.clone(),
+            script: version.run_script(),
+            directory: version.work(),
+            environment,
+            interrupt: launch::of(&manifest).interrupt,
+            log: self.log(task),
+            limits: self.limits(&manifest),
+            user,
+            has_outputs: run.rules.has_outputs,
+            cgroup: None,
+        };
+        let record = serde_json::to_vec(run).map_err(|error| failed(&error))?;
+        durable::create_dir_all(&run_dir).map_err(|error| failed(&error))?;
+        durable::write(&run_dir.join(RUN_RECORD), &record, 0o600).map_err(|error| failed(&error))?;
+        let (facts, promise) = (self.ros_facts_in(&spec.environment), Promise::of(&manifest));
+        if let Some(what) = environment::unheard_of(&spec.environment).filter(|_| !promise.is_empty()) {
+            let text = format!("nodes here meet by {what}, which the agent does not speak: [ready] can't be watched");
+            let failure = Failure::new(FailureCode::GRAPH_UNAVAILABLE, text);
+            return Err(StepFailure { failure, retry_after_ms: None });
+        }
+        self.watcher.before_start(&promise, facts.as_ref()).await.map_err(|failure| {
+            // Whoever has the name may go away: a run that was ready before waits for that. So may what is in the graph's way.
+            let may_pass = run.ever_ready || (failure.code == FailureCode::GRAPH_UNAVAILABLE && facts.is_some());
+            StepFailure { failure, retry_after_ms: may_pass.then_some(0) }
+        })?;
+        let started = self.supervisor.start(&run_dir, &spec).await;
+        if matches!(started, Err(SupervisorError::NoAnswer))
+            && let Err(error) = self.supervisor.stop(&run_dir, Duration::ZERO).await
+        {
+            // It stays in the ledger until it is seen to be gone.
+            tracing::warn!(%task, error = %chain(&error), "cannot end what may have been started");
+        }
+        let pid = started.map_err(|error| failed(&error))?.task.pid;
+        // What earlier runs left is of no more use; that it can't be deleted is no reason not to run.
+        if let Err(error) = self.forget_runs(&task_dir.run(), Some(&run_dir)).await {
+            tracing::warn!(%task, failure = %error.failure, "cannot delete what ended runs left");
+        }
+        Ok(pid)
+    }
+
+    async fn stop(&self, task: &TaskName, run: &ActiveRun) -> Result<(), StepFailure> {
+        let Some(process) = &run.process else { return Ok(()) };
+        let grace = Duration::from_secs(u64::from(run.rules.stop_timeout_s));
+        let dir = self.run_dir(task, process);
+        let facts = self.ros_facts_of(&dir);
+        self.watcher.wind_down(&dir, &self.promise(&run.package), facts.as_ref(), grace / 2).await;
+        let stopped = self.supervisor.stop(&dir, grace).await;
+        stopped.map(drop).map_err(|error: SupervisorError| later(FailureCode::IO_ERROR, &error, 0))
+    }
+
+    async fn collect(
+        &self,
+        task: &TaskName,
+        files: &Collection,
+        progress: &watch::Sender<Progress>,
+        cancel: &CancellationToken,
+    ) -> Result<(), StepFailure> {
+        let manifest = self.manifest(&files.package).await?;
+        let (directory, user) = self.written_in(&files.package, manifest.build.tool)?;
+        let order = OutputOrder {
+            robot_id: self.robot.clone(),
+            task: task.clone(),
+            version: files.package.version.clone(),
+            deployment: files.deployment.clone(),
+            run: files.run,
+            directory,
+            user,
+            notes: self.data.task(task).uploads(),
+            patterns: manifest.outputs.paths,
+            max_bytes: self.held().output_bytes,
+        };
+        match outputs::bring_back(&self.registry, &order, progress, cancel).await {
+            Ok(count) => {
+                tracing::info!(%task, run = files.run, count, "its files are at the server");
+                Ok(())
+            }
+            Err(error) => Err(StepFailure {
+                retry_after_ms: error.retry_after().map(millis),
+                failure: Failure::new(outputs_code(&error), chain(&error)),
+            }),
+        }
+    }
+
+    async fn prune(
+        &self,
+        task: &TaskName,
+        kept: &[Digest],
+        running: Option<&ProcessRecord>,
+    ) -> Result<(), StepFailure> {
+        let (task, kept) = (self.data.task(task), kept.to_vec());
+        let running = running.map(|process| task.run().join(&process.dir));
+        self.forget_runs(&task.run(), running.as_deref()).await?;
+        on_disk(move || task.prune(&kept)).await
+    }
+
+    async fn remove(&self, task: &TaskName) -> Result<(), StepFailure> {
+        let dir = self.data.task(task);
+        let ended = self.end_other_runs(&dir.run(), None).await;
+        ended.map_err(|error| later(FailureCode::IO_ERROR, &error, 0))?;
+        on_disk(move || dir.remove()).await?;
+        self.accounts.release(task).map_err(|error| later(FailureCode::IO_ERROR, &error, 0))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use task_proto::DeploymentId;
+
+    use super::*;
+    use crate::install::fetch::FetchSettings;
+    use crate::process::cgroup::RunLimits;
+    use crate::process::run_dir::RunDir;
+    use crate::setup::launch::Interrupt;
+
+    /// A robot whose data is in `dir` and whose own settings are `file`. Nobody is its server.
+    pub(super) fn robot(dir: &Path, file: &str) -> Robot {
+        std::fs::write(dir.join(crate::config::FILE_NAME), file).expect("written");
+        let config = Config::load(dir, std::iter::empty()).expect("loads");
+        let data = DataDir::new(dir).expect("a data directory");
+        let tls = task_transport::Trust::by(None).client_config(clock::for_certificates());
+        let client = crate::transfer::server::client(tls).expect("a client");
+        let server: reqwest::Url = "http://127.0.0.1:9/".parse().expect("a URL");
+        let fetcher =
+            Fetcher::new(client.clone(), server.clone(), "tskr_x".to_owned(), data.clone(), FetchSettings::default());
+        let registry = Registry::new(client, server, "tskr_x".to_owned());
+        let mac = "02:00:00:00:00:01".parse().expect("an address");
+        Robot::new(data, (fetcher, Listening::default()), registry, &config, &RobotId::random(), mac)
+    }
+
+    /// The directory of a run in that environment, of which nothing but what it is was written yet.
+    pub(super) fn run_dir(path: &Path, environment: BTreeMap<String, String>) -> RunDir {
+        let run = RunDir::create(path).expect("made");
+        let spec = RunSpec {
+            assignment: DeploymentId::random(),
+            script: "run.sh".into(),
+            directory: "/".into(),
+            environment,
+            interrupt: Interrupt::default(),
+            log: LogSpec::at("log".into()),
+            limits: RunLimits::default(),
+            user: None,
+            has_outputs: false,
+            cgroup: None,
+        };
+        run.write_spec(&spec).expect("written");
+        run
+    }
+}

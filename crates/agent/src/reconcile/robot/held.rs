@@ -1,0 +1,133 @@
+//! The settings that hold now, as the effects use them: made anew when the server says something else.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, PoisonError};
+use std::time::Duration;
+
+use task_proto::settings::{EffectiveSettings, RobotSettings};
+use tokio::sync::watch;
+
+use super::Robot;
+use crate::config::Config;
+use crate::config::settings::{Settled, settle};
+use crate::install::builder::BuildLimits;
+use crate::logs::forwarder::ForwardSettings;
+use crate::process::cgroup::RunLimits;
+use crate::setup::environment;
+use crate::setup::installation::Installation;
+use crate::setup::underlay;
+
+/// How many bytes a run may bring back, unless the robot's settings say otherwise.
+const OUTPUT_BYTES: u64 = 4 << 30;
+
+/// What holds.
+pub(super) struct Held {
+    /// What was set at the server.
+    pub(super) set: RobotSettings,
+    /// All settings.
+    pub(super) config: Config,
+    /// As they are reported.
+    pub(super) effective: Option<EffectiveSettings>,
+    pub(super) environment: BTreeMap<String, String>,
+    pub(super) build_limits: BuildLimits,
+    pub(super) task_limits: RunLimits,
+    pub(super) output_bytes: u64,
+}
+
+impl Held {
+    /// Of a robot's `own` settings and what was `set` for it.
+    pub(super) fn of(own: &Config, set: RobotSettings) -> Arc<Self> {
+        let Settled { config, effective } = settle(own, &set);
+        let mut variables: BTreeMap<String, String> = environment::ROS_VARIABLES
+            .iter()
+            .filter_map(|name| Some(((*name).to_owned(), std::env::var(name).ok()?)))
+            .collect();
+        variables.extend(config.ros_domain_id.map(|id| ("ROS_DOMAIN_ID".to_owned(), id.to_string())));
+        let mut build_limits = BuildLimits::of_this_machine();
+        if let Some(timeout_s) = config.limits.build_timeout_s {
+            build_limits.timeout = Duration::from_secs(timeout_s);
+        }
+        build_limits.memory_bytes = config.limits.build_memory_bytes.or(build_limits.memory_bytes);
+        build_limits.pids = Some(config.task_pids);
+        let memory_bytes = config.limits.task_memory_mb.map(|megabytes| megabytes << 20);
+        Arc::new(Self {
+            set,
+            environment: environment::of_this_robot(&variables),
+            build_limits,
+            task_limits: RunLimits { memory_bytes, pids: Some(config.task_pids), ..RunLimits::default() },
+            output_bytes: config.limits.output_bytes.unwrap_or(OUTPUT_BYTES),
+            config,
+            effective,
+        })
+    }
+
+    /// The ROS there is, by these settings.
+    pub(super) fn installations(&self) -> Vec<Installation> {
+        underlay::by_settings(&self.config.underlays, self.config.workspace.as_deref())
+    }
+}
+
+impl Robot {
+    /// Which log lines go to the server by themselves, now and from now on.
+    pub fn forward(&self) -> watch::Receiver<ForwardSettings> {
+        self.forward.subscribe()
+    }
+
+    pub(super) fn held(&self) -> Arc<Held> {
+        self.held.read().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Takes on what is set for this robot. What runs goes on as it was started.
+    pub(super) fn adopt(&self, set: &RobotSettings) {
+        let before = self.held();
+        if before.set == *set {
+            return;
+        }
+        let held = Held::of(&self.own, set.clone());
+        let (own, refused) =
+            held.effective.as_ref().map(|e| (e.own.join(", "), e.refused.join(", "))).unwrap_or_default();
+        tracing::info!(own, "settings from the server");
+        if !refused.is_empty() {
+            tracing::warn!(refused, "settings from the server that are not taken");
+        }
+        self.fetcher.limit(&held.config.limits);
+        self.graph.limit(held.config.limits.log_bytes);
+        self.forward.send_replace(held.config.forward);
+        let same_ros =
+            held.config.underlays == before.config.underlays && held.config.workspace == before.config.workspace;
+        *self.held.write().unwrap_or_else(PoisonError::into_inner) = held;
+        if !same_ros {
+            self.find_ros();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt as _;
+
+    use serde_json::json;
+    use task_proto::DeploymentId;
+
+    use super::super::tests::robot;
+    use crate::task::effects::Effects as _;
+    use crate::task::ledger::{GateQuestion, GateStep};
+
+    #[tokio::test]
+    async fn the_gate_is_asked_in_the_domain_that_the_server_has_set() {
+        let temp = tempfile::tempdir().expect("a directory");
+        let program = temp.path().join("gate.sh");
+        std::fs::write(&program, "#!/bin/sh\necho \"domain $ROS_DOMAIN_ID\"\nexit 1\n").expect("written");
+        std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).expect("executable");
+        let robot = robot(temp.path(), &format!("[gate]\ncommand = [{program:?}]\n"));
+        robot.adopt(&serde_json::from_value(json!({ "ros_domain_id": 7 })).expect("parses"));
+        let question = GateQuestion {
+            step: GateStep::Start,
+            deployment: DeploymentId::random(),
+            run: 1,
+            version: "1.0".parse().expect("valid"),
+        };
+        let refused = robot.ask_gate(&"talker".parse().expect("valid"), &question).await.expect_err("no");
+        assert_eq!(refused.failure.text, "domain 7");
+    }
+}

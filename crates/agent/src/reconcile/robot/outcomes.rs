@@ -1,0 +1,79 @@
+//! What the plan is told of how a step ended: each module's error as a failure's code and text, and whether to try again.
+
+use std::error::Error;
+use std::path::Path;
+use std::time::Duration;
+
+use task_proto::report::{Failure, FailureCode};
+
+use crate::install::builder::BuildError;
+use crate::install::fetch::FetchError;
+use crate::system::disk;
+use crate::system::error_chain::chain;
+use crate::task::plan::{Done, StepFailure};
+use crate::telemetry::outputs::OutputError;
+
+pub(super) fn pulled(outcome: Result<(), FetchError>) -> Result<Done, StepFailure> {
+    match outcome {
+        Ok(()) => Ok(Done::Well),
+        Err(error) => match error.told_to_wait() {
+            Some(wait) => Ok(Done::ToldToWait { at_least_ms: millis(wait) }),
+            None => Err(fetch_failure(error)),
+        },
+    }
+}
+
+/// Does work on the disk in a thread that may block; a failure is tried again.
+pub(super) async fn on_disk(work: impl FnOnce() -> std::io::Result<()> + Send + 'static) -> Result<(), StepFailure> {
+    let done = tokio::task::spawn_blocking(work).await.map_err(std::io::Error::other);
+    done.flatten().map_err(|error| later(FailureCode::IO_ERROR, &error, 0))
+}
+
+pub(super) fn millis(duration: Duration) -> u64 {
+    u64::try_from(duration.as_millis()).unwrap_or(u64::MAX)
+}
+
+pub(super) fn fetch_failure(error: FetchError) -> StepFailure {
+    // A cancelled pull is no failure: the driver lets go of its outcome.
+    let code = error.code().unwrap_or(FailureCode::INTERRUPTED);
+    if error.is_retryable() || matches!(error, FetchError::Cancelled) {
+        let least_ms = error.retry_after().map_or(0, millis);
+        return later(code, &error, least_ms);
+    }
+    finally(code, &error)
+}
+
+/// A build that failed on a disk without room, which holds `root`, says little of the package: it is tried again.
+pub(super) fn build_failure(error: BuildError, root: &Path) -> StepFailure {
+    let Some(code) = error.code() else { return later(FailureCode::BUILD_FAILED, &error, 0) };
+    match disk::room(root) {
+        Ok(room) if room.is_used_up() => {
+            let text = format!("{} of {} bytes are free; {}", room.free, room.total, chain(&error));
+            let least_ms = millis(disk::FULL_PAUSE);
+            StepFailure { failure: Failure::new(FailureCode::DISK_FULL, text), retry_after_ms: Some(least_ms) }
+        }
+        _ => finally(code, &error),
+    }
+}
+
+pub(super) fn outputs_code(error: &OutputError) -> FailureCode {
+    match error {
+        OutputError::Unreachable(_) | OutputError::NotTheServer { .. } | OutputError::Busy { .. } => {
+            FailureCode::SERVER_UNREACHABLE
+        }
+        OutputError::Garbled { .. } => FailureCode::DIGEST_MISMATCH,
+        OutputError::Read { .. } | OutputError::User(_) | OutputError::Note { .. } => FailureCode::IO_ERROR,
+        OutputError::Cancelled => FailureCode::INTERRUPTED,
+        OutputError::Pattern { .. } | OutputError::TooMuch(_) | OutputError::Refused { .. } => {
+            FailureCode::OUTPUTS_LOST
+        }
+    }
+}
+
+pub(super) fn finally(code: FailureCode, error: &dyn Error) -> StepFailure {
+    StepFailure { failure: Failure::new(code, chain(error)), retry_after_ms: None }
+}
+
+pub(super) fn later(code: FailureCode, error: &dyn Error, least_ms: u64) -> StepFailure {
+    StepFailure { failure: Failure::new(code, chain(error)), retry_after_ms: Some(least_ms) }
+}

@@ -1,0 +1,209 @@
+//! The ROS that the robot has, as it was last seen: found by the settings that hold, and known better once somebody has
+//! looked into it.
+
+use std::collections::BTreeMap;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, PoisonError};
+
+use task_proto::manifest::TaskManifest;
+use task_proto::report::{FailureCode, RosFacts};
+
+use super::Robot;
+use super::outcomes::finally;
+use crate::process::run_dir::RunDir;
+use crate::ros::probe;
+use crate::setup::environment;
+use crate::setup::installation::Installation;
+use crate::setup::launch;
+use crate::setup::underlay;
+use crate::system::durable;
+use crate::system::layout::VersionDir;
+use crate::system::task_user::TaskUser;
+use crate::task::ledger::ActiveRun;
+use crate::task::plan::StepFailure;
+
+/// Where looking into ROS installations has its files.
+const SURVEY_DIR: &str = "survey";
+
+/// The variable by which nodes find where to write logs of their own, which begin anew: ROS makes new files at each start and
+/// deletes none. What of them can't be deleted is no reason not to start.
+pub(super) async fn node_logs(version: &VersionDir, user: Option<&TaskUser>) -> [(String, String); 1] {
+    let (logs, user) = (version.node_logs(), user.cloned());
+    let variable = ("ROS_LOG_DIR".to_owned(), logs.display().to_string());
+    let empty = move || {
+        durable::remove_dir_all(&logs)?;
+        // The version's directory is root's: who writes there needs one of its own.
+        user.map_or(Ok(()), |user| user.make_home(&logs))
+    };
+    let emptied = tokio::task::spawn_blocking(empty).await;
+    if let Err(error) = emptied.map_err(io::Error::from).flatten() {
+        tracing::warn!(%error, "cannot delete what nodes wrote into logs of their own");
+    }
+    [variable]
+}
+
+impl Robot {
+    /// How tasks that are started now meet ROS.
+    pub(super) fn ros_facts(&self) -> Option<RosFacts> {
+        self.ros_facts_in(&self.held().environment)
+    }
+
+    /// How tasks with this environment do.
+    pub(super) fn ros_facts_in(&self, environment: &BTreeMap<String, String>) -> Option<RosFacts> {
+        environment::ros_facts(&self.installations(), environment)
+    }
+
+    /// How the run does whose directory is `dir`: it stays in the domain that it was started in.
+    pub(super) fn ros_facts_of(&self, dir: &Path) -> Option<RosFacts> {
+        match RunDir::at(dir).spec() {
+            Ok(Some(spec)) => self.ros_facts_in(&spec.environment),
+            // It was not started, or is not readable any more.
+            Ok(None) | Err(_) => self.ros_facts(),
+        }
+    }
+
+    pub(super) fn installations(&self) -> Vec<Installation> {
+        self.ros.read().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    pub(super) fn setup_files(&self, manifest: &TaskManifest) -> Result<Vec<PathBuf>, StepFailure> {
+        let version = launch::of(manifest).ros;
+        let found = underlay::setup_files(&self.installations(), version, &manifest.requires.ros_distro);
+        found.map_err(|error| finally(FailureCode::REQUIREMENTS_UNMET, &error))
+    }
+
+    /// The same for a run that is to be started. What is not there is looked for once more; for a run that was ready before
+    /// it may come back, as a disk that is mounted late or a package that is being upgraded.
+    pub(super) fn setup_files_of(&self, run: &ActiveRun, manifest: &TaskManifest) -> Result<Vec<PathBuf>, StepFailure> {
+        let again = |_| {
+            self.find_ros();
+            self.setup_files(manifest)
+        };
+        let retry_after_ms = run.ever_ready.then_some(0);
+        self.setup_files(manifest).or_else(again).map_err(|error| StepFailure { retry_after_ms, ..error })
+    }
+
+    /// Takes what can be found by the settings that hold for what there is, until somebody has looked into it. What has been
+    /// started already may have to be started again before anybody does.
+    pub(super) fn find_ros(&self) {
+        let found = self.held().installations();
+        *self.ros.write().unwrap_or_else(PoisonError::into_inner) = found;
+    }
+
+    /// Looks into it; anew, if other settings hold by then.
+    pub(super) async fn survey(&self) {
+        let dir = self.data.root().join(SURVEY_DIR);
+        loop {
+            let held = self.held();
+            let found = held.installations();
+            let seen = match &self.task_user {
+                Ok(user) => probe::survey(found, &held.environment, &dir, user.as_ref()).await,
+                // Setup files may be anybody's: they are never sourced as root for want of a user.
+                Err(_) => found,
+            };
+            // Whoever changes the settings does that before they write here.
+            let mut ros = self.ros.write().unwrap_or_else(PoisonError::into_inner);
+            if Arc::ptr_eq(&held, &self.held()) {
+                *ros = seen;
+                return;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt as _;
+
+    use serde_json::json;
+    use task_proto::settings::RobotSettings;
+
+    use super::super::tests::{robot, run_dir};
+    use super::*;
+    use crate::task::effects::Effects as _;
+
+    fn setup(dir: &Path, name: &str, text: &str) -> (PathBuf, RobotSettings) {
+        let path = dir.join(name);
+        std::fs::write(&path, text).expect("written");
+        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o644)).expect("readable");
+        let settings = serde_json::from_value(json!({ "underlays": [path] })).expect("parses");
+        (path, settings)
+    }
+
+    #[tokio::test]
+    async fn logs_of_nodes_begin_anew_at_each_start() {
+        let temp = tempfile::tempdir().expect("a directory");
+        let digest = task_proto::Digest::of(b"manifest");
+        let data = crate::system::layout::DataDir::new(temp.path()).expect("a directory");
+        let version = data.task(&"talker".parse().expect("valid")).version(&digest);
+        let [(name, place)] = node_logs(&version, None).await;
+        assert_eq!((name.as_str(), Path::new(&place)), ("ROS_LOG_DIR", version.node_logs().as_path()));
+        std::fs::create_dir_all(version.node_logs().join("2026-11-22")).expect("made");
+        std::fs::write(version.node_logs().join("2026-11-22/launch.log"), "long").expect("written");
+        node_logs(&version, None).await;
+        assert!(!version.node_logs().exists() && version.root().exists());
+    }
+
+    #[test]
+    fn what_the_server_says_of_ros_holds_before_anybody_has_looked_into_it() {
+        let temp = tempfile::tempdir().expect("a directory");
+        let (own, _) = setup(temp.path(), "own.bash", "");
+        let (path, settings) = setup(temp.path(), "setup.bash", "");
+        let robot = robot(temp.path(), "");
+        robot.adopt(&settings);
+        let setups =
+            |robot: &Robot| robot.installations().into_iter().flat_map(|found| found.setups).collect::<Vec<_>>();
+        assert_eq!(setups(&robot), [path]);
+        assert!(robot.ros_facts().is_some(), "its graph can be watched");
+        let stays = RobotSettings { ros_domain_id: Some(7), ..settings };
+        robot.ros.write().expect("sound")[0].packages = Some(["rclpy".to_owned()].into());
+        robot.adopt(&stays);
+        assert!(robot.installations()[0].packages.is_some(), "what was seen of the same files is still true");
+        robot.adopt(&RobotSettings {
+            underlays: Some(vec![own.to_str().expect("text").parse().expect("valid")]),
+            ..stays
+        });
+        assert_eq!(setups(&robot), [own]);
+    }
+
+    #[test]
+    fn a_run_stays_in_its_domain_whatever_is_set_later() {
+        let temp = tempfile::tempdir().expect("a directory");
+        let (_, settings) = setup(temp.path(), "setup.bash", "");
+        let robot = robot(temp.path(), "");
+        let set = |id| robot.adopt(&RobotSettings { ros_domain_id: Some(id), ..settings.clone() });
+        set(7);
+        let run = run_dir(&temp.path().join("run"), robot.held().environment.clone());
+        set(9);
+        let domain = |facts: Option<RosFacts>| facts.and_then(|facts| facts.domain_id);
+        assert_eq!(domain(robot.ros_facts_of(run.path())), Some(7));
+        assert_eq!(domain(robot.ros_facts_of(&temp.path().join("none"))), Some(9));
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_look_that_began_under_other_settings_is_not_what_counts() {
+        let temp = tempfile::tempdir().expect("a directory");
+        let (begun, go) = (temp.path().join("begun"), temp.path().join("go"));
+        let waiting =
+            format!("touch {}\nuntil [ -e {} ]; do read -rt 0.05 _ <> <(:); done\n", begun.display(), go.display());
+        let (_, before) = setup(temp.path(), "before.bash", &waiting);
+        let (path, after) = setup(temp.path(), "after.bash", "export ROS_DISTRO=jazzy ROS_VERSION=2\n");
+        let uid = nix::unistd::geteuid();
+        let robot = Arc::new(robot(temp.path(), &format!("task_user = \"{uid}\"\n")));
+        robot.adopt(&before);
+        let looking = tokio::spawn({
+            let robot = robot.clone();
+            async move { robot.look_for_ros().await }
+        });
+        while !begun.exists() {
+            tokio::task::yield_now().await;
+        }
+        robot.adopt(&after);
+        std::fs::write(&go, "").expect("written");
+        looking.await.expect("looked");
+        let found = robot.installations();
+        assert_eq!(found.last().map(|found| &found.setups), Some(&vec![path]));
+        assert_eq!(found.last().map(|found| found.distros.clone()), Some(vec!["jazzy".to_owned()]));
+    }
+}

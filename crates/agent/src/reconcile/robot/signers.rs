@@ -1,0 +1,117 @@
+//! Who has signed a package, as the robot's steps ask for it: before anything is fetched, once more at each step that
+//! fetches, builds or starts, whatever was planned.
+
+use task_proto::desired::PackageRef;
+use tokio_util::sync::CancellationToken;
+
+use super::Robot;
+use super::outcomes::fetch_failure;
+use crate::config::trust::{Distrust, Use};
+use crate::install::signature_policy::NotVouched;
+use crate::task::plan::StepFailure;
+
+impl Robot {
+    /// That the package may be used so, by what was signed about it, which is fetched if need be.
+    pub(super) async fn vouched(
+        &self,
+        package: &PackageRef,
+        purpose: Use,
+        cancel: &CancellationToken,
+    ) -> Result<(), StepFailure> {
+        let Some(vouching) = &self.vouching else { return Ok(()) };
+        vouching.vouch(package, purpose, cancel).await.map_err(|error| match error {
+            NotVouched::Distrusted(distrust) => refusal(&distrust, package),
+            NotVouched::Fetch(error) => fetch_failure(error),
+        })
+    }
+
+    /// The same for what was found to be so a moment ago. If it is no more, that is looked into first.
+    pub(super) fn still_vouched(&self, package: &PackageRef) -> Result<(), StepFailure> {
+        let Some(vouching) = &self.vouching else { return Ok(()) };
+        let judged = vouching.judge(package, Use::Begin);
+        judged.map_err(|distrust| StepFailure { retry_after_ms: Some(0), ..refusal(&distrust, package) })
+    }
+}
+
+/// Only a list of publishers comes by itself: other signatures come with another order.
+fn refusal(distrust: &Distrust, package: &PackageRef) -> StepFailure {
+    StepFailure { failure: distrust.failure(package), retry_after_ms: distrust.may_pass().then_some(0) }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io;
+    use std::path::Path;
+
+    use nix::mount::{MsFlags, mount};
+    use task_proto::desired::{BlobRef, DesiredState, Evidence, SignatureRef};
+    use task_proto::envelope::SigningKey;
+    use task_proto::publisher::PackageStatement;
+    use task_proto::report::FailureCode;
+    use task_proto::{Digest, Generation, RobotId};
+
+    use super::super::tests::robot;
+    use super::*;
+    use crate::system::durable::own_mounts::with_own_mounts;
+    use crate::task::effects::Effects as _;
+
+    /// Does `step` without room for one more file, which fails and passes, and again with room.
+    async fn try_full(dir: &Path, step: impl AsyncFn() -> Result<(), StepFailure>) {
+        let files = dir.join("files");
+        std::fs::create_dir(&files).expect("made");
+        let refused = (0..).find_map(|number: u32| std::fs::write(files.join(number.to_string()), b"").err());
+        assert_eq!(refused.expect("full").kind(), io::ErrorKind::StorageFull);
+        let failure = step().await.expect_err("there is no room");
+        assert_eq!(failure.failure.code, FailureCode::DISK_FULL, "{}", failure.failure);
+        assert!(failure.retry_after_ms.is_some_and(|least_ms| least_ms > 0), "{}", failure.failure);
+        std::fs::remove_dir_all(&files).expect("removed");
+        step().await.expect("there is room");
+    }
+
+    async fn prepare_on_a_full_disk(dir: &Path) {
+        let key = SigningKey::from_bytes([1; 32]);
+        let trusted = format!("task_user = \"root\"\n[trusted_publishers]\nkeys = [\"{}\"]\n", key.public_key());
+        let robot = robot(dir, &trusted);
+        let manifest = serde_json::json!({
+            "name": "talker", "version": "1.0", "run": { "exec": ["true"] },
+            "content": { "tar_digest": Digest::of(b""), "tar_size": 0, "entries": 0 },
+        });
+        let manifest = serde_json::to_vec(&manifest).expect("json");
+        let package = PackageRef {
+            name: "talker".parse().expect("valid"),
+            version: "1.0".parse().expect("valid"),
+            manifest: BlobRef::of(b"manifest"),
+            config: BlobRef::of(&manifest),
+            content: BlobRef::of(b"content"),
+        };
+        let statement = PackageStatement { package: package.clone() }.seal(&key);
+        let statement = serde_json::to_vec(&statement).expect("json");
+        let envelope = BlobRef::of(&statement);
+        robot.offer(vec![(envelope, statement.into()), (package.config, manifest.into())]);
+        let signatures = vec![SignatureRef { manifest: package.manifest.digest, envelope }];
+        robot.heed(&DesiredState {
+            robot_id: RobotId::random(),
+            generation: Generation(1),
+            issued_at_ms: 0,
+            expires_at_ms: u64::MAX,
+            tasks: Vec::new(),
+            evidence: Evidence { lists: Vec::new(), signatures },
+            settings: Default::default(),
+        });
+        let cancel = CancellationToken::new();
+        try_full(dir, async || robot.check_signers(&package, &cancel).await).await;
+        try_full(dir, async || robot.pull_manifest(&package, &cancel).await.map(drop)).await;
+        try_full(dir, async || robot.build(&package, &cancel).await).await;
+    }
+
+    #[test]
+    fn an_order_waits_for_a_disk_that_is_full_wherever_it_meets_it() {
+        let temp = tempfile::tempdir().expect("a directory");
+        with_own_mounts(|| {
+            mount(Some("tmpfs"), temp.path(), Some("tmpfs"), MsFlags::empty(), Some("nr_inodes=64")).expect("mounted");
+            // Only this thread sees what is mounted.
+            let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
+            runtime.block_on(prepare_on_a_full_disk(temp.path()));
+        });
+    }
+}

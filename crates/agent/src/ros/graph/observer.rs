@@ -1,0 +1,277 @@
+//! The one task that listens to discovery. It owns what participants said about their nodes and which remote endpoints
+//! are matched with ours; it publishes snapshots, and wakes whoever waits for a change.
+//!
+//! Where the DDS library's events are not enough: a killed process says nothing, so its participant is lost only when its
+//! lease ends (Fast DDS: 20 s), and events are dropped when too many come at once; so everything is also looked at every
+//! few seconds.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::pin::pin;
+use std::sync::Arc;
+use std::time::Duration;
+
+use futures_util::StreamExt;
+use ros2_client::dds::rustdds::discovery::{DiscoveredReaderData, DiscoveredWriterData};
+use ros2_client::dds::rustdds::{DomainParticipant, DomainParticipantStatusEvent as Event, RTPSEntity, StatusEvented};
+use tokio::sync::watch;
+use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until};
+use tokio_util::sync::CancellationToken;
+
+use super::endpoint::{Cdr, Reader, Sample};
+use super::entities::ParticipantEntities;
+use super::snapshot::{Discovered, Snapshot};
+use super::{EndpointId, ParticipantId};
+use crate::system::clock;
+
+/// Changes within this time become one snapshot.
+const DEBOUNCE: Duration = Duration::from_millis(50);
+/// How often everything is looked at without an event.
+const AUDIT: Duration = Duration::from_secs(3);
+/// How long a participant may have no endpoints and is remembered.
+const NEWCOMER: Duration = Duration::from_secs(60);
+/// The most readers, and the most writers, that are looked at.
+const MAX_DISCOVERED: usize = 20_000;
+/// The most participants of which something is remembered.
+const MAX_PARTICIPANTS: usize = 1024;
+/// How far the wall clock may fall back between two looks: further is a step, and no correction.
+const MAX_FALL_MS: u64 = 1000;
+/// The most addresses of one endpoint.
+const MAX_LOCATORS: usize = 16;
+
+/// Which remote endpoints each of ours is matched with.
+#[derive(Debug, Default)]
+pub struct Matches {
+    remotes: BTreeMap<EndpointId, BTreeSet<EndpointId>>,
+}
+
+/// What the clocks show, in milliseconds.
+#[derive(Debug, Clone, Copy)]
+struct Clocks {
+    wall_ms: u64,
+    boot_ms: u64,
+}
+
+/// See the module.
+pub struct Observer {
+    participant: DomainParticipant,
+    own: ParticipantId,
+    said: BTreeMap<ParticipantId, ParticipantEntities>,
+    first_seen: BTreeMap<ParticipantId, std::time::Instant>,
+    snapshot: watch::Sender<Arc<Snapshot>>,
+    matches: watch::Sender<Matches>,
+}
+
+impl Matches {
+    /// The participants matched with both of ours: they can hear the request, and we their answer.
+    pub fn with_both(&self, writer: EndpointId, reader: EndpointId) -> BTreeSet<ParticipantId> {
+        let participants = |own| -> BTreeSet<_> {
+            self.remotes.get(&own).into_iter().flatten().map(|remote| remote.participant()).collect()
+        };
+        &participants(writer) & &participants(reader)
+    }
+
+    /// Forgets one of ours that is gone.
+    pub fn forget(&mut self, own: EndpointId) {
+        self.remotes.remove(&own);
+    }
+}
+
+impl Clocks {
+    fn read() -> Self {
+        Self { wall_ms: clock::wall_ms(), boot_ms: clock::boot_ms() }
+    }
+
+    fn fell_back_since(self, before: Self) -> bool {
+        let passed_ms = self.boot_ms.saturating_sub(before.boot_ms);
+        self.wall_ms + MAX_FALL_MS < before.wall_ms + passed_ms
+    }
+}
+
+impl Observer {
+    /// For this participant; it sees nothing before it runs.
+    pub fn new(
+        participant: DomainParticipant,
+        snapshot: watch::Sender<Arc<Snapshot>>,
+        matches: watch::Sender<Matches>,
+    ) -> Self {
+        let own = EndpointId::of(participant.guid()).participant();
+        Self { participant, own, said: BTreeMap::new(), first_seen: BTreeMap::new(), snapshot, matches }
+    }
+
+    /// Listens until `closing`, until the DDS library ends, or until the wall clock is set back: the library then keeps to
+    /// itself what it hears by best effort, which is who is new, until the clock shows the former time again. Another
+    /// participant knows nothing of that time.
+    pub async fn run(mut self, discovery: Reader<Cdr>, closing: CancellationToken) {
+        let listener = self.participant.status_listener();
+        let mut events = pin!(listener.as_async_status_stream());
+        let mut samples = pin!(discovery.samples());
+        let mut audit = interval(AUDIT);
+        audit.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let (mut due, mut clocks): (Option<Instant>, _) = (None, Clocks::read());
+        loop {
+            // Each branch may be dropped while it waits: streams and timers keep what they have.
+            tokio::select! {
+                () = closing.cancelled() => return,
+                event = events.next() => {
+                    let Some(event) = event else { return };
+                    if self.heard(event) {
+                        due.get_or_insert_with(|| Instant::now() + DEBOUNCE);
+                    }
+                }
+                Some(sample) = samples.next() => {
+                    self.said(&sample);
+                    due.get_or_insert_with(|| Instant::now() + DEBOUNCE);
+                }
+                _ = audit.tick() => {
+                    let before = std::mem::replace(&mut clocks, Clocks::read());
+                    if clocks.fell_back_since(before) {
+                        tracing::warn!("the clock was set back; the ROS graph is looked at anew");
+                        return;
+                    }
+                    due = Some(Instant::now());
+                }
+                () = sleep_until(due.unwrap_or_else(Instant::now)), if due.is_some() => {
+                    due = None;
+                    self.look();
+                }
+            }
+        }
+    }
+
+    /// Takes in an event of the DDS library; says whether the graph may look different now.
+    fn heard(&mut self, event: Event) -> bool {
+        match event {
+            Event::RemoteReaderMatched { local_writer: own, remote_reader: remote }
+            | Event::RemoteWriterMatched { local_reader: own, remote_writer: remote } => {
+                let (own, remote) = (EndpointId::of(own), EndpointId::of(remote));
+                self.matches.send_if_modified(|matches| matches.remotes.entry(own).or_default().insert(remote));
+                false
+            }
+            Event::ReaderLost { guid, .. } | Event::WriterLost { guid, .. } => {
+                let lost = EndpointId::of(guid);
+                self.unmatch(|remote| *remote == lost);
+                true
+            }
+            Event::ParticipantLost { id, .. } => {
+                let lost = ParticipantId(prefix(id.as_ref()));
+                self.unmatch(|remote| remote.participant() == lost);
+                self.first_seen.remove(&lost);
+                true
+            }
+            Event::ParticipantDiscovered { dpd } => {
+                let seen = EndpointId::of(dpd.guid).participant();
+                if self.first_seen.len() < MAX_PARTICIPANTS {
+                    self.first_seen.entry(seen).or_insert_with(std::time::Instant::now);
+                }
+                true
+            }
+            Event::ReaderDetected { .. } | Event::WriterDetected { .. } => true,
+            _ => false,
+        }
+    }
+
+    fn unmatch(&self, lost: impl Fn(&EndpointId) -> bool) {
+        self.matches.send_if_modified(|matches| {
+            let before: usize = matches.remotes.values().map(BTreeSet::len).sum();
+            matches.remotes.values_mut().for_each(|remotes| remotes.retain(|remote| !lost(remote)));
+            let after: usize = matches.remotes.values().map(BTreeSet::len).sum();
+            before != after
+        });
+    }
+
+    /// Takes in what a participant says about its nodes. Nobody speaks for another.
+    fn said(&mut self, sample: &Sample<Cdr>) {
+        let from = sample.writer.participant();
+        if from == self.own {
+            return;
+        }
+        match ParticipantEntities::decode(&sample.message.body, sample.message.is_little_endian()) {
+            Ok((entities, _form)) if entities.participant == from => {
+                if self.said.len() < MAX_PARTICIPANTS || self.said.contains_key(&from) {
+                    self.said.insert(from, entities);
+                }
+            }
+            Ok((entities, _form)) => {
+                tracing::debug!(%from, of = %entities.participant, "a participant speaks for another");
+            }
+            Err(error) => tracing::debug!(%from, error = %error, "a participant's nodes cannot be read"),
+        }
+    }
+
+    /// Looks at everything discovery has, forgets what is gone and publishes what it shows.
+    fn look(&mut self) {
+        let readers = self.participant.discovered_readers();
+        let writers = self.participant.discovered_writers();
+        let readers: Vec<_> =
+            readers.iter().map(discovered_reader).filter(|d| self.is_ros(d)).take(MAX_DISCOVERED).collect();
+        let writers: Vec<_> =
+            writers.iter().map(discovered_writer).filter(|d| self.is_ros(d)).take(MAX_DISCOVERED).collect();
+        let now = std::time::Instant::now();
+        let present: BTreeSet<_> = readers.iter().chain(&writers).map(|endpoint| endpoint.id.participant()).collect();
+        self.said.retain(|id, _| present.contains(id));
+        // A participant is seen before its endpoints are.
+        self.first_seen.retain(|id, seen| present.contains(id) || now.duration_since(*seen) < NEWCOMER);
+        for id in present.iter().take(MAX_PARTICIPANTS) {
+            self.first_seen.entry(*id).or_insert(now);
+        }
+        self.unmatch(|remote| !present.contains(&remote.participant()) && remote.participant() != self.own);
+        let seen = Snapshot::of(now, &self.said, &self.first_seen, &readers, &writers);
+        self.snapshot.send_if_modified(|current| {
+            let changed = !seen.shows_the_same_as(current);
+            *current = Arc::new(seen);
+            changed
+        });
+    }
+
+    /// Whether an endpoint is of another's ROS: the agent's own and DDS's built-in ones are not looked at.
+    fn is_ros(&self, endpoint: &Discovered) -> bool {
+        endpoint.id.participant() != self.own
+            && (endpoint.topic == super::names::DISCOVERY_TOPIC
+                || ["rt/", "rq/", "rr/"].iter().any(|prefix| endpoint.topic.starts_with(prefix)))
+    }
+}
+
+fn discovered_reader(data: &DiscoveredReaderData) -> Discovered {
+    let locators = &data.reader_proxy.unicast_locator_list;
+    Discovered {
+        id: EndpointId::of(data.reader_proxy.remote_reader_guid),
+        topic: data.subscription_topic_data.topic_name().clone(),
+        kind: data.subscription_topic_data.type_name().clone(),
+        locators: locators.iter().filter(|locator| locator.is_udp()).take(MAX_LOCATORS).map(|l| (*l).into()).collect(),
+    }
+}
+
+fn discovered_writer(data: &DiscoveredWriterData) -> Discovered {
+    let locators = &data.writer_proxy.unicast_locator_list;
+    Discovered {
+        id: EndpointId::of(data.writer_proxy.remote_writer_guid),
+        topic: data.publication_topic_data.topic_name.clone(),
+        kind: data.publication_topic_data.type_name.clone(),
+        locators: locators.iter().filter(|locator| locator.is_udp()).take(MAX_LOCATORS).map(|l| (*l).into()).collect(),
+    }
+}
+
+fn prefix(bytes: &[u8]) -> [u8; 12] {
+    let mut prefix = [0; 12];
+    let length = bytes.len().min(12);
+    prefix[..length].copy_from_slice(&bytes[..length]);
+    prefix
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_clock_that_is_set_back_is_noticed_and_one_that_is_corrected_is_not() {
+        let before = Clocks { wall_ms: 1_000_000, boot_ms: 50_000 };
+        let fell_back = |wall_ms: u64, boot_ms: u64| Clocks { wall_ms, boot_ms }.fell_back_since(before);
+        assert!(!fell_back(1_003_000, 53_000));
+        assert!(!fell_back(1_002_100, 53_000), "slewed");
+        assert!(!fell_back(9_000_000, 53_000), "set forward");
+        assert!(fell_back(1_001_000, 53_000));
+        assert!(fell_back(0, 53_000));
+        // Suspended in between: both went on.
+        assert!(!fell_back(8_203_000, 7_253_000));
+    }
+}

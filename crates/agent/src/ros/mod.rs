@@ -1,0 +1,8 @@
+//! The ROS graph: the process that takes part in it, readiness of tasks, and a look into installations. It starts and stops no task.
+
+pub mod graph;
+pub mod graph_access;
+pub mod node_logs;
+pub mod probe;
+pub mod readiness;
+pub mod watcher;

@@ -1,0 +1,292 @@
+//! What is true on the robot, whatever the ledger says: processes, what ROS sees of them, and what lies on the disk.
+//! Plain values, filled by the effects and read by the plan. Times are milliseconds since boot.
+
+use std::collections::BTreeSet;
+
+use task_proto::Digest;
+use task_proto::id::Labels;
+use task_proto::manifest::TaskManifest;
+use task_proto::report::{Failure, FailureCode};
+
+use crate::process::program::ExitStatus;
+use crate::setup::installation::{self, Installation};
+use crate::setup::launch;
+
+/// What is on the disk of one version, and which versions there are.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Prepared {
+    /// The version's manifest, once it was pulled and verified.
+    pub manifest: Option<TaskManifest>,
+    /// Its content is unpacked.
+    pub content: bool,
+    /// It is built, or needs no build.
+    pub built: bool,
+    /// Every version of the task that has a directory.
+    pub versions: Vec<Digest>,
+    /// Whether this robot may run it, as far as is known of who has signed it.
+    pub vouched: Vouched,
+}
+
+/// What the signatures that are on the disk say.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Vouched {
+    /// Nothing, or not enough.
+    #[default]
+    No,
+    /// It may go on running; new work needs a newer list of publishers.
+    Stale,
+    /// It may run. So may everything on a robot that trusts its server alone.
+    Yes,
+}
+
+/// What a robot goes by when it asks who has signed a package.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct TrustFacts {
+    /// Another number whenever a package may be judged otherwise than before.
+    pub epoch: u64,
+    /// Whether the lifetime of the list of publishers is over, so that nothing new begins.
+    pub list_is_over: bool,
+    /// Why the newest list of publishers that it was shown does not count, if it does not.
+    pub refused_list: Option<String>,
+}
+
+/// What became of a process that the ledger knows.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum ProcessState {
+    /// The ledger knows none.
+    None,
+    /// It lives.
+    Alive {
+        /// Its id.
+        pid: u32,
+    },
+    /// It can't be told now.
+    Unknown,
+    /// It was about to be started, and was not.
+    NeverStarted,
+    /// It ended.
+    Ended(Exit),
+}
+
+/// How a process ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Exit {
+    /// With which code or signal; `None` when the process and its shim were gone without a word.
+    pub status: Option<ExitStatus>,
+    /// The memory it was limited to, if it was killed for using more.
+    pub out_of_memory_bytes: Option<u64>,
+    /// The last lines of its output.
+    pub last_lines: String,
+}
+
+/// What ROS says of a run whose process lives, against what its package promises in `[ready]`.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub enum Health {
+    /// Nobody has looked yet.
+    #[default]
+    Unknown,
+    /// All that was promised holds.
+    Holds {
+        /// Since when, without a break.
+        since_ms: u64,
+    },
+    /// Something is missing, and may yet come.
+    Missing(Missing),
+    /// What no waiting mends: `node_name_taken`, `parameter_rejected`, `lifecycle_failed`. Only before it was ready.
+    Refused(Failure),
+}
+
+/// Something that was promised and is not there.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Missing {
+    /// Since when anything has been missing, without a break.
+    pub since_ms: u64,
+    /// What it means once the task was ready: `node_vanished`, `node_inactive`, `topic_silent`, `service_lost`,
+    /// `graph_unavailable`.
+    pub code: FailureCode,
+    /// What is missing, a sentence without its end: "`/mapper` did not appear".
+    pub what: String,
+    /// What is there instead: "on the graph: `/lidar`, `/odom`". May be empty.
+    pub seen: String,
+    /// Whether the run itself lacks something, so that another start may mend it: what a stranger does is not, nor that the
+    /// agent sees nothing.
+    pub is_its_own: bool,
+}
+
+/// What a package may require of the robot.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct RobotFacts {
+    /// The processor architecture.
+    pub arch: String,
+    /// The labels the server holds; `None` until it has said.
+    pub labels: Option<Labels>,
+    /// The ROS installations, the best last; `None` while they have to be looked at.
+    pub installations: Option<Vec<Installation>>,
+    /// Why there is no user to run tasks as, if there is none.
+    pub no_task_user: Option<String>,
+}
+
+impl RobotFacts {
+    /// Whether this robot's ROS has to be known to tell if `manifest` can run here.
+    pub fn must_know_ros(manifest: &TaskManifest) -> bool {
+        launch::of(manifest).ros.is_some()
+            || !manifest.requires.ros_distro.is_empty()
+            || !manifest.exec_depends.is_empty()
+    }
+
+    /// What `manifest` needs and this robot lacks, each as a sentence part; empty when it has all that can be told.
+    pub fn lacks(&self, manifest: &TaskManifest) -> Vec<String> {
+        let requires = &manifest.requires;
+        let mut lacks = Vec::new();
+        for (key, value) in &requires.labels {
+            match self.labels.as_ref().and_then(|labels| labels.get(key)) {
+                Some(have) if have == value => {}
+                Some(have) => lacks.push(format!("label {key}={value} (it has {key}={have})")),
+                None => lacks.push(format!("label {key}={value}")),
+            }
+        }
+        if !requires.arch.is_empty() && !requires.arch.contains(&self.arch) {
+            lacks.push(format!("arch {} (it is {})", requires.arch.join(" or "), self.arch));
+        }
+        let Some(installations) = &self.installations else { return lacks };
+        let launcher = launch::of(manifest);
+        let lacks_of = |chosen: &Installation| -> Vec<String> {
+            let needed = manifest.exec_depends.iter().map(String::as_str).chain(launcher.package);
+            chosen.lacks(needed).into_iter().map(|name| format!("ROS package {name}")).collect()
+        };
+        lacks.extend(match installation::choose(installations, launcher.ros, &requires.ros_distro) {
+            Ok(Some(chosen)) => lacks_of(chosen),
+            Ok(None) => lacks_of(&Installation { packages: Some(BTreeSet::new()), ..Installation::default() }),
+            Err(error) => vec![error.to_string()],
+        });
+        lacks
+    }
+}
+
+impl Missing {
+    /// Why a task that was ready is not as it should be.
+    pub fn failure(&self) -> Failure {
+        Failure::new(self.code.clone(), self.sentence(""))
+    }
+
+    /// Why a task was not ready within its time.
+    pub fn not_within(&self, timeout_s: u32) -> Failure {
+        Failure::new(FailureCode::NOT_READY, self.sentence(&format!(" within {timeout_s} s")))
+    }
+
+    fn sentence(&self, when: &str) -> String {
+        let (what, seen) = (&self.what, &self.seen);
+        if seen.is_empty() { format!("{what}{when}") } else { format!("{what}{when}; {seen}") }
+    }
+}
+
+impl Exit {
+    /// Whether it ended as a program does that is content.
+    pub fn is_success(&self) -> bool {
+        self.status == Some(ExitStatus::Code(0))
+    }
+
+    /// The failure that this end is, in words and with the last lines of output.
+    pub fn failure(&self) -> Failure {
+        let (code, end) = match (self.out_of_memory_bytes, self.status) {
+            (Some(limit), _) => {
+                let end = format!("killed: it used more than the {} MiB of memory it may", limit >> 20);
+                (FailureCode::OUT_OF_MEMORY, end)
+            }
+            (None, Some(status)) => (FailureCode::PROCESS_EXITED, status.to_string()),
+            (None, None) => (FailureCode::PROCESS_EXITED, "gone without an exit status".to_owned()),
+        };
+        Failure::new(code, self.text(&end))
+    }
+
+    fn text(&self, end: &str) -> String {
+        if self.last_lines.trim().is_empty() {
+            format!("the process ended ({end}) and wrote nothing")
+        } else {
+            format!("the process ended ({end}); its last lines:\n{}", self.last_lines.trim_end())
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use task_proto::manifest::Requires;
+
+    use super::*;
+    use crate::setup::installation::RosVersion;
+
+    fn manifest(tool: &str, exec_depends: &[&str]) -> TaskManifest {
+        serde_json::from_value(serde_json::json!({
+            "name": "talker", "version": "1.0.0", "build": {"tool": tool}, "run": {"exec": ["true"]},
+            "exec_depends": exec_depends,
+            "content": {"tar_digest": Digest::of(b""), "tar_size": 0, "entries": 0},
+        }))
+        .expect("manifest")
+    }
+
+    fn robot(installations: Vec<Installation>) -> RobotFacts {
+        let installations = Some(installations);
+        RobotFacts { arch: "x86_64".to_owned(), labels: Some(Labels::new()), installations, no_task_user: None }
+    }
+
+    fn jazzy() -> Installation {
+        Installation {
+            distros: vec!["jazzy".to_owned()],
+            versions: vec![RosVersion::Ros2],
+            packages: Some(["std_msgs".to_owned()].into()),
+            ..Installation::default()
+        }
+    }
+
+    #[test]
+    fn what_is_missing_is_said_with_what_is_there() {
+        let mut missing = Missing {
+            is_its_own: true,
+            since_ms: 0,
+            code: FailureCode::NODE_VANISHED,
+            what: "`/mapper` did not appear".to_owned(),
+            seen: "on the graph: `/lidar`, `/odom`".to_owned(),
+        };
+        let failure = missing.not_within(30);
+        assert_eq!(
+            failure.to_string(),
+            "not_ready: `/mapper` did not appear within 30 s; on the graph: `/lidar`, `/odom`"
+        );
+        missing.seen.clear();
+        assert_eq!(missing.failure().to_string(), "node_vanished: `/mapper` did not appear");
+    }
+
+    #[test]
+    fn what_is_lacking_is_listed_by_the_packages_keys() {
+        let mut robot = robot(vec![jazzy()]);
+        robot.labels = Some([("base".parse().expect("valid"), "husky".parse().expect("valid"))].into());
+        let mut manifest = manifest("colcon", &["std_msgs", "nav2_bringup", "python3-numpy", "slam_toolbox"]);
+        manifest.requires.labels.insert("base".parse().expect("valid"), "turtlebot".parse().expect("valid"));
+        manifest.requires.arch = vec!["aarch64".to_owned()];
+        assert_eq!(
+            robot.lacks(&manifest),
+            [
+                "label base=turtlebot (it has base=husky)",
+                "arch aarch64 (it is x86_64)",
+                "ROS package nav2_bringup",
+                "ROS package slam_toolbox",
+            ]
+        );
+        manifest.requires = Requires { ros_distro: vec!["humble".to_owned()], ..Requires::default() };
+        assert_eq!(robot.lacks(&manifest), ["ros_distro humble (it has jazzy)"]);
+        manifest.requires.ros_distro = vec!["jazzy".to_owned()];
+        manifest.exec_depends.truncate(1);
+        assert!(robot.lacks(&manifest).is_empty());
+    }
+
+    #[test]
+    fn a_robot_without_ros_lacks_it_for_ros_packages_only() {
+        let robot = robot(Vec::new());
+        assert_eq!(robot.lacks(&manifest("colcon", &["rclpy"])), ["ROS 2 (no ROS 2 found)"]);
+        assert_eq!(robot.lacks(&manifest("catkin", &["rospy"])), ["ROS 1 (no ROS 1 found)"]);
+        assert_eq!(robot.lacks(&manifest("none", &["nav_msgs", "ffmpeg"])), ["ROS package nav_msgs"]);
+        assert!(robot.lacks(&manifest("none", &["ffmpeg"])).is_empty());
+        assert!(!RobotFacts::must_know_ros(&manifest("none", &[])));
+        assert!(RobotFacts::must_know_ros(&manifest("colcon", &[])));
+    }
+}

@@ -1,0 +1,550 @@
+//! Properties of the plan, shown in a small simulated world: whatever happens in whatever order, no job runs twice, no
+//! task has two processes, what is not wanted is interrupted, and once it is quiet everything converges.
+
+mod world;
+
+use proptest::prelude::*;
+use task_proto::manifest::{OnBoot, Outputs, Restart, Run, TaskKind};
+use task_proto::report::{FailureCode, Phase};
+
+use self::world::{Happening, Sight, World, happening, health, manifest, order, package};
+use super::*;
+use crate::task::ledger::GateStep;
+use crate::task::observed::Missing;
+
+fn run_rules() -> impl Strategy<Value = Run> {
+    let kind = prop_oneof![Just(TaskKind::Service), Just(TaskKind::Job)];
+    let on_boot = prop_oneof![Just(OnBoot::Start), Just(OnBoot::Hold)];
+    let restart = prop_oneof![Just(Restart::Always), Just(Restart::OnFailure), Just(Restart::Never)];
+    (kind, on_boot, restart, any::<bool>()).prop_map(|(kind, on_boot, restart, idempotent)| Run {
+        kind,
+        on_boot,
+        restart,
+        idempotent,
+        ..Run::default()
+    })
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 512, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn whatever_happens_it_is_safe_and_converges(
+        rules in run_rules(),
+        outputs in prop::bool::ANY,
+        asks in any::<bool>(),
+        bad in prop_oneof![Just(None), Just(Some(0)), Just(Some(1))],
+        happenings in prop::collection::vec(happening(), 1..80),
+    ) {
+        let outputs = Outputs { paths: outputs.then(|| "maps/*".to_owned()).into_iter().collect() };
+        let mut world = World::new(rules);
+        (world.bad, world.outputs, world.asks) = (bad, outputs, asks);
+        for happening in happenings {
+            world.happen(happening);
+            prop_assert!(world.alive.len() <= 1);
+        }
+        world.settle();
+        match (&world.desired, &world.record) {
+            (None, record) => {
+                prop_assert!(record.is_none() && world.alive.is_empty() && world.disk.is_empty());
+            }
+            (Some(order), Some(record)) => {
+                prop_assert_eq!(&record.order, order);
+                let phase = record.standing().0;
+                prop_assert_eq!(phase, record.phase);
+                match order.wanted {
+                    Wanted::Stopped => prop_assert!(world.alive.is_empty() && phase == Phase::Stopped),
+                    Wanted::Running => {
+                        let active = record.active.as_ref().filter(|active| active.is_for(order));
+                        let runs = active.is_some_and(|active| active.process.is_some()) && world.alive.len() == 1;
+                        prop_assert!(runs == (phase == Phase::Running), "{phase} {active:?} {:?}", world.alive);
+                        prop_assert!(runs || phase.is_final(), "stuck in {phase}: {record:?}");
+                        let old_runs = active.is_none() && world.alive.len() == 1;
+                        prop_assert!(phase != Phase::RolledBack || old_runs, "nothing came back: {record:?}");
+                        let bad = bad.is_some_and(|number| order.package == package(number));
+                        prop_assert!(!(bad && runs), "it runs, and is not ready");
+                    }
+                }
+                prop_assert!(world.disk.len() <= 3);
+                prop_assert!(record.collections.is_empty());
+            }
+            (Some(_), None) => prop_assert!(false, "an order without a record"),
+        }
+    }
+
+    #[test]
+    fn backoff_stays_in_its_bounds(attempt in 0..u32::MAX, jitter in 0.0..1.0f64) {
+        prop_assert!(backoff_ms(attempt, 60_000, jitter) <= 60_000);
+        prop_assert!(backoff_ms(attempt, 60_000, 1.0) >= backoff_ms(attempt, 60_000, jitter));
+    }
+}
+
+fn running(run: Run) -> World {
+    let mut world = World::new(run);
+    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+    while world.alive.is_empty() {
+        world.happen(Happening::Effect { well: true });
+        world.happen(Happening::Learn);
+    }
+    world.happen(Happening::Wait { ms: 2000 });
+    assert_eq!(world.record.as_ref().expect("a record").phase, Phase::Running);
+    world
+}
+
+fn phase(world: &World) -> Phase {
+    world.record.as_ref().expect("a record").phase
+}
+
+#[test]
+fn the_old_version_runs_until_the_new_one_is_staged_and_after_a_cancel() {
+    let mut world = running(Run::default());
+    let old = world.alive.clone();
+    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
+    assert!(matches!(world.steps[..], [(Step::PullManifest(_), false)]));
+    assert_eq!((phase(&world), &world.alive), (Phase::Fetching, &old));
+    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+    assert_eq!((phase(&world), &world.alive), (Phase::Running, &old));
+    assert!(world.steps.is_empty(), "the cancelled step is interrupted: {:?}", world.steps);
+}
+
+#[test]
+fn the_old_version_comes_back_after_a_reboot_while_the_new_one_is_pulled() {
+    let mut world = running(Run::default());
+    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
+    world.happen(Happening::Reboot);
+    let mut lanes: Vec<Lane> = world.steps.iter().map(|(step, _)| step.lane()).collect();
+    lanes.sort();
+    assert_eq!(lanes, [Lane::Prepare, Lane::Run]);
+    assert_eq!(phase(&world), Phase::Fetching);
+}
+
+#[test]
+fn a_start_that_seemed_to_fail_is_stopped_before_anything_is_made_of_it() {
+    let mut world = World::new(Run::default());
+    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+    while !matches!(world.steps[..], [(Step::Start(_), false)]) {
+        world.happen(Happening::Effect { well: true });
+        world.happen(Happening::Learn);
+    }
+    let (Step::Start(run), _) = world.steps[0].clone() else { panic!("looked for") };
+    // The shim did not answer in time, and has started it all the same.
+    world.alive.push(run.process.expect("begun").dir);
+    world.happen(Happening::Effect { well: false });
+    assert!(matches!(world.steps[..], [(Step::Stop(_), false)]), "{:?}", world.steps);
+    world.happen(Happening::Effect { well: true });
+    world.happen(Happening::Learn);
+    let active = |world: &World| world.record.as_ref().and_then(|record| record.active.clone()).expect("active");
+    assert_eq!((world.alive.len(), active(&world).restarts, active(&world).process), (0, 1, None));
+    world.settle();
+    assert_eq!((phase(&world), world.alive.len()), (Phase::Running, 1));
+}
+
+#[test]
+fn run_whose_tree_was_changed_is_fetched_and_built_anew_before_it_starts() {
+    let mut world = running(Run::default());
+    world.happen(Happening::ProcessEnds { code: 1 });
+    world.happen(Happening::Wait { ms: 90_000 });
+    assert!(matches!(world.steps[..], [(Step::Start(_), false)]), "{:?}", world.steps);
+    world.happen(Happening::FindsChange);
+    let standing = |world: &World| {
+        let record = world.record.clone().expect("a record");
+        (record.standing().0, record.standing().1.map(|failure| failure.code.clone()))
+    };
+    assert!(matches!(world.steps[..], [(Step::PullContent { .. }, false)]), "{:?}", world.steps);
+    assert_eq!(standing(&world), (Phase::Fetching, Some(task_proto::report::FailureCode::TREE_CHANGED)));
+    world.happen(Happening::Wait { ms: 90_000 });
+    assert!(world.alive.is_empty(), "it is not started before it is there");
+    world.settle();
+    assert_eq!((standing(&world), world.alive.len()), ((Phase::Running, None), 1));
+}
+
+#[test]
+fn a_wait_beyond_all_numbers_is_the_longest_there_is() {
+    let mut world = World::new(Run::default());
+    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+    world.happen(Happening::ToldToWait { ms: u64::MAX });
+    assert_eq!(world.record.as_ref().expect("a record").preparation.retry_at_ms, u64::MAX);
+    assert!(world.steps.is_empty(), "{:?}", world.steps);
+}
+
+#[test]
+fn hold_starts_nothing_and_stops_nothing() {
+    let mut world = running(Run::default());
+    let old = world.alive.clone();
+    world.happen(Happening::Hold(true));
+    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
+    for _ in 0..4 {
+        world.happen(Happening::Effect { well: true });
+        world.happen(Happening::Learn);
+    }
+    assert_eq!((phase(&world), &world.alive), (Phase::Deferred, &old));
+    world.happen(Happening::Hold(false));
+    assert!(matches!(world.steps[..], [(Step::Stop(_), false)]));
+}
+
+#[test]
+fn a_job_that_the_robot_lost_is_interrupted_unless_it_is_idempotent() {
+    for (idempotent, expected) in [(false, Phase::Failed), (true, Phase::Starting)] {
+        let mut world = running(Run { kind: TaskKind::Job, idempotent, ..Run::default() });
+        world.happen(Happening::Reboot);
+        assert_eq!(phase(&world), expected);
+    }
+}
+
+#[test]
+fn a_start_that_a_power_cut_met_is_made_again_unless_it_may_have_been_that_of_a_job() {
+    let job = |idempotent| Run { kind: TaskKind::Job, idempotent, ..Run::default() };
+    for (run, may_have_begun, expected) in [
+        (job(false), true, Phase::Failed),
+        (job(false), false, Phase::Starting),
+        (job(true), true, Phase::Starting),
+        (Run::default(), true, Phase::Starting),
+    ] {
+        let mut world = World::new(run);
+        world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+        while !matches!(world.steps[..], [(Step::Start(_), false)]) {
+            world.happen(Happening::Effect { well: true });
+            world.happen(Happening::Learn);
+        }
+        if may_have_begun {
+            world.happen(Happening::Effect { well: true });
+        }
+        world.happen(Happening::Reboot);
+        assert_eq!(phase(&world), expected, "{may_have_begun}");
+        assert_eq!(matches!(world.steps[..], [(Step::Start(_), false)]), expected == Phase::Starting);
+    }
+}
+
+#[test]
+fn a_job_of_which_nothing_ran_is_started_again() {
+    let mut world = World::new(Run { kind: TaskKind::Job, ..Run::default() });
+    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+    while !matches!(world.steps[..], [(Step::Start(_), false)]) {
+        world.happen(Happening::Effect { well: true });
+        world.happen(Happening::Learn);
+    }
+    world.happen(Happening::Effect { well: false });
+    world.happen(Happening::Learn);
+    assert_eq!((phase(&world), world.alive.len()), (Phase::Starting, 0));
+    world.settle();
+    assert_eq!((phase(&world), world.alive.len()), (Phase::Running, 1));
+}
+
+#[test]
+fn files_of_a_run_that_was_replaced_before_it_was_ready_come_back() {
+    let mut world = World::new(Run::default());
+    world.outputs = Outputs { paths: vec!["maps/*".to_owned()] };
+    world.health = health(Sight::NotAll, 0);
+    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+    while world.alive.is_empty() {
+        world.happen(Happening::Effect { well: true });
+        world.happen(Happening::Learn);
+    }
+    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
+    let mut collected = Vec::new();
+    for _ in 0..20 {
+        collected.extend(world.steps.iter().filter_map(|(step, _)| match step {
+            Step::Collect(files) => Some(files.package.clone()),
+            _ => None,
+        }));
+        world.happen(Happening::Effect { well: true });
+        world.happen(Happening::Learn);
+    }
+    assert_eq!(collected.first(), Some(&package(0)), "{collected:?}");
+}
+
+#[test]
+fn a_service_that_never_gets_ready_fails_with_its_exit_code() {
+    let mut world = World::new(Run::default());
+    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
+    for _ in 0..200 {
+        world.happen(Happening::Effect { well: true });
+        world.happen(Happening::Learn);
+        if world.alive.iter().any(|dir| dir.starts_with("d0000000000000001")) {
+            world.happen(Happening::ProcessEnds { code: 3 });
+        }
+        world.happen(Happening::Wait { ms: 500 });
+    }
+    let (phase, failure) = world.record.as_ref().expect("a record").standing();
+    assert_eq!(phase, Phase::Failed);
+    assert!(failure.expect("a failure").text.contains("exited with code 3"));
+}
+
+fn bad_switch(world: &mut World) -> String {
+    let old = world.alive[0].clone();
+    world.bad = Some(1);
+    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
+    while !world.alive.iter().any(|dir| dir.starts_with("d0000000000000001")) {
+        world.happen(Happening::Effect { well: true });
+        world.happen(Happening::Learn);
+    }
+    old
+}
+
+#[test]
+fn a_version_that_does_not_get_ready_is_stopped_and_the_old_one_started_again() {
+    let mut world = running(Run::default());
+    bad_switch(&mut world);
+    assert_eq!(phase(&world), Phase::Starting);
+    world.happen(Happening::Wait { ms: 30_000 });
+    assert!(matches!(world.steps[..], [(Step::Stop(_), false)]), "{:?}", world.steps);
+    assert_eq!(phase(&world), Phase::Starting, "it is not final before the process is gone");
+    world.happen(Happening::Effect { well: true });
+    world.happen(Happening::Learn);
+    let record = world.record.as_ref().expect("a record");
+    let (phase, failure) = record.standing();
+    assert_eq!(phase, Phase::RolledBack);
+    assert_eq!(failure.expect("why").to_string(), "not_ready: `/mapper` is gone within 30 s");
+    assert!(matches!(&world.steps[..], [(Step::Start(run), false)] if run.package == package(0)), "{:?}", world.steps);
+    world.settle();
+    assert_eq!((world.alive.len(), world.record.as_ref().expect("a record").phase), (1, Phase::RolledBack));
+    // A reboot brings the old one back, and the order is not tried again by itself.
+    world.happen(Happening::Reboot);
+    world.settle();
+    let record = world.record.as_ref().expect("a record");
+    assert_eq!((record.phase, &record.active.as_ref().expect("active").package), (Phase::RolledBack, &package(0)));
+    world.bad = None;
+    world.happen(Happening::Order { deployment: 1, run: 2, stop: false });
+    world.settle();
+    assert_eq!(world.record.as_ref().expect("a record").phase, Phase::Running);
+}
+
+#[test]
+fn a_rollback_survives_a_power_cut_before_and_after_every_step() {
+    for cut in 0..12 {
+        let mut world = running(Run::default());
+        bad_switch(&mut world);
+        for at in 0..12 {
+            if at == cut {
+                world.happen(Happening::Reboot);
+            }
+            world.happen(if at % 2 == 0 { Happening::Wait { ms: 15_000 } } else { Happening::Effect { well: true } });
+            world.happen(Happening::Learn);
+        }
+        world.settle();
+        assert_eq!((phase(&world), world.alive.len()), (Phase::RolledBack, 1), "cut at {cut}");
+    }
+}
+
+#[test]
+fn when_the_old_version_fails_after_it_came_back_the_order_has_failed() {
+    let mut world = running(Run::default());
+    bad_switch(&mut world);
+    for _ in 0..10_000 {
+        world.happen(Happening::Effect { well: true });
+        world.happen(Happening::Learn);
+        if phase(&world) == Phase::RolledBack {
+            world.happen(Happening::ProcessEnds { code: 3 });
+        }
+        world.happen(Happening::Wait { ms: 30_000 });
+    }
+    let (phase, failure) = world.record.as_ref().expect("a record").standing();
+    let text = &failure.expect("why").text;
+    assert_eq!((phase, world.alive.len()), (Phase::Failed, 0));
+    assert!(text.contains("within 30 s\n1.0, which had come back, failed: the process ended"), "{text}");
+}
+
+#[test]
+fn what_the_operator_had_stopped_does_not_come_back() {
+    let mut world = running(Run::default());
+    world.happen(Happening::Order { deployment: 0, run: 2, stop: true });
+    world.settle();
+    assert_eq!(phase(&world), Phase::Stopped);
+    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
+    assert!(world.steps.iter().all(|(step, _)| step.lane() == Lane::Prepare), "the old one stays down meanwhile");
+    bad_order(&mut world);
+    assert_eq!((phase(&world), world.alive.len()), (Phase::Failed, 0));
+}
+
+#[test]
+fn a_first_version_and_a_job_that_do_not_get_ready_have_failed() {
+    let mut world = World::new(Run::default());
+    bad_order(&mut world);
+    assert_eq!((phase(&world), world.alive.len()), (Phase::Failed, 0));
+    let mut world = running(Run::default());
+    world.manifest.kind = TaskKind::Job;
+    bad_order(&mut world);
+    assert_eq!((phase(&world), world.alive.len()), (Phase::Failed, 0));
+}
+
+fn bad_order(world: &mut World) {
+    world.bad = Some(1);
+    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
+    world.settle();
+}
+
+#[test]
+fn a_task_that_stays_degraded_is_started_again_unless_its_policy_is_never() {
+    for (restart, again) in [(Restart::OnFailure, true), (Restart::Always, true), (Restart::Never, false)] {
+        let mut world = running(Run { restart, ..Run::default() });
+        world.happen(Happening::Sees(Sight::NotAll));
+        world.happen(Happening::Wait { ms: 29_999 });
+        assert!(world.steps.is_empty());
+        world.happen(Happening::Wait { ms: 1 });
+        assert_eq!(matches!(world.steps[..], [(Step::Stop(_), false)]), again, "{restart:?}");
+        assert_eq!(phase(&world), Phase::Running);
+        world.settle();
+        let active = world.record.as_ref().expect("a record").active.as_ref().expect("active");
+        assert_eq!((phase(&world), active.restarts), (Phase::Running, u32::from(again)));
+    }
+}
+
+#[test]
+fn a_task_must_hold_for_its_time_without_a_break() {
+    let mut world = World::new(Run::default());
+    world.health = Health::Unknown;
+    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+    while world.alive.is_empty() {
+        world.happen(Happening::Effect { well: true });
+        world.happen(Happening::Learn);
+    }
+    for sight in [Sight::All, Sight::NotAll, Sight::All] {
+        world.happen(Happening::Sees(sight));
+        world.happen(Happening::Wait { ms: 1999 });
+        assert_eq!(phase(&world), Phase::Starting);
+    }
+    world.happen(Happening::Wait { ms: 1 });
+    assert_eq!(phase(&world), Phase::Running);
+    let mut world = running(Run::default());
+    world.happen(Happening::Sees(Sight::Refused));
+    assert_eq!((phase(&world), world.steps.len()), (Phase::Running, 0), "only a start can be refused");
+}
+
+#[test]
+fn what_was_good_before_a_power_cut_is_tried_again_when_it_is_refused_after() {
+    let mut world = running(Run::default());
+    world.happen(Happening::Reboot);
+    world.health = health(Sight::Refused, 0);
+    for _ in 0..20 {
+        world.happen(Happening::Effect { well: true });
+        world.happen(Happening::Learn);
+        world.happen(Happening::Wait { ms: 30_000 });
+    }
+    let active = world.record.as_ref().expect("a record").active.as_ref().expect("active");
+    assert!(active.end.is_none() && active.restarts > 0, "{active:?}");
+    world.health = health(Sight::All, 0);
+    world.settle();
+    assert_eq!((phase(&world), world.alive.len()), (Phase::Running, 1));
+}
+
+#[test]
+fn what_is_no_fault_of_its_own_ends_no_run() {
+    let mut world = running(Run::default());
+    let Health::Missing(missing) = health(Sight::NotAll, 0) else { panic!("it is missing") };
+    for (is_its_own, stops) in [(false, 0), (true, 1)] {
+        world.health = Health::Missing(Missing { is_its_own, ..missing.clone() });
+        world.happen(Happening::Wait { ms: 600_000 });
+        assert_eq!(world.steps.len(), stops, "{:?}", world.steps);
+    }
+    assert!(matches!(world.steps[..], [(Step::Stop(_), false)]), "{:?}", world.steps);
+}
+
+#[test]
+fn a_job_has_its_deadline() {
+    let mut world = running(Run { kind: TaskKind::Job, deadline_s: Some(60), ..Run::default() });
+    world.happen(Happening::Wait { ms: 57_999 });
+    assert!(world.steps.is_empty());
+    world.happen(Happening::Wait { ms: 1 });
+    assert!(matches!(world.steps[..], [(Step::Stop(_), false)]), "{:?}", world.steps);
+    world.settle();
+    let (phase, failure) = world.record.as_ref().expect("a record").standing();
+    assert_eq!((phase, &failure.expect("why").code), (Phase::Failed, &FailureCode::DEADLINE_EXCEEDED));
+}
+
+#[test]
+fn the_gate_allows_a_switch_as_a_whole() {
+    let mut world = running(Run::default());
+    world.gated = true;
+    let old = world.alive.clone();
+    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
+    while !matches!(world.steps[..], [(Step::Ask(_), _)]) {
+        world.happen(Happening::Effect { well: true });
+        world.happen(Happening::Learn);
+    }
+    let step = |world: &World| match &world.steps[..] {
+        [(Step::Ask(question), false)] => Some(question.step),
+        _ => None,
+    };
+    assert_eq!(step(&world), Some(GateStep::Switch));
+    for _ in 0..3 {
+        world.happen(Happening::Effect { well: false });
+        assert_eq!((phase(&world), &world.alive), (Phase::Deferred, &old));
+        assert!(world.steps.is_empty(), "it is asked again later");
+        world.happen(Happening::Wait { ms: 60_000 });
+        assert_eq!((phase(&world), step(&world)), (Phase::Deferred, Some(GateStep::Switch)));
+    }
+    world.happen(Happening::Effect { well: true });
+    world.happen(Happening::Learn);
+    assert!(matches!(world.steps[..], [(Step::Stop(_), false)]), "{:?}", world.steps);
+    world.happen(Happening::Effect { well: true });
+    world.happen(Happening::Learn);
+    assert!(matches!(world.steps[..], [(Step::Start(_), false)]), "{:?}", world.steps);
+    world.settle();
+    // A crash is no new start, a reboot is.
+    world.happen(Happening::ProcessEnds { code: 1 });
+    world.happen(Happening::Wait { ms: 60_000 });
+    assert!(matches!(world.steps[..], [(Step::Start(_), false)]), "{:?}", world.steps);
+    world.settle();
+    world.happen(Happening::Reboot);
+    assert_eq!(step(&world), Some(GateStep::Start));
+    world.happen(Happening::Effect { well: false });
+    assert_eq!(phase(&world), Phase::Deferred);
+}
+
+#[test]
+fn a_stop_that_the_gate_refuses_waits_while_the_task_is_looked_after() {
+    let mut world = running(Run::default());
+    world.gated = true;
+    world.happen(Happening::Order { deployment: 0, run: 2, stop: true });
+    world.happen(Happening::Effect { well: false });
+    assert_eq!((phase(&world), world.alive.len()), (Phase::Deferred, 1));
+    world.happen(Happening::Sees(Sight::NotAll));
+    world.happen(Happening::Wait { ms: 30_000 });
+    assert!(world.steps.iter().any(|(step, _)| matches!(step, Step::Stop(_))), "what failed is stopped unasked");
+    world.settle();
+    assert_eq!((phase(&world), world.alive.len()), (Phase::Stopped, 0));
+}
+
+#[test]
+fn on_boot_hold_leaves_a_service_down_after_a_reboot() {
+    let mut world = running(Run { on_boot: OnBoot::Hold, ..Run::default() });
+    world.happen(Happening::Reboot);
+    world.settle();
+    assert_eq!((phase(&world), world.alive.len()), (Phase::Stopped, 0));
+    world.happen(Happening::Order { deployment: 0, run: 2, stop: false });
+    world.settle();
+    assert_eq!((phase(&world), world.alive.len()), (Phase::Running, 1));
+}
+
+#[test]
+fn every_step_of_the_run_lane_has_a_deadline() {
+    let order = order(1, 1, 1, Wanted::Running);
+    let stop_timeout_s = 3600;
+    let run = ActiveRun::of(&order, RunRules::from(&manifest(&Run { stop_timeout_s, ..Run::default() })), 0);
+    let steps =
+        [Step::Start(Box::new(run.clone())), Step::Stop(Box::new(run)), Step::Prune { kept: Vec::new() }, Step::Remove];
+    assert!(steps.iter().all(|step| step.lane() == Lane::Run && step.deadline().is_some()));
+    let stop = steps[1].deadline().expect("checked");
+    assert!(stop > Duration::from_secs(2 * u64::from(stop_timeout_s)), "both signals have their time: {stop:?}");
+}
+
+#[test]
+fn who_has_signed_it_is_looked_for_before_anything_of_it_is_fetched() {
+    let mut world = World::new(Run::default());
+    world.asks = true;
+    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+    assert!(matches!(world.steps[..], [(Step::CheckSigners(_), false)]), "{:?}", world.steps);
+    world.happen(Happening::Effect { well: true });
+    world.happen(Happening::Learn);
+    assert!(matches!(world.steps[..], [(Step::PullManifest(_), false)]), "{:?}", world.steps);
+    // Whoever signed it is trusted no more while it is pulled.
+    world.happen(Happening::Signed(false));
+    world.happen(Happening::Effect { well: true });
+    world.happen(Happening::Learn);
+    assert!(matches!(world.steps[..], [(Step::CheckSigners(_), false)]), "{:?}", world.steps);
+    world.happen(Happening::Effect { well: true });
+    assert_eq!(phase(&world), Phase::Failed);
+    let failure = world.record.as_ref().expect("a record").preparation.failure.clone().expect("a reason");
+    assert_eq!(failure.code, FailureCode::UNTRUSTED_PACKAGE);
+    assert!(world.steps.is_empty() && world.disk.iter().all(|(_, level)| *level < 2), "{:?}", world.disk);
+}

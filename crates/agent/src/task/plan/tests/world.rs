@@ -1,0 +1,483 @@
+//! The simulated world: one robot with one task, on which things happen in any order. Acts for the agent exactly as the
+//! plan decides, and checks on the way that no job is started twice.
+
+use proptest::prelude::*;
+use task_proto::desired::{BlobRef, Delivery};
+use task_proto::manifest::{Build, ContentFacts, Outputs, Ready, Requires, Run, TaskKind, TaskManifest};
+use task_proto::report::{Failure, FailureCode};
+use task_proto::{DeploymentId, Digest};
+
+use crate::process::program::ExitStatus;
+use crate::setup::installation::Installation;
+use crate::task::observed::{Exit, Missing};
+use crate::task::plan::*;
+
+/// One robot with one task.
+pub(super) struct World {
+    pub(super) desired: Option<DesiredTask>,
+    pub(super) record: Option<TaskRecord>,
+    /// The processes that live, by their directory.
+    pub(super) alive: Vec<String>,
+    /// How those ended that do not.
+    ended: Vec<(String, Option<ExitStatus>)>,
+    /// Versions whose manifest, content and build are there.
+    pub(super) disk: Vec<(PackageRef, u8)>,
+    /// The steps under way, with whether their effect has happened.
+    pub(super) steps: Vec<(Step, bool)>,
+    /// (deployment, run) of every process of a job that was ever started.
+    job_starts: Vec<(DeploymentId, u64)>,
+    boot: u32,
+    pub(super) start: u64,
+    now_ms: u64,
+    held: bool,
+    may_begin: bool,
+    pub(super) manifest: Run,
+    ros_seen: bool,
+    /// What ROS says of the process that lives, unless its version is bad.
+    pub(super) health: Health,
+    /// The number of the package that never gets ready.
+    pub(super) bad: Option<u8>,
+    pub(super) gated: bool,
+    pub(super) outputs: Outputs,
+    /// Whether the robot asks who has signed a version, those whose signatures are on its disk, and whether these are
+    /// enough.
+    pub(super) asks: bool,
+    vouched: Vec<PackageRef>,
+    signed: bool,
+}
+
+/// What can happen.
+#[derive(Debug, Clone)]
+pub(super) enum Happening {
+    Order {
+        deployment: u8,
+        run: u64,
+        stop: bool,
+    },
+    Withdraw,
+    /// The effect of a step happens, well or badly; the agent does not know it yet.
+    Effect {
+        well: bool,
+    },
+    /// The server has no room for a pull and says when to come back.
+    ToldToWait {
+        ms: u64,
+    },
+    /// A start finds that what is on the disk was changed, and deletes it.
+    FindsChange,
+    /// The agent learns of the ends of steps.
+    Learn,
+    ProcessEnds {
+        code: i32,
+    },
+    ProcessVanishes,
+    AgentDies,
+    Reboot,
+    Hold(bool),
+    MayBegin(bool),
+    /// Signatures are enough, or not any more.
+    Signed(bool),
+    Gate(bool),
+    Sees(Sight),
+    Wait {
+        ms: u64,
+    },
+}
+
+/// What ROS can be seen to say.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Sight {
+    Nothing,
+    All,
+    NotAll,
+    Refused,
+}
+
+fn sight() -> impl Strategy<Value = Sight> {
+    prop_oneof![1 => Just(Sight::Nothing), 4 => Just(Sight::All), 1 => Just(Sight::NotAll), 1 => Just(Sight::Refused)]
+}
+
+pub(super) fn health(sight: Sight, since_ms: u64) -> Health {
+    match sight {
+        Sight::Nothing => Health::Unknown,
+        Sight::All => Health::Holds { since_ms },
+        Sight::NotAll => Health::Missing(Missing {
+            is_its_own: true,
+            since_ms,
+            code: FailureCode::NODE_VANISHED,
+            what: "`/mapper` is gone".to_owned(),
+            seen: String::new(),
+        }),
+        Sight::Refused => Health::Refused(Failure::new(FailureCode::NODE_NAME_TAKEN, "it was there before")),
+    }
+}
+
+pub(super) fn happening() -> impl Strategy<Value = Happening> {
+    use Happening::*;
+    prop_oneof![
+        4 => (0..3u8, 1..3u64, any::<bool>())
+            .prop_map(|(deployment, run, stop)| Order { deployment, run, stop: stop && run == 2 }),
+        1 => Just(Withdraw),
+        8 => prop::bool::weighted(0.8).prop_map(|well| Effect { well }),
+        2 => (0..90_000u64).prop_map(|ms| ToldToWait { ms }),
+        1 => Just(FindsChange),
+        8 => Just(Learn),
+        2 => (0..2i32).prop_map(|code| ProcessEnds { code }),
+        1 => Just(ProcessVanishes),
+        2 => Just(AgentDies),
+        1 => Just(Reboot),
+        1 => any::<bool>().prop_map(Hold),
+        1 => any::<bool>().prop_map(MayBegin),
+        1 => any::<bool>().prop_map(Signed),
+        1 => any::<bool>().prop_map(Gate),
+        3 => sight().prop_map(Sees),
+        3 => (0..90_000u64).prop_map(|ms| Wait { ms }),
+    ]
+}
+
+pub(super) fn package(number: u8) -> PackageRef {
+    let blob = |kind: u8| BlobRef { digest: Digest::of(&[number, kind]), size: 1 };
+    PackageRef {
+        name: "talker".parse().expect("valid"),
+        version: format!("1.{number}").parse().expect("valid"),
+        manifest: blob(0),
+        config: blob(1),
+        content: blob(2),
+    }
+}
+
+pub(super) fn order(deployment: u8, package_number: u8, run: u64, wanted: Wanted) -> DesiredTask {
+    DesiredTask {
+        task: "talker".parse().expect("valid"),
+        deployment: format!("d{deployment:016x}").parse().expect("valid"),
+        package: package(package_number),
+        wanted,
+        run,
+        delivery: Delivery::PushPull,
+        priority: 0,
+    }
+}
+
+fn ros() -> Installation {
+    Installation { packages: Some(["std_msgs".to_owned()].into()), ..Installation::default() }
+}
+
+impl World {
+    pub(super) fn new(manifest: Run) -> Self {
+        Self {
+            desired: None,
+            record: None,
+            alive: Vec::new(),
+            ended: Vec::new(),
+            disk: Vec::new(),
+            steps: Vec::new(),
+            job_starts: Vec::new(),
+            boot: 1,
+            start: 1,
+            now_ms: 1000,
+            held: false,
+            may_begin: true,
+            ros_seen: false,
+            manifest,
+            health: Health::Holds { since_ms: 0 },
+            bad: None,
+            gated: false,
+            outputs: Outputs::default(),
+            asks: false,
+            vouched: Vec::new(),
+            signed: true,
+        }
+    }
+
+    pub(super) fn happen(&mut self, happening: Happening) {
+        match happening {
+            Happening::Order { deployment, run, stop } => {
+                let wanted = if stop { Wanted::Stopped } else { Wanted::Running };
+                // A deployment is of one package.
+                self.desired = Some(order(deployment, deployment % 2, run, wanted));
+            }
+            Happening::Withdraw => self.desired = None,
+            Happening::Effect { well } => self.effect(well),
+            Happening::ToldToWait { ms } => self.told_to_wait(ms),
+            Happening::Learn => self.learn(),
+            Happening::FindsChange => self.find_change(),
+            Happening::ProcessEnds { code } => self.end_process(Some(ExitStatus::Code(code))),
+            Happening::ProcessVanishes => self.end_process(None),
+            Happening::AgentDies => self.start_agent(self.boot),
+            Happening::Reboot => {
+                self.end_process(None);
+                self.now_ms = 1000;
+                self.health = health(Sight::All, 0);
+                self.start_agent(self.boot + 1);
+            }
+            Happening::Hold(held) => self.held = held,
+            Happening::MayBegin(may_begin) => self.may_begin = may_begin,
+            Happening::Signed(signed) => self.signed = signed,
+            Happening::Gate(gated) => self.gated = gated,
+            Happening::Sees(sight) => self.health = health(sight, self.now_ms),
+            Happening::Wait { ms } => self.now_ms += ms,
+        }
+        self.plan();
+    }
+
+    fn start_agent(&mut self, boot: u32) {
+        self.steps.clear();
+        self.start += 1;
+        let mut ledger = crate::task::ledger::Ledger::new(1);
+        ledger.boot_id = self.boot.to_string();
+        ledger.tasks.extend(self.record.take().map(|record| (record.order.task.clone(), record)));
+        self.boot = boot;
+        ledger.enter_boot(&self.boot.to_string(), self.now_ms);
+        self.record = ledger.tasks.into_values().next();
+    }
+
+    fn end_process(&mut self, status: Option<ExitStatus>) {
+        for dir in self.alive.drain(..) {
+            self.ended.push((dir, status));
+        }
+    }
+
+    /// The driver's loop: plans both lanes until they rest.
+    pub(super) fn plan(&mut self) {
+        let desired = self.desired.clone();
+        // An interrupted step has no further effect; the driver waits for that before it begins another.
+        self.steps.retain(|(step, _)| step.is_wanted(desired.as_ref(), self.record.as_ref()));
+        if self.record.is_none() {
+            self.record = desired.map(|order| TaskRecord::new(order, self.now_ms));
+        }
+        for round in 0.. {
+            assert!(round < 20, "the plan does not come to rest: {:?}", self.record);
+            let before = (self.record.clone(), self.steps.len());
+            for lane in Lane::ALL {
+                if self.record.is_none() || self.steps.iter().any(|(step, _)| step.lane() == lane) {
+                    continue;
+                }
+                let next = self.with_situation(|s| match lane {
+                    Lane::Run => supervise(s),
+                    Lane::Prepare => prepare(s),
+                    Lane::Gate => consult(s),
+                    Lane::Collect => collect(s),
+                });
+                match next {
+                    Next::Rest { .. } => {}
+                    Next::Record(record) => self.record = Some(*record),
+                    Next::Act(step) => self.begin(step),
+                }
+            }
+            if before == (self.record.clone(), self.steps.len()) {
+                return;
+            }
+        }
+    }
+
+    fn begin(&mut self, step: Step) {
+        let record = self.record.as_ref().expect("a step is of a record");
+        let same = |run: &ActiveRun, other: &ActiveRun| run.deployment == other.deployment && run.run == other.run;
+        let new = match &step {
+            Step::PullManifest(package) | Step::PullContent { package, .. } | Step::Build(package) => Some(package),
+            Step::Start(run) if record.active.as_ref().is_none_or(|active| !same(active, run)) => Some(&run.package),
+            _ => None,
+        };
+        let vouched = new.map_or(Vouched::Yes, |package| self.vouched_for(package));
+        assert_eq!(vouched, Vouched::Yes, "nobody trusted has signed what is begun: {step:?}");
+        self.record = Some(begun(record, &step, &self.boot.to_string(), self.start, self.now_ms));
+        // What a start will do is fixed by the record written before it.
+        let step = match step {
+            Step::Start(_) => {
+                Step::Start(Box::new(self.record.clone().and_then(|record| record.active).expect("begun")))
+            }
+            other => other,
+        };
+        self.steps.push((step, false));
+    }
+
+    fn with_situation<T>(&self, ask: impl Fn(&Situation<'_>) -> T) -> T {
+        let record = self.record.as_ref().expect("there is a record");
+        let level =
+            self.disk.iter().find(|(on_disk, _)| *on_disk == record.order.package).map_or(0, |(_, level)| *level);
+        let prepared = Prepared {
+            manifest: (level > 0).then(|| TaskManifest { outputs: self.outputs.clone(), ..manifest(&self.manifest) }),
+            content: level > 1,
+            built: level > 2,
+            versions: self.disk.iter().map(|(package, _)| package.manifest.digest).collect(),
+            vouched: self.vouched_for(&record.order.package),
+        };
+        let process = match record.active.as_ref().and_then(|active| active.process.as_ref()) {
+            None => ProcessState::None,
+            Some(process) if self.alive.contains(&process.dir) => ProcessState::Alive { pid: 7 },
+            Some(process) => match self.ended.iter().find(|(dir, _)| *dir == process.dir) {
+                Some((_, status)) => {
+                    ProcessState::Ended(Exit { status: *status, out_of_memory_bytes: None, last_lines: String::new() })
+                }
+                None => ProcessState::NeverStarted,
+            },
+        };
+        let active = record.active.as_ref().map(|active| &active.package);
+        let bad = self.bad.is_some_and(|number| active == Some(&package(number)));
+        let health = if bad { health(Sight::NotAll, 0) } else { self.health.clone() };
+        ask(&Situation {
+            desired: self.desired.as_ref(),
+            record,
+            prepared: &prepared,
+            process: &process,
+            health: &health,
+            preparing: self.steps.iter().any(|(step, _)| step.lane() == Lane::Prepare),
+            acting: self.steps.iter().any(|(step, _)| step.lane() == Lane::Run),
+            collecting: self.steps.iter().any(|(step, _)| step.lane() == Lane::Collect),
+            deleting: self.steps.iter().any(|(step, _)| step.deletes()),
+            robot: &RobotFacts { installations: self.ros_seen.then(|| vec![ros()]), ..RobotFacts::default() },
+            may_begin: self.may_begin,
+            held: self.held,
+            gated: self.gated,
+            boot_id: &self.boot.to_string(),
+            now_ms: self.now_ms,
+            jitter: 0.5,
+        })
+    }
+
+    fn told_to_wait(&mut self, ms: u64) {
+        let is_pull = |step: &Step| matches!(step, Step::PullManifest(_) | Step::PullContent { .. });
+        let Some(at) = self.steps.iter().position(|(step, done)| !done && is_pull(step)) else { return };
+        let (step, _) = self.steps.remove(at);
+        let before = self.record.clone().expect("a step is of a record").preparation;
+        let told = Done::ToldToWait { at_least_ms: ms };
+        let record = self.with_situation(|s| finished(s, &step, Ok(told)));
+        let after = &record.preparation;
+        assert_eq!((after.phase, after.attempts), (before.phase, before.attempts), "it counts as a try");
+        assert!(after.failure.is_none() && after.retry_at_ms >= self.now_ms.saturating_add(ms));
+        self.record = Some(record);
+    }
+
+    fn find_change(&mut self) {
+        let start = |(step, done): &(Step, bool)| {
+            if let (Step::Start(run), false) = (step, done) { Some(run.clone()) } else { None }
+        };
+        let Some((at, run)) = self.steps.iter().enumerate().find_map(|(at, step)| Some((at, start(step)?))) else {
+            return;
+        };
+        let (step, _) = self.steps.remove(at);
+        self.raise(&run.package, 1);
+        let failure = Failure::new(FailureCode::TREE_CHANGED, "src is not what was unpacked");
+        let error = StepFailure { failure, retry_after_ms: Some(0) };
+        self.record = Some(self.with_situation(|s| finished(s, &step, Err(error.clone()))));
+    }
+
+    fn effect(&mut self, well: bool) {
+        let Some((step, done)) = self.steps.iter_mut().find(|(_, done)| !done) else { return };
+        *done = true;
+        let step = step.clone();
+        if !well {
+            self.steps.retain(|(other, _)| *other != step);
+            let failure = Failure::new(FailureCode::IO_ERROR, "it went badly");
+            let error = StepFailure { failure, retry_after_ms: Some(0) };
+            self.record = Some(self.with_situation(|s| finished(s, &step, Err(error.clone()))));
+            return;
+        }
+        match &step {
+            Step::CheckSigners(package) if self.signed => self.vouched.push(package.clone()),
+            Step::CheckSigners(_) => {
+                self.steps.retain(|(other, _)| *other != step);
+                let failure = Failure::new(FailureCode::UNTRUSTED_PACKAGE, "nobody has signed it");
+                let error = StepFailure { failure, retry_after_ms: None };
+                self.record = Some(self.with_situation(|s| finished(s, &step, Err(error.clone()))));
+            }
+            Step::PullManifest(package) => self.raise(package, 1),
+            Step::LookForRos(_) => self.ros_seen = true,
+            Step::Ask(_) => {}
+            Step::Collect(files) => {
+                assert!(self.disk.iter().any(|(package, _)| *package == files.package), "its files are gone");
+                let active = self.record.as_ref().and_then(|record| record.active.as_ref());
+                let same = active.is_some_and(|run| {
+                    run.deployment == files.deployment && run.run == files.run && run.process.is_some()
+                });
+                assert!(!same, "it still writes");
+            }
+            Step::PullContent { package, .. } => self.raise(package, 2),
+            Step::Build(package) => self.raise(package, 3),
+            Step::Start(run) => {
+                assert!(self.alive.is_empty(), "a second process of the task");
+                let dir = run.process.as_ref().expect("begun").dir.clone();
+                assert!(self.ended.iter().all(|(other, _)| *other != dir), "a run directory is used twice");
+                self.alive.push(dir);
+                if self.manifest.kind == TaskKind::Job {
+                    let job = (run.deployment.clone(), run.run);
+                    assert!(self.manifest.idempotent || !self.job_starts.contains(&job), "a job is started twice");
+                    self.job_starts.push(job);
+                }
+            }
+            Step::Stop(run) => {
+                assert_eq!(self.record.as_ref().and_then(|record| record.active.as_ref()), Some(&**run));
+                let process = run.process.as_ref().expect("what lives");
+                self.alive.retain(|dir| *dir != process.dir);
+                self.ended.push((process.dir.clone(), Some(ExitStatus::Signal(2))));
+            }
+            Step::Prune { kept } => {
+                let active = self.record.as_ref().and_then(|record| record.active.as_ref());
+                let fallback = self.record.as_ref().and_then(|record| record.fallback.as_ref());
+                for run in [active, fallback].into_iter().flatten() {
+                    assert!(kept.contains(&run.package.manifest.digest), "prunes what runs or may come back");
+                }
+                self.disk.retain(|(package, _)| kept.contains(&package.manifest.digest));
+            }
+            Step::Remove => {
+                assert!(self.alive.is_empty(), "removes a task that runs");
+                self.disk.clear();
+                // With the task its history and directories go: the same order afterwards is a new one.
+                self.job_starts.clear();
+                self.ended.clear();
+            }
+        }
+    }
+
+    fn vouched_for(&self, package: &PackageRef) -> Vouched {
+        let is_vouched = !self.asks || (self.signed && self.vouched.contains(package));
+        if is_vouched { Vouched::Yes } else { Vouched::No }
+    }
+
+    fn raise(&mut self, package: &PackageRef, level: u8) {
+        self.disk.retain(|(on_disk, _)| on_disk != package);
+        self.disk.push((package.clone(), level));
+    }
+
+    fn learn(&mut self) {
+        let (done, under_way) = std::mem::take(&mut self.steps).into_iter().partition(|(_, done)| *done);
+        self.steps = under_way;
+        for (step, _) in done {
+            if step == Step::Remove {
+                self.record = None;
+            } else {
+                self.record = Some(self.with_situation(|s| finished(s, &step, Ok(Done::Started(7)))));
+            }
+        }
+    }
+
+    /// Lets everything go well until nothing is left to do.
+    pub(super) fn settle(&mut self) {
+        self.happen(Happening::Hold(false));
+        self.happen(Happening::MayBegin(true));
+        self.happen(Happening::Signed(true));
+        self.health = health(Sight::All, 0);
+        for _ in 0..60 {
+            self.happen(Happening::Effect { well: true });
+            self.happen(Happening::Learn);
+            self.happen(Happening::Wait { ms: 400_000 });
+        }
+        assert!(self.steps.is_empty(), "still under way: {:?}", self.steps);
+    }
+}
+
+pub(super) fn manifest(run: &Run) -> TaskManifest {
+    TaskManifest {
+        name: "talker".parse().expect("valid"),
+        version: "1.0".parse().expect("valid"),
+        build: Build::default(),
+        run: run.clone(),
+        ready: Ready::default(),
+        parameters: Default::default(),
+        outputs: Outputs::default(),
+        requires: Requires::default(),
+        limits: task_proto::manifest::Limits::default(),
+        exec_depends: vec!["std_msgs".to_owned()],
+        content: ContentFacts { tar_digest: Digest::of(b""), tar_size: 0, entries: 0 },
+    }
+}

@@ -1,0 +1,423 @@
+//! How the machine does, from what the kernel shows in /proc and /sys. A [`Gauge`] looks; [`Sender`] says it once a minute,
+//! over the MQTT session or, while there is none, over HTTP. Nothing is decided by it, and what was lost is not sent again.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use task_proto::RobotId;
+use task_proto::api::AWAITS_APPROVAL;
+use task_proto::topic::RobotTopic;
+use task_proto::vitals::{Telemetry, Vitals};
+use tokio::sync::{Mutex, mpsc};
+use tokio::time::Instant;
+
+use crate::link::state::{Message, REFUSED_POLL, Shared, spread};
+use crate::system::battery;
+use crate::system::clock;
+use crate::system::disk;
+use crate::system::error_chain::chain;
+use crate::transfer::server::{Server, ServerError};
+
+/// Shares of time and rates over less than this say little.
+const LEAST_SPAN: Duration = Duration::from_millis(250);
+/// The first look is sent within this time, so that a fleet which starts at once spreads over it.
+const FIRST_WITHIN: Duration = Duration::from_secs(10);
+/// How long a server that does not know what it is sent is left alone: it is older than this agent.
+const UNKNOWN_PAUSE: Duration = Duration::from_secs(3600);
+
+/// Where the kernel shows how the machine does.
+#[derive(Debug, Clone)]
+pub struct Places {
+    /// `/proc`.
+    pub proc: PathBuf,
+    /// `/sys`.
+    pub sys: PathBuf,
+    /// What lies on the file system that counts.
+    pub data: PathBuf,
+}
+
+impl Places {
+    /// Those of this machine, with the agent's data directory.
+    pub fn of_this_machine(data: &Path) -> Self {
+        Self { proc: "/proc".into(), sys: "/sys".into(), data: data.to_owned() }
+    }
+}
+
+/// What only grows; two of them make shares and rates.
+#[derive(Debug, Clone, Copy, Default)]
+struct Counters {
+    /// Time of all processors, in the kernel's ticks, and of it that in which they did something.
+    cpu: Option<(u64, u64)>,
+    /// Bytes in and out.
+    network: Option<(u64, u64)>,
+}
+
+/// Looks at the machine, again and again.
+pub struct Gauge {
+    places: Places,
+    before: Option<(Instant, Counters)>,
+    last: Vitals,
+}
+
+impl Gauge {
+    /// One that has not looked yet.
+    pub fn new(places: Places) -> Self {
+        Self { places, before: None, last: Vitals::default() }
+    }
+
+    /// How the machine does at `now`. The first look knows no shares and rates; one that comes too soon after the one before
+    /// shows that again.
+    pub fn look(&mut self, now: Instant) -> Vitals {
+        if self.before.is_some_and(|(at, _)| now.duration_since(at) < LEAST_SPAN) {
+            return self.last;
+        }
+        let counters = Counters { cpu: self.cpu(), network: self.network() };
+        let (before_at, before) = self.before.replace((now, counters)).unwrap_or((now, Counters::default()));
+        let seconds = now.duration_since(before_at).as_secs_f64();
+        let network = counters.network.zip(before.network).filter(|_| seconds > 0.0);
+        let rate = |now: u64, before: u64| (now.saturating_sub(before) as f64 / seconds) as u64;
+        let (memory_total_bytes, memory_used_bytes) = self.memory().unzip();
+        let room = disk::room(&self.places.data).ok();
+        self.last = Vitals {
+            at_ms: clock::wall_ms(),
+            cpu_percent: counters.cpu.zip(before.cpu).and_then(|(now, before)| busy_percent(now, before)),
+            memory_used_bytes,
+            memory_total_bytes,
+            disk_used_bytes: room.map(|room| room.total.saturating_sub(room.free)),
+            disk_total_bytes: room.map(|room| room.total),
+            network_in_bytes_per_s: network.map(|(now, before)| rate(now.0, before.0)),
+            network_out_bytes_per_s: network.map(|(now, before)| rate(now.1, before.1)),
+            load_1m: self.proc("loadavg").and_then(|text| text.split_whitespace().next()?.parse().ok()),
+            battery_percent: battery::percent(&self.places.sys.join("class/power_supply")),
+            temperature_c: self.temperature(),
+        };
+        self.last
+    }
+
+    fn proc(&self, name: &str) -> Option<String> {
+        fs::read_to_string(self.places.proc.join(name)).ok()
+    }
+
+    fn cpu(&self) -> Option<(u64, u64)> {
+        let text = self.proc("stat")?;
+        let line = text.lines().find_map(|line| line.strip_prefix("cpu "))?;
+        // What guests used is in what their hosts did already.
+        let ticks: Vec<u64> = line.split_whitespace().take(8).map_while(|number| number.parse().ok()).collect();
+        let idle = ticks.get(3)?.saturating_add(ticks.get(4).copied().unwrap_or(0));
+        let all = ticks.iter().copied().fold(0, u64::saturating_add);
+        Some((all, all.saturating_sub(idle)))
+    }
+
+    /// All there is, and what programs could not have.
+    fn memory(&self) -> Option<(u64, u64)> {
+        let text = self.proc("meminfo")?;
+        let bytes = |key: &str| {
+            let line = text.lines().find_map(|line| line.strip_prefix(key)?.strip_prefix(':'))?;
+            line.split_whitespace().next()?.parse::<u64>().ok()?.checked_mul(1024)
+        };
+        let total = bytes("MemTotal")?;
+        Some((total, total.saturating_sub(bytes("MemAvailable")?)))
+    }
+
+    /// Of the interfaces that are devices; where there are none, as in a container, of all but the loopback. Bridges and
+    /// the like would count everything twice.
+    fn network(&self) -> Option<(u64, u64)> {
+        let text = self.proc("net/dev")?;
+        let all = text.lines().filter_map(|line| {
+            let (name, figures) = line.split_once(':')?;
+            let figures: Vec<&str> = figures.split_whitespace().collect();
+            Some((name.trim(), figures.first()?.parse::<u64>().ok()?, figures.get(8)?.parse::<u64>().ok()?))
+        });
+        let all: Vec<_> = all.filter(|(name, ..)| *name != "lo").collect();
+        let devices: BTreeSet<&str> = all.iter().map(|(name, ..)| *name).filter(|name| self.is_device(name)).collect();
+        let counted = all.iter().filter(|(name, ..)| devices.is_empty() || devices.contains(name));
+        Some(counted.fold((0, 0), |sum, (_, r#in, out)| (sum.0.saturating_add(*r#in), sum.1.saturating_add(*out))))
+    }
+
+    fn is_device(&self, interface: &str) -> bool {
+        self.places.sys.join("class/net").join(interface).join("device").exists()
+    }
+
+    fn temperature(&self) -> Option<f32> {
+        let zones = fs::read_dir(self.places.sys.join("class/thermal")).ok()?.flatten();
+        let zones = zones.filter(|zone| zone.file_name().to_string_lossy().starts_with("thermal_zone"));
+        let read = |zone: fs::DirEntry| fs::read_to_string(zone.path().join("temp")).ok()?.trim().parse::<i32>().ok();
+        // A zone without a sensor says something that no robot survives.
+        let hottest = zones.filter_map(read).filter(|milli| (-40_000..=150_000).contains(milli)).max()?;
+        Some(tenths(f64::from(hottest) / 1000.0))
+    }
+}
+
+fn busy_percent(now: (u64, u64), before: (u64, u64)) -> Option<f32> {
+    let all = now.0.checked_sub(before.0).filter(|all| *all > 0)?;
+    let busy = now.1.saturating_sub(before.1).min(all);
+    Some(tenths(busy as f64 * 100.0 / all as f64))
+}
+
+fn tenths(value: f64) -> f32 {
+    ((value * 10.0).round() / 10.0) as f32
+}
+
+/// Where vitals come from: the machine, or what stands for one.
+pub trait Source: Send + 'static {
+    /// How it does now.
+    fn look(&mut self) -> Vitals;
+}
+
+impl Source for Gauge {
+    fn look(&mut self) -> Vitals {
+        self.look(Instant::now())
+    }
+}
+
+/// Vitals for whoever asks now. Who asks again and again gets them over the time in between.
+#[derive(Clone)]
+pub struct Asked {
+    gauge: Arc<Mutex<Gauge>>,
+}
+
+impl Asked {
+    /// Of the machine at `places`.
+    pub fn new(places: Places) -> Self {
+        Self { gauge: Arc::new(Mutex::new(Gauge::new(places))) }
+    }
+
+    /// How the machine does. After nobody has asked for a while it looks twice, or shares and rates would be over all that time.
+    pub async fn now(&self) -> Vitals {
+        const FRESH: Duration = Duration::from_secs(10);
+        let mut gauge = self.gauge.lock().await;
+        let is_fresh = gauge.before.is_some_and(|(at, _)| at.elapsed() < FRESH);
+        if !is_fresh {
+            gauge.before = None;
+            gauge.look(Instant::now());
+            tokio::time::sleep(LEAST_SPAN).await;
+        }
+        gauge.look(Instant::now())
+    }
+}
+
+/// Says again and again how the robot does.
+pub struct Sender<S> {
+    /// The robot.
+    pub robot_id: RobotId,
+    /// How often; zero: never.
+    pub interval: Duration,
+    /// What is said.
+    pub source: S,
+    /// Where it goes while no session is up.
+    pub server: Server,
+}
+
+impl<S: Source> Sender<S> {
+    /// Sends until the agent ends; `messages` go out while a session is up.
+    pub async fn run(mut self, shared: Shared, messages: mpsc::Sender<Message>) {
+        if self.interval.is_zero() {
+            return;
+        }
+        // A session brings the same with less, above all where a whole fleet starts at once.
+        let mut tried = shared.mqtt_tried.subscribe();
+        tokio::select! {
+            // Cancel-safe: a watch remembers what it holds, a token can be awaited again.
+            _ = tried.wait_for(|tried| *tried) => {}
+            () = shared.shutdown.cancelled() => return,
+        }
+        // The shares and rates of the first message begin here.
+        self.source.look();
+        let first = FIRST_WITHIN.min(self.interval).mul_f64(0.1 + 0.9 * rand::random::<f64>());
+        let mut ticks = tokio::time::interval_at(Instant::now() + first, self.interval);
+        ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        let mut not_before = Instant::now();
+        loop {
+            tokio::select! {
+                // Cancel-safe: an interval keeps its own time.
+                _ = ticks.tick() => {}
+                // Cancel-safe: a token can be awaited again.
+                () = shared.shutdown.cancelled() => return,
+            }
+            let telemetry = Telemetry { robot_id: self.robot_id.clone(), vitals: self.source.look() };
+            if *shared.mqtt_up.borrow() {
+                say(&messages, &telemetry);
+            } else if Instant::now() >= not_before
+                && let Err(error) = self.server.telemetry(&telemetry).await
+            {
+                tracing::debug!(error = %chain(&error), "no vitals over HTTP");
+                not_before = Instant::now() + pause(&error);
+            }
+        }
+    }
+}
+
+/// How long the server is told nothing after this answer.
+fn pause(error: &ServerError) -> Duration {
+    match error {
+        ServerError::TokenRefused(_) => REFUSED_POLL.mul_f64(spread()),
+        // It is let in at any time.
+        ServerError::Refused { code, .. } if code == AWAITS_APPROVAL => REFUSED_POLL.mul_f64(spread()),
+        ServerError::Refused { .. } => UNKNOWN_PAUSE,
+        ServerError::Busy { retry_after: Some(wait), .. } => (*wait).min(REFUSED_POLL),
+        ServerError::Busy { .. } | ServerError::Unreachable(_) | ServerError::NotTheServer(_) => Duration::ZERO,
+    }
+}
+
+fn say(messages: &mpsc::Sender<Message>, telemetry: &Telemetry) {
+    match serde_json::to_vec(telemetry) {
+        // With a session that is too slow the next ones say more.
+        Ok(payload) => drop(messages.try_send(Message { topic: RobotTopic::Telemetry, payload })),
+        Err(error) => tracing::error!(%error, "vitals can't be written as JSON"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    struct Machine {
+        dir: tempfile::TempDir,
+    }
+
+    impl Machine {
+        fn new() -> Self {
+            Self { dir: tempfile::tempdir().expect("a directory") }
+        }
+
+        fn write(&self, path: &str, text: &str) {
+            let path = self.dir.path().join(path);
+            fs::create_dir_all(path.parent().expect("a parent")).expect("made");
+            fs::write(path, text).expect("written");
+        }
+
+        fn gauge(&self) -> Gauge {
+            let root = self.dir.path();
+            Gauge::new(Places { proc: root.join("proc"), sys: root.join("sys"), data: root.to_owned() })
+        }
+    }
+
+    const NET_HEAD: &str =
+        "Inter-|   Receive                            |  Transmit\n face |bytes    packets |bytes    packets\n";
+
+    fn interface(name: &str, r#in: u64, out: u64) -> String {
+        format!("  {name}: {in} 1 0 0 0 0 0 0 {out} 1 0 0 0 0 0 0\n")
+    }
+
+    #[test]
+    fn shares_and_rates_are_over_the_time_between_two_looks() {
+        let machine = Machine::new();
+        machine.write("proc/stat", "cpu  100 0 100 700 100 0 0 0 50 0\ncpu0 1 2 3\n");
+        machine.write("proc/net/dev", &format!("{NET_HEAD}{}{}", interface("lo", 9, 9), interface("eth0", 1000, 100)));
+        let mut gauge = machine.gauge();
+        let begun = Instant::now();
+        let first = gauge.look(begun);
+        assert_eq!((first.cpu_percent, first.network_in_bytes_per_s), (None, None));
+        machine.write("proc/stat", "cpu  150 0 125 900 125 0 0 0 60 0\n");
+        machine
+            .write("proc/net/dev", &format!("{NET_HEAD}{}{}", interface("lo", 99, 99), interface("eth0", 3000, 400)));
+        assert_eq!(gauge.look(begun + LEAST_SPAN / 2), first, "too soon");
+        let second = gauge.look(begun + Duration::from_secs(2));
+        assert_eq!(second.cpu_percent, Some(25.0));
+        assert_eq!((second.network_in_bytes_per_s, second.network_out_bytes_per_s), (Some(1000), Some(150)));
+        // An interface was taken away, and counters began anew.
+        machine.write("proc/net/dev", NET_HEAD);
+        machine.write("proc/stat", "cpu  1 0 1 1 1 0 0 0 0 0\n");
+        let third = gauge.look(begun + Duration::from_secs(4));
+        assert_eq!((third.cpu_percent, third.network_in_bytes_per_s), (None, Some(0)));
+    }
+
+    #[test]
+    fn bridges_do_not_count_where_there_are_devices() {
+        let machine = Machine::new();
+        let net = |eth, bridge| format!("{NET_HEAD}{}{}", interface("eth0", eth, 0), interface("docker0", bridge, 0));
+        machine.write("proc/net/dev", &net(0, 0));
+        machine.write("sys/class/net/eth0/device/uevent", "");
+        let mut gauge = machine.gauge();
+        let begun = Instant::now();
+        gauge.look(begun);
+        machine.write("proc/net/dev", &net(500, 70_000));
+        assert_eq!(gauge.look(begun + Duration::from_secs(1)).network_in_bytes_per_s, Some(500));
+    }
+
+    #[test]
+    fn what_the_kernel_shows_of_memory_heat_and_load() {
+        let machine = Machine::new();
+        machine.write("proc/meminfo", "MemTotal:        4000 kB\nMemFree:  100 kB\nMemAvailable:    1000 kB\n");
+        machine.write("proc/loadavg", "0.42 0.30 0.20 1/100 4711\n");
+        machine.write("sys/class/thermal/thermal_zone0/temp", "51340\n");
+        machine.write("sys/class/thermal/thermal_zone1/temp", "-274000\n");
+        machine.write("sys/class/thermal/cooling_device0/temp", "99000\n");
+        machine.write("sys/class/power_supply/BAT0/type", "Battery\n");
+        machine.write("sys/class/power_supply/BAT0/capacity", "80\n");
+        let seen = machine.gauge().look(Instant::now());
+        assert_eq!((seen.memory_total_bytes, seen.memory_used_bytes), (Some(4_096_000), Some(3_072_000)));
+        assert_eq!((seen.load_1m, seen.temperature_c, seen.battery_percent), (Some(0.42), Some(51.3), Some(80)));
+        assert!(seen.disk_used_bytes <= seen.disk_total_bytes && seen.disk_total_bytes > Some(0));
+    }
+
+    #[test]
+    fn what_is_not_there_is_not_said() {
+        let machine = Machine::new();
+        machine.write("proc/stat", "intr 1\n");
+        machine.write("proc/meminfo", "MemTotal: many kB\n");
+        machine.write("proc/loadavg", "");
+        let mut gauge = machine.gauge();
+        let begun = Instant::now();
+        gauge.look(begun);
+        let seen = gauge.look(begun + Duration::from_secs(1));
+        let disk = (seen.disk_used_bytes, seen.disk_total_bytes);
+        let nothing =
+            Vitals { at_ms: seen.at_ms, disk_used_bytes: disk.0, disk_total_bytes: disk.1, ..Vitals::default() };
+        assert_eq!(seen, nothing);
+    }
+
+    #[test]
+    fn a_server_that_says_no_is_left_alone() {
+        let refused = |code: &str| ServerError::Refused { code: code.to_owned(), message: String::new() };
+        let busy = |retry_after| ServerError::Busy { status: 503, retry_after };
+        let some_minutes = REFUSED_POLL / 2..=REFUSED_POLL.mul_f64(1.5);
+        assert!(some_minutes.contains(&pause(&ServerError::TokenRefused("no such token".to_owned()))));
+        assert!(some_minutes.contains(&pause(&refused(AWAITS_APPROVAL))), "it may be let in soon");
+        assert_eq!(pause(&refused("not_found")), UNKNOWN_PAUSE);
+        assert_eq!(pause(&busy(Some(Duration::from_secs(7)))), Duration::from_secs(7));
+        assert_eq!(pause(&busy(Some(Duration::from_secs(1 << 40)))), REFUSED_POLL);
+        assert_eq!(pause(&ServerError::NotTheServer("a portal".to_owned())), Duration::ZERO);
+    }
+
+    /// Says, of each look, whether a session had been tried by then.
+    struct Looks(Shared, mpsc::UnboundedSender<bool>);
+
+    impl Source for Looks {
+        fn look(&mut self) -> Vitals {
+            self.1.send(*self.0.mqtt_tried.borrow()).expect("heard");
+            Vitals::default()
+        }
+    }
+
+    #[tokio::test]
+    async fn nothing_is_said_before_a_session_was_tried() {
+        let shared = Shared::new(tokio_util::sync::CancellationToken::new());
+        let (looks, mut looked) = mpsc::unbounded_channel();
+        let (messages, _said) = mpsc::channel(1);
+        let tls = task_transport::Trust::by(None).client_config(clock::for_certificates());
+        let client = crate::transfer::server::client(tls).expect("a client");
+        let robot_id = RobotId::random();
+        let base = "http://127.0.0.1:9/".parse().expect("a URL");
+        let server = Server::new(client, base, robot_id.clone(), "tskr_x".to_owned());
+        let source = Looks(shared.clone(), looks);
+        let sender = Sender { robot_id, interval: Duration::from_secs(60), source, server };
+        let sending = tokio::spawn(sender.run(shared.clone(), messages));
+        tokio::task::yield_now().await;
+        shared.mqtt_tried.send_replace(true);
+        assert_eq!(looked.recv().await, Some(true));
+        shared.shutdown.cancel();
+        sending.await.expect("ends");
+    }
+
+    #[tokio::test]
+    async fn this_machine_answers_whoever_asks() {
+        let asked = Asked::new(Places::of_this_machine(Path::new("/")));
+        let seen = asked.now().await;
+        assert!(seen.cpu_percent.is_some_and(|percent| (0.0..=100.0).contains(&percent)), "{seen:?}");
+        assert!(seen.memory_used_bytes < seen.memory_total_bytes, "{seen:?}");
+    }
+}

@@ -1,0 +1,246 @@
+//! The HTTP half of the link: enrol, ask for the desired state, deliver reports. It tells "the server said no" from
+//! "something else answered" (a captive portal, a proxy); it never retries and decides nothing.
+
+use std::time::Duration;
+
+use reqwest::header::{ETAG, HeaderMap, HeaderValue, IF_NONE_MATCH, RETRY_AFTER};
+use reqwest::{Method, StatusCode, Url};
+use rustls::ClientConfig;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use task_proto::api::{
+    EnrollRequest, EnrollResponse, ErrorBody, INSTANCE_HEADER, MqttEndpoint, PLACE_HEADER, ReportReply, RobotToken,
+};
+use task_proto::envelope::Envelope;
+use task_proto::report::Report;
+use task_proto::vitals::Telemetry;
+use task_proto::{Digest, InstanceId, RobotId};
+
+use crate::transfer::credential::Credential;
+
+/// The longest answer that is read.
+const MAX_ANSWER_BYTES: usize = 8 * 1024 * 1024;
+/// How long a connection may take to come about.
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(10);
+/// How long a whole request may take.
+const REQUEST_TIMEOUT: Duration = Duration::from_secs(30);
+/// How long a connection is kept for the next request: a pull makes several in a row, then nothing for minutes, and a fleet's
+/// idle connections would cost the server more than its sessions.
+pub const KEPT_CONNECTION: Duration = Duration::from_secs(3);
+
+/// Why there is no answer to use.
+#[derive(Debug, thiserror::Error)]
+pub enum ServerError {
+    /// No connection, or it broke.
+    #[error("the server can't be reached")]
+    Unreachable(#[source] reqwest::Error),
+    /// Something answered that is not taskd.
+    #[error("something else answers in the server's place: {0}")]
+    NotTheServer(String),
+    /// The token is not accepted.
+    #[error("the server does not accept the token: {0}")]
+    TokenRefused(String),
+    /// The server is overloaded, restarting or broken.
+    #[error("the server answers {status}")]
+    Busy {
+        /// The HTTP status.
+        status: u16,
+        /// When it wants to be asked again.
+        retry_after: Option<Duration>,
+    },
+    /// The server said no.
+    #[error("the server refuses: {message} ({code})")]
+    Refused {
+        /// The stable code.
+        code: String,
+        /// For people.
+        message: String,
+    },
+}
+
+/// The server, as one registered robot sees it.
+#[derive(Clone)]
+pub struct Server {
+    client: reqwest::Client,
+    base: Url,
+    robot: RobotId,
+    token: Credential,
+    /// What every request says of the agent that makes it.
+    said: HeaderMap,
+}
+
+/// A desired state as the server sent it.
+#[derive(Debug)]
+pub struct Sent {
+    /// The signed state.
+    pub envelope: Envelope,
+    /// The server's mark for just these bytes. It means something only to the server.
+    pub tag: Option<HeaderValue>,
+}
+
+/// The one HTTP client of the agent, which speaks TLS like this.
+pub fn client(tls: ClientConfig) -> Result<reqwest::Client, reqwest::Error> {
+    reqwest::Client::builder()
+        .tls_backend_preconfigured(tls)
+        .connect_timeout(CONNECT_TIMEOUT)
+        .timeout(REQUEST_TIMEOUT)
+        .pool_idle_timeout(KEPT_CONNECTION)
+        .redirect(reqwest::redirect::Policy::none())
+        .user_agent(concat!("task-agent/", env!("CARGO_PKG_VERSION")))
+        .build()
+}
+
+/// Registers a robot.
+pub async fn enroll(
+    client: &reqwest::Client,
+    base: &Url,
+    token: &str,
+    request: &EnrollRequest,
+) -> Result<EnrollResponse, ServerError> {
+    let answer = send(client, Method::POST, at(base, "enroll"), token, Some(request), HeaderMap::new()).await?;
+    parse(&answer.body)
+}
+
+impl Server {
+    /// The server at `base`, for the robot with this token.
+    pub fn new(client: reqwest::Client, base: Url, robot: RobotId, token: impl Into<Credential>) -> Self {
+        Self { client, base, robot, token: token.into(), said: HeaderMap::new() }
+    }
+
+    /// The same, as the agent `instance` that runs at `place`: to another one the server gives nothing for a while.
+    pub fn speaking_as(mut self, instance: &InstanceId, place: Option<Digest>) -> Self {
+        let said =
+            [(INSTANCE_HEADER, Some(instance.to_string())), (PLACE_HEADER, place.map(|place| place.to_string()))];
+        for (name, value) in said {
+            if let Some(value) = value.and_then(|value| HeaderValue::try_from(value).ok()) {
+                self.said.insert(name, value);
+            }
+        }
+        self
+    }
+
+    /// The same with another token.
+    pub fn with_token(&self, token: String) -> Self {
+        Self { token: token.into(), ..self.clone() }
+    }
+
+    /// The signed desired state; `None` if it is still the one that was sent with the tag `known`.
+    pub async fn desired(&self, known: Option<&HeaderValue>) -> Result<Option<Sent>, ServerError> {
+        let url = at(&self.base, &format!("robots/{}/desired", self.robot));
+        let answer = self.ask::<()>(Method::GET, url, None, known).await?;
+        if answer.status == StatusCode::NOT_MODIFIED {
+            return Ok(None);
+        }
+        Ok(Some(Sent { envelope: parse(&answer.body)?, tag: answer.headers.get(ETAG).cloned() }))
+    }
+
+    /// Delivers a report; once this returns it is stored.
+    pub async fn report(&self, report: &Report) -> Result<ReportReply, ServerError> {
+        let url = at(&self.base, &format!("robots/{}/report", self.robot));
+        let answer = self.ask(Method::POST, url, Some(report), None).await?;
+        parse(&answer.body)
+    }
+
+    /// Says how the robot's machine does.
+    pub async fn telemetry(&self, telemetry: &Telemetry) -> Result<(), ServerError> {
+        let url = at(&self.base, &format!("robots/{}/telemetry", self.robot));
+        self.ask(Method::POST, url, Some(telemetry), None).await.map(drop)
+    }
+
+    /// Asks where the robot's MQTT session goes.
+    pub async fn mqtt_endpoint(&self) -> Result<MqttEndpoint, ServerError> {
+        let url = at(&self.base, &format!("robots/{}/mqtt", self.robot));
+        let answer = self.ask::<()>(Method::GET, url, None, None).await?;
+        parse(&answer.body)
+    }
+
+    /// Asks for a token to go over to. The first use of it ends the one in use.
+    pub async fn next_token(&self) -> Result<String, ServerError> {
+        let url = at(&self.base, &format!("robots/{}/token", self.robot));
+        let answer = self.ask::<()>(Method::POST, url, None, None).await?;
+        let RobotToken { token } = parse(&answer.body)?;
+        Ok(token)
+    }
+
+    /// Sends; once more if the token was replaced while the request was under way.
+    async fn ask<B: Serialize>(
+        &self,
+        method: Method,
+        url: Url,
+        body: Option<&B>,
+        known: Option<&HeaderValue>,
+    ) -> Result<Answer, ServerError> {
+        let token = self.token.current();
+        let mut headers = self.said.clone();
+        headers.extend(known.map(|tag| (IF_NONE_MATCH, tag.clone())));
+        match send(&self.client, method.clone(), url.clone(), &token, body, headers.clone()).await {
+            Err(ServerError::TokenRefused(_)) if self.token.current() != token => {
+                send(&self.client, method, url, &self.token.current(), body, headers).await
+            }
+            answer => answer,
+        }
+    }
+}
+
+struct Answer {
+    status: StatusCode,
+    headers: HeaderMap,
+    body: Vec<u8>,
+}
+
+fn at(base: &Url, path: &str) -> Url {
+    let mut url = base.clone();
+    url.set_path(&format!("{}{}/{path}", base.path().trim_end_matches('/'), task_proto::api::BASE));
+    url
+}
+
+async fn send<B: Serialize>(
+    client: &reqwest::Client,
+    method: Method,
+    url: Url,
+    token: &str,
+    body: Option<&B>,
+    headers: HeaderMap,
+) -> Result<Answer, ServerError> {
+    let mut request = client.request(method, url).bearer_auth(token).headers(headers);
+    if let Some(body) = body {
+        request = request.json(body);
+    }
+    let mut response = request.send().await.map_err(ServerError::Unreachable)?;
+    let (status, headers) = (response.status(), response.headers().clone());
+    let mut bytes = Vec::new();
+    while let Some(chunk) = response.chunk().await.map_err(ServerError::Unreachable)? {
+        if bytes.len() + chunk.len() > MAX_ANSWER_BYTES {
+            return Err(ServerError::NotTheServer(format!("an answer of more than {MAX_ANSWER_BYTES} bytes")));
+        }
+        bytes.extend_from_slice(&chunk);
+    }
+    let answer = Answer { status, headers, body: bytes };
+    if status.is_success() || status == StatusCode::NOT_MODIFIED { Ok(answer) } else { Err(refusal(&answer)) }
+}
+
+fn refusal(answer: &Answer) -> ServerError {
+    let status = answer.status;
+    if status.is_server_error() || status == StatusCode::TOO_MANY_REQUESTS {
+        let seconds = answer.headers.get(RETRY_AFTER).and_then(|value| value.to_str().ok()?.parse().ok());
+        return ServerError::Busy { status: status.as_u16(), retry_after: seconds.map(Duration::from_secs) };
+    }
+    // A proxy also says 401 or 403; only the server says it in its own words.
+    let Ok(body) = serde_json::from_slice::<ErrorBody>(&answer.body) else { return not_the_server(answer) };
+    if status == StatusCode::UNAUTHORIZED {
+        return ServerError::TokenRefused(body.error.message);
+    }
+    ServerError::Refused { code: body.error.code, message: body.error.message }
+}
+
+fn not_the_server(answer: &Answer) -> ServerError {
+    let start = String::from_utf8_lossy(&answer.body[..answer.body.len().min(80)]).replace(char::is_control, " ");
+    ServerError::NotTheServer(format!("status {}, {start:?}", answer.status.as_u16()))
+}
+
+fn parse<T: DeserializeOwned>(body: &[u8]) -> Result<T, ServerError> {
+    serde_json::from_slice(body).map_err(|_| {
+        let start = String::from_utf8_lossy(&body[..body.len().min(80)]).replace(char::is_control, " ");
+        ServerError::NotTheServer(format!("{start:?} where JSON should be"))
+    })
+}

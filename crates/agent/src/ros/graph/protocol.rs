@@ -439,4 +439,20 @@ mod tests {
         let Event::Snapshot(shown) = serde_json::from_slice(&line).expect("an event") else { panic!("another event") };
         assert_eq!((shown.nodes.len(), shown.omitted), (MAX_NODES / 4, MAX_NODES / 4 * 3));
     }
+
+    #[test]
+    fn a_graph_that_was_not_cut_is_cut_where_it_is_received() {
+        let now = Instant::now();
+        let nodes = (0..MAX_NODES + 3).map(|number| node(&format!("/node_{number}"))).collect();
+        let participant = |number: u64| {
+            let mut id = [0; 12];
+            id[..8].copy_from_slice(&number.to_le_bytes());
+            ShownParticipant { id: ParticipantId(id), locators: BTreeSet::new(), seen_ms: 0 }
+        };
+        let participants = (0..=MAX_PARTICIPANTS as u64).map(participant).collect();
+        let shown = Shown { age_ms: 0, nodes, participants, omitted: 2 };
+        let received = shown.received(now, &Snapshot::empty(now));
+        assert_eq!((received.nodes.len(), received.omitted), (MAX_NODES, 5));
+        assert_eq!(received.participants.len(), MAX_PARTICIPANTS);
+    }
 }

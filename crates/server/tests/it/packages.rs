@@ -72,8 +72,11 @@ async fn a_task_package_is_checked_and_listed() {
 #[tokio::test]
 async fn package_in_another_repository_is_a_copy_with_its_referrers() {
     let registry = TestRegistry::start().await;
-    let own = registry.push_package("talker", "talker").await;
     let store = &registry.registry.store;
+    let first = registry.push_package("early/talker", "talker").await;
+    assert_eq!(store.packages().await.expect("packages"), [], "a copy alone is no package");
+    let own = registry.push_package("talker", "talker").await;
+    assert_eq!(own, first);
     for mirror in ["mirror/team/talker", "walker"] {
         let copy = registry.push_package(mirror, "talker").await;
         assert_eq!(copy, own, "a copy has the same digest");

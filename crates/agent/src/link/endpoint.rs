@@ -40,6 +40,7 @@ async fn ask(server: &Server, shared: &Shared) {
                 }
                 is_news
             });
+            shared.endpoint_answers.send_modify(|answers| *answers += 1);
         }
         Err(error) => tracing::debug!(error = %chain(&error), "the server does not say where MQTT is"),
     }

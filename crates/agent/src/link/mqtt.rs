@@ -28,7 +28,7 @@ use task_transport::{Line, LineError, Route};
 use tokio::sync::mpsc;
 use tokio::time::Instant;
 
-use self::destination::{moved, place_count};
+use self::destination::{Destination, moved, named_elsewhere, place_count};
 use self::room::MessageRoom;
 use self::subscriptions::Subscriptions;
 pub use self::ways::Ways;
@@ -109,13 +109,15 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
     let mut sends_large = false;
     let mut endpoint = shared.endpoint.subscribe();
     let (mut told, mut place) = (None, 0);
+    // How often the server's place was tried since a session was good there.
+    let mut returns = 0u32;
     loop {
         access.status.connection += 1;
         let begun = Instant::now();
         let room = MessageRoom::of(&access, &shared, sends_large);
         let newest = endpoint.borrow_and_update().clone();
         if newest != told {
-            (told, place) = (newest, 0);
+            (told, place, returns) = (newest, 0, 0);
         }
         let (there, places) = (access.destination(told.as_ref(), place), place_count(told.as_ref()));
         let (at, external) = (access.at(&there), there.external.as_ref());
@@ -125,6 +127,8 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
             // Cancel-safe: nothing follows. The broker notices that the session is gone.
             ended = session => ended,
             () = moved(&mut endpoint, &access, &there) => Ended::Moved,
+            // Cancel-safe: it only asks, and counts where the count lasts.
+            () = server_elsewhere(&access, &shared, &there, &mut returns), if places > 1 => Ended::Moved,
         };
         let was_up = shared.mqtt_up.send_replace(false);
         shared.mqtt_stores.send_replace(false);
@@ -138,7 +142,11 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
         }
         // Whoever waits for parts need not give up if the next session comes at once.
         shared.listening.session(matches!(ended, Ended::TooNarrow));
-        failures = if begun.elapsed() >= GOOD_SESSION { 1 } else { failures.saturating_add(1) };
+        let was_good = begun.elapsed() >= GOOD_SESSION;
+        if was_good && place == 0 {
+            returns = 0;
+        }
+        failures = if was_good { 1 } else { failures.saturating_add(1) };
         let (min_ms, max_ms) = match ended {
             Ended::Closed => return,
             Ended::TooNarrow => {
@@ -147,7 +155,7 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
             }
             Ended::Moved => {
                 access.ways.begin_anew();
-                failures = 0;
+                (failures, place) = (0, 0);
                 continue;
             }
             Ended::Refused => {
@@ -178,6 +186,24 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
             Ok(()) = endpoint.changed() => failures = 0,
             // Cancel-safe: a token can be awaited again.
             () = shared.shutdown.cancelled() => return,
+        }
+    }
+}
+
+/// Waits until the server is at another place than `there` and that place can be reached from here;
+/// until then the session stays up. Each of the earlier `returns` doubles the wait.
+async fn server_elsewhere(access: &MqttAccess, shared: &Shared, there: &Destination, returns: &mut u32) {
+    let mut asked = *returns;
+    loop {
+        let first = named_elsewhere(shared, access, there, &mut asked).await;
+        let way = access.ways.next(&first.host, first.port, first.is_encrypted, first.external.as_ref());
+        match Line::open(&way, CONNECT_TIMEOUT).await {
+            Ok(_) => {
+                tracing::info!(host = first.host, port = first.port, "the server is at another broker");
+                *returns = returns.saturating_add(1);
+                return;
+            }
+            Err(error) => tracing::info!(error = %chain(&error), "the server's broker can't be reached"),
         }
     }
 }

@@ -72,6 +72,8 @@ pub struct Shared {
     pub settled: watch::Sender<bool>,
     /// Where the MQTT session goes; `None`: where whoever keeps it was told at first.
     pub endpoint: watch::Sender<Option<MqttEndpoint>>,
+    /// How often the server has answered where it goes, with something new or not.
+    pub endpoint_answers: watch::Sender<u64>,
     /// Asks the server where it goes.
     pub find: Arc<Notify>,
     /// Whether a session is up.
@@ -131,6 +133,7 @@ impl Shared {
             confirmed: watch::Sender::new(0),
             settled: watch::Sender::new(false),
             endpoint: watch::Sender::new(None),
+            endpoint_answers: watch::Sender::new(0),
             find: Arc::default(),
             mqtt_up: watch::Sender::new(false),
             mqtt_tried: watch::Sender::new(false),

@@ -110,6 +110,14 @@ impl Mosquitto {
         std::fs::read_to_string(self.dir.join("log")).expect("a log")
     }
 
+    /// Takes one account out of its files.
+    fn forget(&self, user: &str) {
+        let path = self.dir.join("passwd");
+        let accounts = std::fs::read_to_string(&path).expect("written");
+        let others = accounts.lines().filter(|line| !line.starts_with(&format!("{user}:")));
+        std::fs::write(path, others.map(|line| format!("{line}\n")).collect::<String>()).expect("written");
+    }
+
     /// What an operator does after robots were enrolled: new files, then SIGHUP.
     pub async fn learn(&self, server: &Server) {
         for file in ["acl", "passwd"] {
@@ -348,6 +356,37 @@ async fn a_robots_password_at_mosquitto_opens_its_own_topics_only() {
     wait_connected(&server, 0).await;
 }
 
+/// Whether the server is at this broker.
+async fn is_at(server: &Server, broker: &Mosquitto) -> bool {
+    let info = server.get("/api/v1/server").await.expect("it answers");
+    info["mqtt"] == broker.address.to_string()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn robot_at_another_broker_than_the_server_comes_to_the_servers() {
+    let dir = TempDir::new().expect("temp dir");
+    let mut brokers = [Mosquitto::named(dir.path(), "first"), Mosquitto::named(dir.path(), "second")];
+    let list = format!("{}, {}", brokers[0].url(), brokers[1].url());
+    let server = Server::start_unready(&dir.path().join("server"), &[("TASKD_BROKER", &list)]).await;
+    let robot = Robot::start(&server, dir.path(), "robot-1", 1).await;
+    // The second broker accepts the robot and refuses the server.
+    brokers[1].learn(&server).await;
+    brokers[1].forget("taskd");
+    brokers[1].launch().await;
+    let is_there = format!(" as {}-", robot.id);
+    eventually("the robot to be at the second broker", async || brokers[1].log().contains(&is_there).then_some(()))
+        .await;
+    brokers[0].learn(&server).await;
+    brokers[0].launch().await;
+    server.wait_ready().await;
+    assert!(is_at(&server, &brokers[0]).await, "the second one refuses it");
+    // The server names the same places in the same order as before.
+    wait_connected(&server, 1).await;
+    server.push(&worker(dir.path(), "1.0.0"), "*").await;
+    runs(&server, "robot-1", "1.0.0").await;
+    assert_eq!(logs(&server, "robot-1").await.from, LogsFrom::Robot, "asked over the first broker");
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn server_and_robots_fail_over_to_the_next_broker_of_the_list() {
     let dir = TempDir::new().expect("temp dir");
@@ -355,18 +394,15 @@ async fn server_and_robots_fail_over_to_the_next_broker_of_the_list() {
     let list = format!("{}, {}", brokers[0].url(), brokers[1].url());
     let server = Server::start_unready(&dir.path().join("server"), &[("TASKD_BROKER", &list)]).await;
     let robot = Robot::start(&server, dir.path(), "robot-1", 1).await;
-    brokers[0].learn(&server).await;
-    brokers[0].launch().await;
+    // Server and robot may find different brokers at first.
+    for broker in &mut brokers {
+        broker.learn(&server).await;
+        broker.launch().await;
+    }
     server.wait_ready().await;
     wait_connected(&server, 1).await;
-    brokers[1].learn(&server).await;
-    brokers[1].launch().await;
-    let is_at = async |broker: &Mosquitto| {
-        let info = server.get("/api/v1/server").await.expect("it answers");
-        info["mqtt"] == broker.address.to_string()
-    };
-    let (at, other) = (0, 1);
-    assert!(is_at(&brokers[at]).await, "the other one was not there");
+    let is_at = async |broker: &Mosquitto| is_at(&server, broker).await;
+    let (at, other) = if is_at(&brokers[0]).await { (0, 1) } else { (1, 0) };
     server.push(&worker(dir.path(), "1.0.0"), "*").await;
     runs(&server, "robot-1", "1.0.0").await;
 

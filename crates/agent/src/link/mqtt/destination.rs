@@ -1,11 +1,19 @@
 //! The places that the server names for MQTT sessions: its own broker, or external ones in the order in which they are
 //! tried. It opens nothing.
 
+use std::time::Duration;
+
 use task_proto::api::{ExternalBroker, MqttEndpoint, MqttPlace};
 use task_proto::topic::TopicPrefix;
 use tokio::sync::watch;
 
 use super::MqttAccess;
+use crate::link::state::Shared;
+
+/// The longest wait before the server is asked for its place for the first time in a session.
+const FIRST_QUESTION: Duration = Duration::from_secs(10);
+/// The longest wait before it is asked again.
+const MAX_QUESTION: Duration = Duration::from_secs(5 * 60);
 
 /// Where one session goes, and as whom.
 #[derive(Clone, PartialEq, Eq)]
@@ -57,4 +65,51 @@ pub(super) async fn moved(
         }
     }
     std::future::pending().await
+}
+
+/// Asks the server from time to time for its place, until that place is not `there`. A server and a
+/// robot that look for a broker at the same time may find different ones; while the server's answer
+/// stays the same, [`moved`] does not return. `asked` counts the questions: each doubles the wait.
+pub(super) async fn named_elsewhere(
+    shared: &Shared,
+    access: &MqttAccess,
+    there: &Destination,
+    asked: &mut u32,
+) -> Destination {
+    let mut answers = shared.endpoint_answers.subscribe();
+    loop {
+        // Cancel-safe: a timer that is made anew each time.
+        tokio::time::sleep(wait_before_question(*asked, rand::random())).await;
+        *asked = asked.saturating_add(1);
+        answers.borrow_and_update();
+        shared.find.notify_one();
+        // Cancel-safe: a watch remembers that it changed. Without an answer the session stays.
+        if answers.changed().await.is_err() {
+            return std::future::pending().await;
+        }
+        let first = access.destination(shared.endpoint.borrow().as_ref(), 0);
+        if first != *there {
+            return first;
+        }
+    }
+}
+
+/// The wait before the next question. `jitter`, even from 0 to 1, spreads the second half of it.
+fn wait_before_question(asked: u32, jitter: f64) -> Duration {
+    let longest = FIRST_QUESTION.saturating_mul(1 << asked.min(10)).min(MAX_QUESTION);
+    longest.mul_f64(0.5 + jitter.clamp(0.0, 1.0) / 2.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn questions_begin_soon_and_become_rare() {
+        assert_eq!(wait_before_question(0, 0.0), Duration::from_secs(5));
+        assert_eq!(wait_before_question(0, 1.0), FIRST_QUESTION);
+        assert_eq!(wait_before_question(2, 1.0), FIRST_QUESTION * 4);
+        assert_eq!(wait_before_question(u32::MAX, 1.0), MAX_QUESTION);
+        assert_eq!(wait_before_question(7, 0.0), MAX_QUESTION / 2);
+    }
 }

@@ -1,6 +1,6 @@
 //! Orders that follow from earlier ones: what failed once more, and back to what was there before.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
+use std::collections::{BTreeMap, HashMap, HashSet};
 
 use task_proto::api::{CreateDeployment, DeploymentView, MatchedRobot, RetryDeployment};
 use task_proto::desired::PackageRef;
@@ -12,7 +12,6 @@ use super::deployments::Placed;
 use super::robots::matched;
 use super::tasks::meant;
 use super::{ActionError, Actions, IdempotencyKey, Remembered, all_known, check_scope};
-use crate::advance::advance;
 use crate::changes::Consequences;
 use crate::person::Person;
 use crate::store::{Act, Deed, KnownRobot, Write};
@@ -82,9 +81,8 @@ impl Actions {
         let expires_at_ms = now_ms + lifetime_ms;
         let kind = package.manifest.run.kind;
         let placed = Placed { package: &package.package, kind, order: &order, robots: &robots, expires_at_ms };
-        let (new, touched) = placed.place(&mut write, now_ms).await?;
-        let mut consequences = Consequences { deployments: touched.clone(), ..Consequences::default() };
-        advance(&mut write, &self.chooser, touched, now_ms, &mut consequences).await?;
+        let mut consequences = Consequences::default();
+        let new = placed.place(&mut write, &self.chooser, now_ms, &mut consequences).await?;
         let deed = Deed::by(by, Act::DeploymentRetry, &new)
             .with("of", id)
             .with("package", format!("{} {}", package.package.name, package.package.version))
@@ -131,16 +129,13 @@ impl Actions {
             return Err(ActionError::NothingToRollBack(task.clone()));
         }
         let expires_at_ms = now_ms + self.settings.assignment_lifetime_ms;
-        let mut touched = BTreeSet::new();
+        let mut consequences = Consequences::default();
         for (package, kind, robots) in goals {
             let order = CreateDeployment::new(task.clone(), package.manifest.digest, selector.clone());
             let placed = Placed { package: &package, kind, order: &order, robots: &robots, expires_at_ms };
-            let (id, also) = placed.place(&mut write, now_ms).await?;
-            touched.extend(also);
+            let id = placed.place(&mut write, &self.chooser, now_ms, &mut consequences).await?;
             rollback.deployments.push(id);
         }
-        let mut consequences = Consequences { deployments: touched.clone(), ..Consequences::default() };
-        advance(&mut write, &self.chooser, touched, now_ms, &mut consequences).await?;
         let deployments: Vec<&str> = rollback.deployments.iter().map(DeploymentId::as_str).collect();
         let deed = Deed::by(by, Act::TaskRollBack, task)
             .with("robots", selector)

@@ -17,7 +17,7 @@ use crate::chooser::{Chooser, travelling_bytes};
 use crate::delivery::shown_bytes;
 use crate::person::Person;
 use crate::rollout::Tally;
-use crate::store::{Act, Deed, NewDeployment, Revocable, Write};
+use crate::store::{Act, Deed, NewDeployment, Revocable, StillRunning, Write};
 
 /// How long an idempotency key is remembered.
 const KEY_LIFETIME_MS: u64 = 30 * DAY_MS;
@@ -58,10 +58,9 @@ impl Actions {
         let robots: Vec<RobotId> = robots.into_iter().map(|robot| robot.id).collect();
         let (kind, expires_at_ms) = (package.manifest.run.kind, now_ms + lifetime_ms);
         let placed = Placed { package: &package.package, kind, order, robots: &robots, expires_at_ms };
-        let (id, touched) = placed.place(&mut write, now_ms).await?;
+        let mut consequences = Consequences::default();
+        let id = placed.place(&mut write, &self.chooser, now_ms, &mut consequences).await?;
         let task = &package.package.name;
-        let mut consequences = Consequences { deployments: touched.clone(), ..Consequences::default() };
-        advance(&mut write, &self.chooser, touched, now_ms, &mut consequences).await?;
         let deed = Deed::by(by, Act::DeploymentCreate, &id)
             .with("package", format!("{task} {}", package.package.version))
             .with("manifest", package.package.manifest.digest)
@@ -205,12 +204,15 @@ pub(super) struct Placed<'a> {
 }
 
 impl Placed<'_> {
-    /// Stores the deployment with its assignments. Gives it, and all deployments that may go on now, itself among them.
+    /// Stores the deployment with its assignments, and moves on all deployments that may go on now,
+    /// itself among them. Where its package runs already, nothing begins unless `restart` is set.
     pub(super) async fn place(
         &self,
         write: &mut Write,
+        chooser: &Chooser,
         now_ms: u64,
-    ) -> Result<(DeploymentId, BTreeSet<DeploymentId>), ActionError> {
+        consequences: &mut Consequences,
+    ) -> Result<DeploymentId, ActionError> {
         let &Self { package, kind, order, robots, expires_at_ms } = self;
         let id = DeploymentId::random();
         let new = NewDeployment { id: &id, package, kind, order, expires_at_ms };
@@ -218,9 +220,17 @@ impl Placed<'_> {
         let mut touched = write.assign(&id, &package.name, robots, now_ms).await?;
         if !order.restart {
             write.settle_running(&id, now_ms).await?;
+            for StillRunning { robot, failed, earlier } in
+                write.settle_still_running(&id, &package.name, now_ms).await?
+            {
+                consequences.rings.insert(robot);
+                consequences.deployments.extend([failed, earlier]);
+            }
         }
         touched.insert(id.clone());
-        Ok((id, touched))
+        consequences.deployments.extend(touched.iter().cloned());
+        advance(write, chooser, touched, now_ms, consequences).await?;
+        Ok(id)
     }
 }
 

@@ -106,7 +106,7 @@ impl Write {
                  timeline = CASE ended WHEN 1 THEN timeline ELSE {} END",
             grown_by(phase, "$1")
         );
-        self.set_pairs(&end, phase, now_ms, taken.iter().map(|row| (&row.deployment, &row.robot))).await?;
+        self.set_pairs(&end, phase.as_str(), now_ms, taken.iter().map(|row| (&row.deployment, &row.robot))).await?;
         // What was stopped since stays so, whatever version of it comes back.
         for (wanted, stop) in [(Wanted::Running, ""), (Wanted::Stopped, "wanted = 'stopped', ")] {
             // Where the replaced one stands is what the robot's next report says; $2 is what it is until then.
@@ -119,7 +119,7 @@ impl Write {
             );
             let replaced = taken.iter().filter(|row| row.desired && row.wanted == wanted);
             let previous: Vec<_> = replaced.filter_map(|row| Some((row.previous.as_ref()?, &row.robot))).collect();
-            self.set_pairs(&revive, Phase::Assigned, now_ms, previous.iter().copied()).await?;
+            self.set_pairs(&revive, Phase::Assigned.as_str(), now_ms, previous.iter().copied()).await?;
             self.pass_over_deleted(&previous).await?;
         }
         let is_told = |row: &&Revocable| row.left.as_ref().map_or(row.desired, |left| left.is_told);
@@ -209,11 +209,11 @@ impl Write {
         Ok(())
     }
 
-    /// Runs `UPDATE assignments` with `set`, whose $1 is the time and $2 a phase, on the given rows.
-    async fn set_pairs<'a>(
+    /// Runs `UPDATE assignments` with `set`, whose $1 is the time and $2 `word`, on the given rows.
+    pub(super) async fn set_pairs<'a>(
         &mut self,
         set: &str,
-        phase: Phase,
+        word: &str,
         now_ms: u64,
         pairs: impl Iterator<Item = (&'a DeploymentId, &'a RobotId)>,
     ) -> Result<(), StoreError> {
@@ -224,7 +224,7 @@ impl Write {
                  WHERE assignments.deployment_id = v.deployment_id AND assignments.robot_id = v.robot_id",
                 values(3, group.len(), PAIR)
             );
-            let mut query = sqlx::query(AssertSqlSafe(sql)).bind(stored(now_ms)).bind(phase.as_str());
+            let mut query = sqlx::query(AssertSqlSafe(sql)).bind(stored(now_ms)).bind(word);
             for (deployment, robot) in group {
                 query = query.bind(deployment.as_str()).bind(robot.as_str());
             }

@@ -1,9 +1,10 @@
 //! Orders that follow from earlier ones, told on every database: a task run anew, what failed once more, and back.
 
 use task_proto::api::{PackageView, RetryDeployment};
+use task_proto::desired::DesiredTask;
 use task_proto::manifest::TaskKind;
 use task_proto::oci::MANIFEST_TYPE;
-use task_proto::report::{Failure, FailureCode, Phase};
+use task_proto::report::{ActiveVersion, Failure, FailureCode, Phase};
 use task_proto::selector::Selector;
 use task_proto::{DeploymentId, RepositoryName, TaskName};
 use taskd::actions::{ActionError, Rollback, TaskOrder};
@@ -16,6 +17,7 @@ use crate::story::code;
 
 on_both_databases! {
     a_package_that_runs_already_is_not_started_again,
+    package_that_came_back_after_a_failure_is_not_started_again,
     a_restart_is_a_new_run_of_all_that_have_the_task,
     a_retry_is_for_those_that_ended_badly_and_got_nothing_since,
     a_retry_may_be_for_some_and_keeps_the_orders_ways,
@@ -138,6 +140,61 @@ async fn a_package_that_runs_already_is_not_started_again(database: TestDatabase
         let id = fleet.actions.create_deployment(&fleet.operator, &random_key(), &order, &job).await.expect("ordered");
         assert_eq!(fleet.desired(&robots[0]).await.expect("state").tasks[0].deployment, id);
         fleet.follow(&mut robots[0], Phase::Running).await;
+    }
+}
+
+/// The report of a live process that `deployment` brought.
+fn active(deployment: &DeploymentId, version: &str) -> Option<ActiveVersion> {
+    let manifest = Some(package(version, TaskKind::Service).package.manifest.digest);
+    Some(ActiveVersion { deployment: deployment.clone(), version: version.parse().expect("valid"), manifest, pid: 7 })
+}
+
+async fn package_that_came_back_after_a_failure_is_not_started_again(database: TestDatabase) {
+    let fleet = Fleet::new(database).await;
+    fleet.publish("1").await;
+    let mut robots = fleet.enroll(4).await;
+    let first = fleet.deploy("1", |_| ()).await;
+    for robot in &mut robots {
+        fleet.follow(robot, Phase::Running).await;
+    }
+    let failed = fleet.deploy("2", |_| ()).await;
+    // The second robot could not fetch the new version, the third one runs nothing, and the last
+    // one still fetches.
+    let ends = [Phase::RolledBack, Phase::Failed, Phase::Failed, Phase::Fetching];
+    for ((number, robot), phase) in robots.iter_mut().enumerate().zip(ends) {
+        robot.accept(&fleet.desired(robot).await.expect("not withheld"), phase);
+        for task in robot.tasks.values_mut() {
+            task.active = active(&first, "1").filter(|_| number != 2);
+        }
+        fleet.report(robot).await;
+    }
+    fleet.changes.take_rings().await;
+    let back = fleet.roll_back("*").await.expect("ordered").deployments.remove(0);
+    assert_eq!(fleet.changes.take_rings().await.robots.len(), 4, "the state of each is new");
+    assert_eq!(fleet.phases(&back).await, [Phase::Running, Phase::Running, Phase::Assigned, Phase::Assigned]);
+    let run = |task: &DesiredTask| (task.deployment.clone(), task.run, task.package.version.to_string());
+    for (robot, deployment) in robots.iter().zip([&first, &first, &back, &back]) {
+        let desired = fleet.desired(robot).await.expect("state");
+        assert_eq!(desired.tasks.iter().map(run).collect::<Vec<_>>(), [(deployment.clone(), 1, "1".to_owned())]);
+    }
+    assert_eq!(fleet.phases(&failed).await, [Phase::RolledBack, Phase::Failed, Phase::Failed, Phase::Superseded]);
+    for robot in &mut robots {
+        fleet.follow(robot, Phase::Running).await;
+    }
+    assert_eq!(fleet.phases(&first).await[..2], [Phase::Running; 2]);
+    assert_eq!(fleet.deployment(&back).await.state, task_proto::api::DeploymentState::Settled);
+    // After another failure it can still be started anew.
+    fleet.deploy("3", |_| ()).await;
+    for robot in &mut robots {
+        robot.accept(&fleet.desired(robot).await.expect("not withheld"), Phase::RolledBack);
+        for task in robot.tasks.values_mut() {
+            task.active = active(&first, "1");
+        }
+        fleet.report(robot).await;
+    }
+    let forced = fleet.deploy("1", |order| order.restart = true).await;
+    for robot in &robots {
+        assert_eq!(fleet.desired(robot).await.expect("state").tasks[0].deployment, forced);
     }
 }
 

@@ -310,6 +310,19 @@ fn a_version_that_does_not_get_ready_is_stopped_and_the_old_one_started_again() 
 }
 
 #[test]
+fn run_that_came_back_goes_on_when_it_is_ordered_again() {
+    let mut world = running(Run::default());
+    bad_switch(&mut world);
+    world.happen(Happening::Wait { ms: 30_000 });
+    world.settle();
+    let old = world.alive.clone();
+    assert_eq!((phase(&world), old.len()), (Phase::RolledBack, 1));
+    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+    world.settle();
+    assert_eq!((phase(&world), &world.alive), (Phase::Running, &old));
+}
+
+#[test]
 fn a_rollback_survives_a_power_cut_before_and_after_every_step() {
     for cut in 0..12 {
         let mut world = running(Run::default());

@@ -14,7 +14,7 @@ use taskd::broker::codec::{DecodeError, Received, decode, encode_publish};
 use taskd::broker::{
     Broker, BrokerConfig, Gatekeeper, Inbox, Limits, Login, NotStored, Principal, Refusal, RobotMessage,
 };
-use taskd::conduct::{Conduct, ConductLimits};
+use taskd::limits::conduct::{Conduct, ConductLimits};
 use tokio::runtime::Runtime;
 
 /// The largest packet that is tried.

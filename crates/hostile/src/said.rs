@@ -8,7 +8,7 @@ use task_proto::log::LogBatch;
 use task_proto::part::{Cut, MAX_PARTS, Part};
 use task_proto::report::{Condition, Phase, Report, Status};
 use task_proto::request::{Reply, Request};
-use taskd::deployment::Standing;
+use taskd::domain::deployment::Standing;
 
 /// A report, a status or a batch of log lines. An assignment goes on from a report as one that has an end.
 pub fn report(bytes: &[u8]) {

@@ -15,7 +15,7 @@ use task_proto::topic::TopicPrefix;
 use taskd::broker::{
     Broker, BrokerConfig, Gatekeeper, Inbox, Limits, Login, NotStored, Principal, Refusal, RobotMessage,
 };
-use taskd::conduct::{Conduct, ConductLimits};
+use taskd::limits::conduct::{Conduct, ConductLimits};
 
 /// As taskd itself has it.
 #[global_allocator]

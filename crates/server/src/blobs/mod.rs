@@ -1,10 +1,14 @@
-//! The blob store: bytes on disk under the digest they hash to, in `blobs/<algorithm>/<hex>`. A blob is renamed into place
-//! when it is whole, verified and synced, and never modified afterwards. It knows no references: what may be deleted is
-//! [`crate::collector`]'s decision. A blob's modification time is when it was last asked for by someone
-//! who pushes; its content is never judged by it.
+//! Owns the bytes of packages on disk, under the digest they hash to; it never changes a blob that
+//! is whole.
+//!
+//! A blob lies in `blobs/<algorithm>/<hex>`. It is renamed into place when it is whole, verified
+//! and synced. The store of blobs knows no references: what may be deleted is [`collector`]'s
+//! decision. A blob's modification time is when it was last asked for by someone who pushes; its
+//! content is never judged by it.
 
 mod blob;
 mod body;
+pub mod collector;
 mod upload;
 
 use std::collections::{HashSet, VecDeque};
@@ -25,7 +29,7 @@ use upload::Uploads;
 pub use upload::{InvalidUploadId, UploadId};
 
 use crate::config::BlobRead;
-use crate::delivery::shown_bytes;
+use crate::domain::delivery::shown_bytes;
 
 /// Reads from the disk for answers at the same time. More would not be faster, and would keep the processor from those who
 /// wait for something else.

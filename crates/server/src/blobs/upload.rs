@@ -23,7 +23,7 @@ use task_proto::{Digest, RepositoryName, RobotId};
 use tokio::sync::OwnedMutexGuard;
 
 use super::{BlobError, BlobSettings, Blobs, modified_ms, move_into_place, on_disk};
-use crate::data_directory::room;
+use crate::system::data_directory::room;
 
 /// How much of a body is gathered before it is hashed and written in one go.
 const GATHERED_BYTES: usize = 1024 * 1024;

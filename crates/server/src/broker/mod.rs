@@ -1,7 +1,10 @@
-//! The MQTT broker as the rest of the server sees it: ring a robot, receive what robots send, know who is there.
-//! It asks a [`Gatekeeper`] who may come in and hands messages to an [`Inbox`]; it never stores anything and knows no
-//! payloads. [`Broker::start`] serves MQTT itself, [`Broker::connect`] makes the server a client of another broker; behind
-//! the handle both are the same to the rest of the server.
+//! Owns the MQTT broker as the rest of the server sees it; it never stores anything and never reads
+//! a payload.
+//!
+//! It rings a robot, receives what robots send and knows who is there. It asks a [`Gatekeeper`] who
+//! may come in and hands messages to an [`Inbox`]. [`Broker::start`] serves MQTT itself,
+//! [`Broker::connect`] makes the server a client of another broker; behind the handle both are the
+//! same to the rest of the server.
 
 mod external;
 mod fan_out;
@@ -24,8 +27,8 @@ use task_proto::{Digest, RobotId, UserName};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::watch;
 
-use crate::conduct::Conduct;
-use crate::tls::{ClientProof, Tls};
+use crate::limits::conduct::Conduct;
+use crate::net::tls::{ClientProof, Tls};
 pub use external::{CANARY_LEVEL, ExternalConfig, external_route};
 use external::{Crowd, External};
 pub use fan_out::{FanOut, FanOutError, FanOutSettings, MAX_PART_BYTES, Part, PartQos};

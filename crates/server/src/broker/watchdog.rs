@@ -18,7 +18,7 @@ use tokio::time::timeout;
 use super::front::{CANARY_ID, CanaryPass, Front};
 use super::router::{CANARY_TOPIC, Router};
 use super::{Health, Limits};
-use crate::tls::Tls;
+use crate::net::tls::Tls;
 
 /// Remedies tried in a row before the watchdog gives up.
 const MAX_REMEDIES: u32 = 3;
@@ -224,7 +224,7 @@ mod tests {
 
     use super::super::{BrokerConfig, Gatekeeper, Inbox, NotStored, Principal, Refusal, RobotMessage};
     use super::*;
-    use crate::conduct::{Conduct, ConductLimits};
+    use crate::limits::conduct::{Conduct, ConductLimits};
 
     const PATIENCE: Duration = Duration::from_secs(10);
 

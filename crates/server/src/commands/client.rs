@@ -19,8 +19,8 @@ use task_transport::Trust;
 use super::login::{kept_pin, kept_token, last_server};
 use super::output::printable;
 use super::{CommandError, Connection, Outcome};
-use crate::clock::Clock;
-use crate::data_directory::{Addresses, OPERATOR_TOKEN, is_locked};
+use crate::system::clock::Clock;
+use crate::system::data_directory::{Addresses, OPERATOR_TOKEN, is_locked};
 
 /// How often a request is tried.
 const TRIES: u32 = 6;
@@ -529,7 +529,7 @@ pub(super) fn random_key() -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::data_directory::DataDirectory;
+    use crate::system::data_directory::DataDirectory;
 
     fn nothing_said() -> Connection {
         let output = super::super::Format::Json;

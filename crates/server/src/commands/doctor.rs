@@ -18,7 +18,7 @@ use tokio::time::{Instant, timeout};
 use super::client::{Client, ClientError, data_directory};
 use super::output::{Format, Output, time};
 use super::{CommandError, Connection, Outcome, doctor_here};
-use crate::clock::Clock;
+use crate::system::clock::Clock;
 
 /// What mends a corrupt database.
 pub(super) const INTEGRITY_MEND: &str =

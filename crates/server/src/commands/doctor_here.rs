@@ -14,9 +14,9 @@ use task_proto::checkup::Checkup;
 use super::doctor::INTEGRITY_MEND;
 use super::output::bytes;
 use crate::config::{Config, ServeFlags};
-use crate::data_directory::is_locked;
-use crate::open_files;
+use crate::net::open_files;
 use crate::store::check_at_rest;
+use crate::system::data_directory::is_locked;
 
 /// With less free the database may be refused its next page.
 const LOW_BYTES: u64 = 256 << 20;

@@ -13,11 +13,11 @@ use task_proto::oci::ImageManifest;
 use task_proto::publisher::{InvalidRole, LIST_ARTIFACT, LIST_REPOSITORY, LIST_TYPE, PublisherList, Role};
 
 use super::client::{Client, ClientError};
+use super::key_file;
 use super::output::{Output, say, time};
 use super::{CommandError, Connection, Outcome, upload};
-use crate::clock::Clock;
 use crate::config::lifetime;
-use crate::key_file;
+use crate::system::clock::Clock;
 
 /// What to do with keys and their list.
 #[derive(Debug, Subcommand)]

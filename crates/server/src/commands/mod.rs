@@ -1,6 +1,8 @@
-//! The operator's commands: what they are called, what they take, and which exit code they end with. Each command talks
-//! to the server over its public API only; none of them opens the files of a server that runs (the published address and
-//! the first token excepted).
+//! Owns the operator's commands, what they take and the exit codes they end with; it never opens
+//! the files of a server that runs.
+//!
+//! Each command talks to the server over its public API only. The published address and the first
+//! token are the exceptions that are read from the data directory.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -8,7 +10,7 @@ use std::process::ExitCode;
 use clap::{Args, Subcommand};
 use task_proto::CaPin;
 
-use crate::key_file::KeyError;
+use self::key_file::KeyError;
 use crate::package::PackageError;
 use client::{Client, ClientError};
 use output::{Format, Output};
@@ -16,6 +18,7 @@ use output::{Format, Output};
 mod audit;
 mod broker;
 mod client;
+pub mod command_line;
 mod complete;
 mod confirm;
 mod course;
@@ -27,6 +30,7 @@ mod download;
 mod enroll_token;
 mod export;
 mod key;
+pub mod key_file;
 mod login;
 mod logs;
 mod output;

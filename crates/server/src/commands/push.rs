@@ -15,10 +15,10 @@ use task_proto::report::Phase;
 use task_proto::selector::Selector;
 
 use super::confirm::confirm;
+use super::key_file;
 use super::output::{Output, bytes, robots, say};
 use super::{CommandError, Outcome, Session, client, complete, robot, upload, view, wait};
 use crate::config::{at_least_one, lifetime};
-use crate::key_file;
 use crate::package::{self, Launch, Packed};
 
 /// What to push, where to and how.

@@ -8,7 +8,7 @@ use super::output::{self, Output, bytes, time};
 use super::robot_settings::shown;
 use super::table::Columns;
 use super::top;
-use crate::delivery::Unit;
+use crate::domain::delivery::Unit;
 
 pub(super) const COLUMNS: Columns = Columns {
     name: "name",

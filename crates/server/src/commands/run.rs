@@ -11,13 +11,13 @@ use task_proto::api::{CreateDeployment, DeploymentView, RobotView};
 use task_proto::desired::PackageRef;
 use task_proto::{RobotId, RobotName};
 
+use super::key_file;
 use super::output::{printable, say};
 use super::package::{PackageName, find, short};
 use super::push::{packed, say_running, sign};
 use super::upload::{Upload, upload};
 use super::{CommandError, Outcome, Session, client, complete, logs, robot, view, wait};
 use crate::config::lifetime;
-use crate::key_file;
 use crate::package::{Launch, PackageError, Problem, describe};
 
 /// What to run where.

@@ -12,7 +12,7 @@ use tokio::time::sleep;
 use super::output::{Format, bytes, say, stderr_is_terminal, stream_text};
 use super::table::Columns;
 use super::{CommandError, Outcome, Session, complete, robot, wait};
-use crate::clock::Clock;
+use crate::system::clock::Clock;
 
 /// Between two looks; robots speak once a minute.
 const PAUSE: Duration = Duration::from_secs(5);

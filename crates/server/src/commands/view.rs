@@ -11,7 +11,7 @@ use task_proto::report::Phase;
 use super::output::{self, robots, time};
 use super::table::Columns;
 use super::{CommandError, Session};
-use crate::delivery::{FELL_BEHIND, ORDERED};
+use crate::domain::delivery::{FELL_BEHIND, ORDERED};
 
 /// Reasons for waiting that are shown; a gate may give each robot one of its own.
 const MAX_REASONS: usize = 5;

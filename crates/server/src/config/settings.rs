@@ -7,7 +7,7 @@ use task_proto::part::{MAX_PART_BYTES, MIN_PART_BYTES};
 
 use super::oidc::{private_url, public_url};
 use super::{BlobRead, Config, lifetime};
-use crate::delivery::shown_bytes;
+use crate::domain::delivery::shown_bytes;
 
 /// One setting. `topic-prefix` is the flag's name; the file's key is `topic_prefix`, the variable `TASKD_TOPIC_PREFIX`.
 pub(super) struct Setting {

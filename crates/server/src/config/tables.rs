@@ -10,7 +10,7 @@ use task_proto::id::LabelValue;
 
 use super::settings::{Setting, size};
 use super::{Config, ConfigError, Origin, nearest, oidc, parse_duration};
-use crate::delivery::{Condition, ConditionKey, MAX_RULES, Quantity, Rule, Rules, Unit};
+use crate::domain::delivery::{Condition, ConditionKey, MAX_RULES, Quantity, Rule, Rules, Unit};
 
 /// The most sites with limits of their own.
 const MAX_SITES: usize = 4096;

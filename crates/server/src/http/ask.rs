@@ -15,9 +15,9 @@ use super::auth::not_permitted;
 use super::error::ApiError;
 use super::extract::{JsonBody, PathParam};
 use super::robots::find;
-use crate::changes::Change;
-use crate::person::Person;
-use crate::requests::RequestError;
+use crate::domain::person::Person;
+use crate::fleet::requests::RequestError;
+use crate::orders::changes::Change;
 
 /// How long a robot may take. A lifecycle transition on a slow robot is what takes longest.
 const PATIENCE: Duration = Duration::from_secs(20);

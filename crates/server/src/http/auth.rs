@@ -24,12 +24,12 @@ use super::App;
 use super::conduct::hold_up;
 use super::error::{ApiError, ROBOT_REVOKED};
 use super::person_limits::{RequestKind, UnderWay};
-use crate::conduct::Way;
-use crate::gatekeeper::ended_others;
-use crate::http_connections::{Connection, Holder};
-use crate::person::Person;
+use crate::domain::person::Person;
+use crate::limits::conduct::Way;
+use crate::link::gatekeeper::ended_others;
+use crate::net::http_connections::{Connection, Holder};
+use crate::net::tls::ClientProof;
 use crate::store::{Admitted, Fault, StoreError, TokenHolder, with_shared_reads};
-use crate::tls::ClientProof;
 
 /// Who may call a route.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

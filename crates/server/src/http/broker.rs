@@ -8,7 +8,7 @@ use task_proto::api::{BrokerChecks, BrokerFiles, MqttEndpoint, NatsFile};
 use super::App;
 use super::error::ApiError;
 use super::extract::PathParam;
-use crate::mqtt_access::MqttAccess;
+use crate::link::mqtt_access::MqttAccess;
 use crate::store::BrokerCredential;
 
 /// Says where the robot's MQTT session goes now.

@@ -11,8 +11,8 @@ use super::extract::{JsonBody, idempotency_key};
 use super::openapi::OrderKey;
 use super::robots::gone;
 use super::views::complete_matched;
-use crate::actions::IdempotencyKey;
-use crate::person::Person;
+use crate::domain::person::Person;
+use crate::orders::actions::IdempotencyKey;
 
 /// Sets and removes labels of many robots, of all that are meant or of none.
 #[utoipa::path(post, path = "/api/v1/bulk/labels", tag = "robots", params(OrderKey),

@@ -7,7 +7,7 @@ use tokio::time::{Instant, sleep_until};
 
 use super::App;
 use super::error::ApiError;
-use crate::conduct::{Verdict, Way};
+use crate::limits::conduct::{Verdict, Way};
 
 /// Waits until it is the robot's turn; an error says when it is.
 pub(super) async fn hold_up(app: &App, robot: &RobotId, way: Way, method: &Method) -> Result<(), ApiError> {

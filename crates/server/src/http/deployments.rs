@@ -18,7 +18,7 @@ use super::extract::{JsonBody, PathParam, QueryParams, idempotency_key, page_lim
 use super::openapi::OrderKey;
 use super::shared_lists::{ListKey, SharedJson};
 use super::views::{complete_deployment, complete_matched, narrowed, without_others};
-use crate::person::Person;
+use crate::domain::person::Person;
 
 /// The query of `GET /deployments`.
 #[derive(Deserialize, IntoParams)]

@@ -18,8 +18,8 @@ use super::error::ApiError;
 use super::extract::{JsonBody, PathParam, TolerantJson};
 use super::openapi::Created;
 use super::robots::find;
-use crate::happening::Happening;
-use crate::person::Person;
+use crate::domain::happening::Happening;
+use crate::domain::person::Person;
 
 /// Registers the robot that holds the token.
 #[utoipa::path(post, path = "/api/v1/enroll", tag = "enrolment",

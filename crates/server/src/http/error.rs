@@ -9,10 +9,10 @@ use http::{HeaderValue, StatusCode, header};
 use serde_json::json;
 use task_proto::api;
 
-use crate::actions::ActionError;
 use crate::blobs::BlobError;
-use crate::person::Person;
-use crate::report_writer::ReportError;
+use crate::domain::person::Person;
+use crate::orders::actions::ActionError;
+use crate::orders::report_writer::ReportError;
 use crate::store::{Fault, StoreError};
 
 /// The code of [`ApiError::robot_revoked`].

@@ -22,14 +22,14 @@ use super::App;
 use super::auth::shown_token;
 use super::error::ApiError;
 use super::views::{complete_robot, narrowed};
-use crate::changes::{Change, Changes};
-use crate::clock::Clock;
-use crate::conduct::Conduct;
-use crate::feed::{Feed, FeedAudience};
-use crate::person::{Person, Scope};
-use crate::presence::Presence;
-use crate::robot_vitals::RobotVitals;
+use crate::domain::person::{Person, Scope};
+use crate::fleet::presence::Presence;
+use crate::fleet::robot_vitals::RobotVitals;
+use crate::limits::conduct::Conduct;
+use crate::orders::changes::{Change, Changes};
+use crate::orders::feed::{Feed, FeedAudience};
 use crate::store::{KnownRobot, Store, StoreError, TokenHolder};
+use crate::system::clock::Clock;
 
 /// For how long notices are gathered: a robot that reports ten times in it is sent once.
 const GATHER: Duration = Duration::from_millis(200);

@@ -14,7 +14,7 @@ use serde_json::Value;
 use task_proto::api::MOST_ON_A_PAGE;
 
 use super::error::ApiError;
-use crate::actions::IdempotencyKey;
+use crate::orders::actions::IdempotencyKey;
 
 /// A JSON body from an operator. A field that this version does not know is refused: it would be an order half done.
 pub struct JsonBody<T>(pub T);

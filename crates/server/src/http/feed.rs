@@ -11,8 +11,8 @@ use utoipa::IntoParams;
 use super::App;
 use super::error::ApiError;
 use super::extract::QueryParams;
-use crate::feed::FeedAudience;
-use crate::person::{Person, Scope};
+use crate::domain::person::{Person, Scope};
+use crate::orders::feed::FeedAudience;
 use crate::store::KnownRobot;
 
 /// How many are listed where nobody says how many.

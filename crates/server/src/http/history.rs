@@ -11,7 +11,7 @@ use super::App;
 use super::error::ApiError;
 use super::extract::{PathParam, QueryParams};
 use super::robots::find;
-use crate::person::Person;
+use crate::domain::person::Person;
 use crate::store::HistoryQuery;
 
 /// How many assignments are listed where nobody says how many, and at most.

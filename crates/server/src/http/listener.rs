@@ -28,9 +28,9 @@ use tokio_util::task::TaskTracker;
 use tower::ServiceExt as _;
 
 use super::traffic::HttpTotals;
-use crate::anteroom::{Anteroom, Place};
-use crate::http_connections::{Connection, HttpConnections};
-use crate::tls::{ClientProof, Tls};
+use crate::net::anteroom::{Anteroom, Place};
+use crate::net::http_connections::{Connection, HttpConnections};
+use crate::net::tls::{ClientProof, Tls};
 
 /// How long a connection on which no good token was shown is left when its place is needed: enough to sign in, or to get a page.
 const GRACE: Duration = Duration::from_secs(3);

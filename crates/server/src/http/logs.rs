@@ -21,9 +21,9 @@ use super::error::ApiError;
 use super::events::end_of_stream;
 use super::extract::{PathParam, QueryParams};
 use super::robots::find;
-use crate::person::{Person, Scope};
-use crate::requests::RequestError;
-use crate::robot_logs::{Joined, Told};
+use crate::domain::person::{Person, Scope};
+use crate::fleet::requests::RequestError;
+use crate::fleet::robot_logs::{Joined, Told};
 
 /// How long a robot may take to look its lines up, before memory has to do.
 const PATIENCE: Duration = Duration::from_secs(10);

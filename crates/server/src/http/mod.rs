@@ -1,5 +1,5 @@
-//! The HTTP edge: one table of routes, each with who may call it, in front of handlers that look up, act and reply.
-//! It never holds SQL and never decides what an order means.
+//! Owns the HTTP edge: one table of routes, each with who may call it, and their handlers; it never
+//! holds SQL and never decides what an order means.
 
 pub mod archives;
 mod ask;
@@ -28,7 +28,9 @@ mod packages;
 mod people;
 pub mod person_limits;
 mod proxy;
+pub mod readiness;
 mod robots;
+pub mod server_facts;
 pub mod session;
 pub mod shared_lists;
 pub mod status;
@@ -37,6 +39,7 @@ pub mod traffic;
 pub mod upload;
 mod views;
 mod vitals;
+pub mod web;
 
 use std::net::IpAddr;
 use std::ops::Deref;
@@ -57,26 +60,25 @@ use task_proto::person::Permission;
 use task_proto::selector::MAX_SELECTOR_BYTES;
 use tokio_util::sync::CancellationToken;
 
-use crate::actions::Actions;
+use self::readiness::Readiness;
+use self::server_facts::ServerFacts;
+use crate::auth::oidc::Provider;
 use crate::blobs::Blobs;
 use crate::broker::Broker;
-use crate::changes::Changes;
-use crate::clock::Clock;
-use crate::conduct::Conduct;
-use crate::feed::Feed;
-use crate::http_connections::HttpConnections;
-use crate::mqtt_access::MqttAccess;
-use crate::oidc::Provider;
-use crate::presence::Presence;
-use crate::readiness::Readiness;
-use crate::report_writer::ReportWriter;
-use crate::requests::Requests;
-use crate::robot_logs::RobotLogs;
-use crate::robot_vitals::RobotVitals;
-use crate::server_facts::ServerFacts;
+use crate::fleet::presence::Presence;
+use crate::fleet::requests::Requests;
+use crate::fleet::robot_logs::RobotLogs;
+use crate::fleet::robot_vitals::RobotVitals;
+use crate::limits::conduct::Conduct;
+use crate::link::mqtt_access::MqttAccess;
+use crate::link::transfers::Transfers;
+use crate::net::http_connections::HttpConnections;
+use crate::orders::actions::Actions;
+use crate::orders::changes::Changes;
+use crate::orders::feed::Feed;
+use crate::orders::report_writer::ReportWriter;
 use crate::store::Store;
-use crate::transfers::Transfers;
-use crate::web;
+use crate::system::clock::Clock;
 use auth::{Access, Gate, guard};
 use error::ApiError;
 use openapi::{Describe as _, Draft};

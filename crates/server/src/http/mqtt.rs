@@ -13,7 +13,7 @@ use task_transport::websocket::{WebSocket, WebSocketError, grant};
 
 use super::App;
 use super::error::ApiError;
-use crate::tls::ClientProof;
+use crate::net::tls::ClientProof;
 
 /// Goes over to MQTT in a WebSocket. Who comes in is the broker's affair, as at its own port.
 #[utoipa::path(get, path = "/mqtt", tag = "agent",

@@ -16,9 +16,9 @@ use super::App;
 use super::error::ApiError;
 use super::extract::QueryParams;
 use super::session::{begin_session, cookie, set_cookie};
-use crate::actions::ActionError;
-use crate::actions::sign_in::ProviderUser;
-use crate::oidc::{Attempt, OidcError, Provider};
+use crate::auth::oidc::{Attempt, OidcError, Provider};
+use crate::orders::actions::ActionError;
+use crate::orders::actions::sign_in::ProviderUser;
 
 /// The cookie of a browser that is away at the provider. It has to be sent when that sends the browser back.
 const COOKIE: &str = "taskd_sign_in";

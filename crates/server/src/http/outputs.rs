@@ -11,7 +11,7 @@ use super::App;
 use super::error::ApiError;
 use super::extract::QueryParams;
 use super::robots::find;
-use crate::person::{Person, Scope};
+use crate::domain::person::{Person, Scope};
 
 /// The query of `GET /outputs`.
 #[derive(Deserialize, IntoParams)]

@@ -18,9 +18,9 @@ use utoipa::{IntoParams, ToSchema};
 use super::App;
 use super::error::ApiError;
 use super::extract::{PathParam, PathParams, QueryParams};
-use crate::changes::Change;
+use crate::domain::person::Person;
+use crate::orders::changes::Change;
 use crate::package::contents;
-use crate::person::Person;
 use crate::store::{Act, Deed, Deletion, PackageUsers, Reference};
 
 /// The most robots and deployments that are named where a package is in use.

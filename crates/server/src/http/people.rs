@@ -20,7 +20,7 @@ use super::auth::not_permitted;
 use super::error::ApiError;
 use super::extract::{JsonBody, PathParam, QueryParams};
 use super::openapi::Created;
-use crate::person::Person;
+use crate::domain::person::Person;
 
 /// Says who is asking, and what they may.
 #[utoipa::path(get, path = "/api/v1/me", tag = "people")]

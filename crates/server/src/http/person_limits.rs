@@ -15,7 +15,7 @@ use tokio::time::{Instant, sleep_until, timeout};
 use super::auth::Access;
 use super::error::ApiError;
 use crate::config::PersonRates;
-use crate::rate_limit::{RateLimiter, Turn};
+use crate::limits::rate_limit::{RateLimiter, Turn};
 
 /// Requests of one kind that one person may have under way. A browser has six.
 const UNDER_WAY: usize = 8;

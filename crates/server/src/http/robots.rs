@@ -24,11 +24,11 @@ use super::extract::{JsonBody, PathParam, QueryParams, TolerantJson, page_limit}
 use super::openapi::Created;
 use super::shared_lists::{ListKey, SharedJson};
 use super::views::complete_robot;
-use crate::changes::Change;
-use crate::happening::Happening;
-use crate::person::Person;
-use crate::presence::Claim;
-use crate::uplink;
+use crate::domain::happening::Happening;
+use crate::domain::person::Person;
+use crate::fleet::presence::Claim;
+use crate::link::uplink;
+use crate::orders::changes::Change;
 
 /// The query of `GET /robots`.
 #[derive(Deserialize, IntoParams)]

@@ -18,8 +18,8 @@ use super::auth::require_same_origin;
 use super::error::ApiError;
 use super::extract::JsonBody;
 use super::{App, oidc};
-use crate::actions::sign_in::PAGE_LIFETIME_MS;
-use crate::person::Person;
+use crate::domain::person::Person;
+use crate::orders::actions::sign_in::PAGE_LIFETIME_MS;
 use crate::store::TokenHolder;
 
 /// The cookie's name.

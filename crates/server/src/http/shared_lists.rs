@@ -13,7 +13,7 @@ use tokio::sync::Semaphore;
 use tokio::time::Instant;
 
 use super::error::ApiError;
-use crate::person::Scope;
+use crate::domain::person::Scope;
 
 /// Lists that are rendered at the same time: each holds the views of a whole fleet.
 const RENDERINGS: usize = 2;

@@ -22,9 +22,9 @@ use super::App;
 use super::error::ApiError;
 use super::extract::{QueryParams, page_limit};
 use crate::broker::Health;
-use crate::data_directory::room;
-use crate::person::Person;
+use crate::domain::person::Person;
 use crate::store::{DatabaseSize, KnownRobot};
+use crate::system::data_directory::room;
 
 /// For how long what takes long to find out is believed.
 const BELIEVED: Duration = Duration::from_secs(30);

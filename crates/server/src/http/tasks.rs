@@ -12,8 +12,8 @@ use super::error::ApiError;
 use super::extract::{JsonBody, PathParam, idempotency_key};
 use super::openapi::OrderKey;
 use super::views::complete_matched;
-use crate::actions::{Rollback, TaskOrder};
-use crate::person::Person;
+use crate::domain::person::Person;
+use crate::orders::actions::{Rollback, TaskOrder};
 
 /// Starts a task on robots that have it; a job runs once more.
 #[utoipa::path(post, path = "/api/v1/tasks/{task}/start", tag = "tasks", params(OrderKey),

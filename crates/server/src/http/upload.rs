@@ -28,8 +28,8 @@ use super::extract::QueryParams;
 use super::oci::{self, OciError, Registry};
 use super::openapi::Created;
 use crate::blobs::BlobError;
+use crate::domain::person::Person;
 use crate::package::{PackageError, Packed, pack_into};
-use crate::person::Person;
 
 /// Archives that are unpacked and packed at the same time.
 const AT_ONCE: usize = 2;

@@ -6,10 +6,10 @@ use task_proto::RobotId;
 use task_proto::api::{DeploymentState, DeploymentView, MatchedRobot, PhaseCount, RobotView};
 use task_proto::report::{Condition, Phase};
 
-use crate::conduct::Conduct;
-use crate::deployment;
-use crate::presence::Presence;
-use crate::robot_vitals::RobotVitals;
+use crate::domain::deployment;
+use crate::fleet::presence::Presence;
+use crate::fleet::robot_vitals::RobotVitals;
+use crate::limits::conduct::Conduct;
 
 /// Adds where a robot is, how it behaves and does, and what is wrong with its identity.
 pub fn complete_robot(view: &mut RobotView, presence: &Presence, conduct: &Conduct, vitals: &RobotVitals, now_ms: u64) {

@@ -13,9 +13,9 @@ use super::App;
 use super::error::ApiError;
 use super::extract::{PathParam, TolerantJson};
 use super::robots::find;
-use crate::changes::Change;
-use crate::person::Person;
-use crate::uplink;
+use crate::domain::person::Person;
+use crate::link::uplink;
+use crate::orders::changes::Change;
 
 /// Takes how the robot's machine does, while it has no MQTT session.
 #[utoipa::path(post, path = "/api/v1/robots/{robot}/telemetry", tag = "agent")]

@@ -1,6 +1,8 @@
-//! From a directory to a package: what the directory says of itself, whether that can run, and the bytes that travel.
-//! It reads the directory and writes one temporary file; it knows no network and no server. And back again: what is in such
-//! bytes.
+//! Owns the way from a directory to a package's bytes and back; it never knows a network or a
+//! server.
+//!
+//! What the directory says of itself, whether that can run, and the bytes that travel. It reads the
+//! directory and writes one temporary file.
 
 use std::path::PathBuf;
 

@@ -11,11 +11,11 @@ use tokio::sync::broadcast::{
 use tokio::time::{Interval, MissedTickBehavior};
 use tokio_util::sync::CancellationToken;
 
-use crate::actions::ActionError;
-use crate::changes::Change;
-use crate::chooser::ServerLoad;
-use crate::happening::Happening;
+use crate::domain::happening::Happening;
 use crate::http::App;
+use crate::orders::actions::ActionError;
+use crate::orders::changes::Change;
+use crate::orders::chooser::ServerLoad;
 
 /// How often the server looks for assignments that have expired.
 const EXPIRY_INTERVAL: Duration = Duration::from_secs(30);

@@ -13,8 +13,8 @@ use task_proto::{DeploymentId, RobotId};
 use super::rows::{from_json, from_optional_json, from_word, groups, id, json, number, priority, stored, values, word};
 use super::{Store, StoreError, Write};
 use super::{deliveries, timelines};
-use crate::deployment;
-use crate::rollout::{Rollout, Standing};
+use crate::domain::deployment;
+use crate::domain::rollout::{Rollout, Standing};
 
 /// An order to be stored.
 #[derive(Debug)]

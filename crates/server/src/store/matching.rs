@@ -5,7 +5,7 @@ use task_proto::selector::Selector;
 
 use super::robots::{KNOWN, known_robot};
 use super::{KnownRobot, Store, StoreError, Write};
-use crate::person::Scope;
+use crate::domain::person::Scope;
 
 /// Those that can be ordered something.
 const ORDERABLE: &str = "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL AND awaits_approval = 0";

@@ -1,5 +1,8 @@
-//! The database: the truth about robots, packages, orders and tokens. One SQL text serves SQLite and Postgres. It never
-//! decides what should happen (that is [`crate::deployment`] and [`crate::rollout`]) and never reads the clock.
+//! Owns the database, the truth about robots, packages, orders and tokens; it never decides what
+//! should happen and never reads the clock.
+//!
+//! Decisions are [`crate::domain::deployment`]'s and [`crate::domain::rollout`]'s. One SQL text
+//! serves SQLite and Postgres.
 
 #![expect(clippy::disallowed_methods, reason = "SQL is at home here")]
 
@@ -80,8 +83,8 @@ pub use timelines::{HistoryPage, HistoryQuery};
 pub use tokens::{Admitted, EnrolmentTerms, TokenHolder};
 pub use users::{NewToken, User};
 
-use crate::pace::Pace;
-use crate::person::Person;
+use crate::domain::person::Person;
+use crate::limits::pace::Pace;
 
 /// What of a SQLite database the writer keeps in memory: 16 MiB.
 const WRITER_CACHE: &str = "PRAGMA cache_size = -16384";

@@ -8,7 +8,7 @@ use task_proto::{Digest, RepositoryName, RobotId, TaskName};
 
 use super::robot_blobs::bytes_taken;
 use super::{Store, StoreError, Write, rows};
-use crate::person::Scope;
+use crate::domain::person::Scope;
 
 /// The newest runs kept of one task on one robot.
 const KEPT: usize = 10;

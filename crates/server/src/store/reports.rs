@@ -11,7 +11,7 @@ use task_proto::{DeploymentId, Digest, Generation, InstanceId, RobotId, RobotNam
 use super::rows::{from_json, from_optional_json, from_word, groups, id, json, number, stored, values};
 use super::timelines::{grown, step};
 use super::{Store, StoreError, Write};
-use crate::deployment::Standing;
+use crate::domain::deployment::Standing;
 
 /// Columns of where an assignment stands in a statement.
 const STANDING: &[&str] = &["TEXT", "TEXT", "TEXT", "BIGINT", "TEXT", "TEXT", "BIGINT", "BIGINT", "TEXT"];

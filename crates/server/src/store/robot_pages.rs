@@ -5,7 +5,7 @@ use task_proto::selector::Selector;
 use task_proto::{RobotId, RobotName};
 
 use super::{Store, StoreError};
-use crate::person::Scope;
+use crate::domain::person::Scope;
 
 /// Some of the robots, sorted by name.
 #[derive(Debug)]

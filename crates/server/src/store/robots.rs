@@ -14,7 +14,7 @@ use task_proto::{DeploymentId, Digest, Generation, MacAddress, RobotId, RobotNam
 use super::deliveries;
 use super::rows::{from_json, from_optional_json, from_word, groups, id, json, number, priority, stored, values};
 use super::{Store, StoreError, Write};
-use crate::person::Scope;
+use crate::domain::person::Scope;
 
 /// Who a robot is.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]

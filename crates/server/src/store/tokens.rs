@@ -15,8 +15,8 @@ use task_proto::{RobotId, TokenId, UserName};
 
 use super::rows::{from_optional_json, from_word, groups, id, json, number, optional, stored, values};
 use super::{Store, StoreError, Write};
-use crate::person::{Person, Scope};
-use crate::tls::ClientProof;
+use crate::domain::person::{Person, Scope};
+use crate::net::tls::ClientProof;
 
 /// Whom a valid token stands for.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -10,8 +10,8 @@ use task_proto::{TokenId, UserName};
 
 use super::rows::{from_word, id, number, optional, stored, word};
 use super::{Store, StoreError, Write};
-use crate::passwords::PasswordHash;
-use crate::person::first_name;
+use crate::auth::passwords::PasswordHash;
+use crate::domain::person::first_name;
 
 /// The most tokens that are listed.
 const MOST_LISTED: i64 = 10_000;

@@ -7,8 +7,8 @@ use task_proto::oci::MANIFEST_TYPE;
 use task_proto::report::{ActiveVersion, Failure, FailureCode, Phase};
 use task_proto::selector::Selector;
 use task_proto::{DeploymentId, RepositoryName, TaskName};
-use taskd::actions::{ActionError, Rollback, TaskOrder};
-use taskd::person::Person;
+use taskd::domain::person::Person;
+use taskd::orders::actions::{ActionError, Rollback, TaskOrder};
 use taskd::store::{NewManifest, PutManifest, Reference, StoredManifest};
 
 use crate::database::{TestDatabase, on_both_databases};

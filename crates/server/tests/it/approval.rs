@@ -5,9 +5,9 @@ use serde_json::{Value, json};
 use task_proto::RobotId;
 use task_proto::api::{AuditPage, CreateEnrollmentToken, EnrollResponse, EnrollmentToken, PendingRobotList, RobotView};
 use task_proto::token::Token;
-use taskd::person::Scope;
+use taskd::domain::person::Scope;
+use taskd::net::tls::ClientProof;
 use taskd::store::TokenHolder;
-use taskd::tls::ClientProof;
 use tempfile::TempDir;
 
 use crate::database::{TestDatabase, on_both_databases};

@@ -7,7 +7,7 @@ use serde_json::json;
 use task_proto::api::{AuditQuery, BulkLabels, DeploymentView, MatchedRobots, RobotList};
 use task_proto::id::Labels;
 use task_proto::report::Phase;
-use taskd::changes::Change;
+use taskd::orders::changes::Change;
 
 use crate::database::{TestDatabase, on_both_databases};
 use crate::fleet::Fleet;

@@ -8,9 +8,9 @@ use std::process::{Output, Stdio};
 
 use serde_json::{Value, json};
 use task_proto::api::{EnrollResponse, RobotView};
-use taskd::clock::Clock;
 use taskd::config::Config;
 use taskd::serve::Server;
+use taskd::system::clock::Clock;
 use tempfile::TempDir;
 
 use crate::outputs::{Push, file, output};

@@ -7,7 +7,7 @@ use task_proto::RobotId;
 use task_proto::api::{RobotView, ServerInfo};
 use task_proto::report::Phase;
 use task_proto::topic::RobotTopic;
-use taskd::conduct::ConductLimits;
+use taskd::limits::conduct::ConductLimits;
 use tempfile::TempDir;
 use tokio::io::AsyncWriteExt as _;
 use tokio::time::timeout;

@@ -11,10 +11,10 @@ use serde_json::{Value, json};
 use sqlx::Connection as _;
 use task_proto::api::ServerStatus;
 use task_proto::report::Phase;
-use taskd::clock::Clock;
 use taskd::config::Config;
 use taskd::serve::Server;
 use taskd::store::sqlite_url;
+use taskd::system::clock::Clock;
 use tempfile::TempDir;
 
 use crate::cli;

@@ -7,7 +7,7 @@ use task_proto::desired::{Delivery, DesiredTask};
 use task_proto::manifest::TaskKind;
 use task_proto::report::{LinkFacts, Phase};
 use taskd::config::DeliverySettings;
-use taskd::delivery::{Condition, ConditionKey, Rule};
+use taskd::domain::delivery::{Condition, ConditionKey, Rule};
 
 use crate::database::{TestDatabase, on_both_databases};
 use crate::fleet::{Fleet, Robot, order_of, package, random_key};

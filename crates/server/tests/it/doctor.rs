@@ -2,7 +2,7 @@
 
 use axum::Router;
 use serde_json::Value;
-use taskd::clock::Clock;
+use taskd::system::clock::Clock;
 
 use crate::cli::{Bench, Ran, command, run};
 

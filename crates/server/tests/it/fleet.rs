@@ -14,15 +14,15 @@ use task_proto::person::{Role, Roles};
 use task_proto::report::{HostFacts, LinkFacts, Phase, Report, TaskReport};
 use task_proto::token::{Token, TokenKind};
 use task_proto::{DeploymentId, Digest, Generation, InstanceId, MacAddress, RobotId, UserName};
-use taskd::actions::{ActionError, ActionSettings, Actions, Enrolled, IdempotencyKey};
-use taskd::changes::Changes;
-use taskd::chooser::{Chooser, ServerLoad};
-use taskd::clock::Clock;
 use taskd::config::DeliverySettings;
-use taskd::person::Person;
-use taskd::presence::Presence;
-use taskd::report_writer::ReportWriter;
+use taskd::domain::person::Person;
+use taskd::fleet::presence::Presence;
+use taskd::orders::actions::{ActionError, ActionSettings, Actions, Enrolled, IdempotencyKey};
+use taskd::orders::changes::Changes;
+use taskd::orders::chooser::{Chooser, ServerLoad};
+use taskd::orders::report_writer::ReportWriter;
 use taskd::store::TokenHolder;
+use taskd::system::clock::Clock;
 
 use crate::database::TestDatabase;
 

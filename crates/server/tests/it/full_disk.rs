@@ -10,9 +10,9 @@ use reqwest::{Method, RequestBuilder, StatusCode};
 use serde_json::{Value, json};
 use task_proto::Digest;
 use task_proto::report::Phase;
-use taskd::clock::Clock;
 use taskd::config::Config;
 use taskd::serve::Server;
+use taskd::system::clock::Clock;
 use tempfile::TempDir;
 
 use crate::harness::{TestRobot, TestServer, answer};

@@ -15,9 +15,9 @@ use task_proto::report::{HostFacts, Phase, Report, TaskReport};
 use task_proto::token::Token;
 use task_proto::{Digest, InstanceId, RobotId};
 use task_transport::Trust;
-use taskd::clock::Clock;
 use taskd::config::Config;
 use taskd::serve::Server;
+use taskd::system::clock::Clock;
 use tempfile::TempDir;
 
 /// The moment at which every test begins.

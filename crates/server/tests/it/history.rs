@@ -5,7 +5,7 @@ use task_proto::Generation;
 use task_proto::api::{EditRobot, MAX_TIMELINE, PastAssignment};
 use task_proto::report::Phase;
 use task_proto::settings::RobotSettings;
-use taskd::actions::TaskOrder;
+use taskd::orders::actions::TaskOrder;
 use taskd::store::{HistoryPage, HistoryQuery};
 
 use crate::database::{TestDatabase, on_both_databases};

@@ -6,7 +6,7 @@ use task_proto::api::DeploymentState;
 use task_proto::desired::Wanted;
 use task_proto::manifest::TaskKind;
 use task_proto::report::{Condition, Phase, Report};
-use taskd::actions::TaskOrder;
+use taskd::orders::actions::TaskOrder;
 
 use crate::database::{TestDatabase, on_both_databases};
 use crate::fleet::{Fleet, Robot, package, random_key};

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use serde_json::json;
 use task_proto::api::{DeploymentList, DeploymentView, RobotList};
 use task_proto::{DeploymentId, RobotName};
-use taskd::person::Scope;
+use taskd::domain::person::Scope;
 
 use crate::database::{TestDatabase, on_both_databases};
 use crate::fleet::{Fleet, Robot};

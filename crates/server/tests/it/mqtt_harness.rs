@@ -12,11 +12,11 @@ use task_proto::topic::{RobotTopic, Topic, TopicPrefix};
 use taskd::broker::{
     Broker, BrokerConfig, Gatekeeper, Inbox, Limits, Login, NotStored, Principal, Refusal, RobotMessage,
 };
-use taskd::clock::Clock;
-use taskd::conduct::{Conduct, ConductLimits};
 use taskd::config::TlsSettings;
-use taskd::data_directory::DataDirectory;
-use taskd::tls::Tls;
+use taskd::limits::conduct::{Conduct, ConductLimits};
+use taskd::net::tls::Tls;
+use taskd::system::clock::Clock;
+use taskd::system::data_directory::DataDirectory;
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::sync::{Mutex, Notify, mpsc};

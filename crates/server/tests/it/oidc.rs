@@ -7,9 +7,9 @@ use std::process::{Child, Command, Stdio};
 use reqwest::{Client, Method, Response, StatusCode, Url};
 use serde_json::{Value, json};
 use task_proto::api::{AuditPage, Me, SessionView};
-use taskd::clock::Clock;
 use taskd::config::{Config, OidcSettings, RoleRule};
 use taskd::serve::Server;
+use taskd::system::clock::Clock;
 use tempfile::TempDir;
 
 use crate::harness::{TestServer, answer, refusal};

@@ -10,7 +10,7 @@ use task_proto::oci::MANIFEST_TYPE;
 use task_proto::output::{OUTPUT_TYPE, OutputFile, OutputSet};
 use task_proto::{Digest, RobotId};
 use taskd::blobs::BlobSettings;
-use taskd::collector;
+use taskd::blobs::collector;
 use taskd::http::oci::Registry;
 
 use crate::database::{TestDatabase, on_both_databases};

@@ -13,9 +13,9 @@ use task_proto::publisher::{PackageStatement, SIGNATURE_ARTIFACT};
 use task_proto::report::Phase;
 use task_proto::{Digest, RepositoryName, RobotId};
 use taskd::blobs::BlobSettings;
-use taskd::collector::{self, Collected};
+use taskd::blobs::collector::{self, Collected};
+use taskd::domain::person::Person;
 use taskd::http::auth::Caller;
-use taskd::person::Person;
 use taskd::store::{NewManifest, PutManifest, StoredManifest};
 
 use crate::database::{TestDatabase, on_both_databases};

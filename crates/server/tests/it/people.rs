@@ -12,11 +12,11 @@ use task_proto::report::Phase;
 use task_proto::selector::Selector;
 use task_proto::token::{Token, TokenKind};
 use task_proto::{Digest, RobotId, TokenId, UserName};
-use taskd::actions::{ActionError, TaskOrder};
+use taskd::domain::person::Person;
 use taskd::http::error::ApiError;
-use taskd::person::Person;
+use taskd::net::tls::ClientProof;
+use taskd::orders::actions::{ActionError, TaskOrder};
 use taskd::store::{Deletion, Store, StoreError, TokenHolder};
-use taskd::tls::ClientProof;
 
 use crate::database::{TestDatabase, on_both_databases};
 use crate::fleet::{Fleet, order_of, package, random_key};

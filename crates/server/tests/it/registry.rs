@@ -14,18 +14,18 @@ use task_proto::desired::BlobRef;
 use task_proto::oci::MANIFEST_TYPE;
 use task_proto::token::{Token, TokenKind};
 
+use taskd::blobs::collector::{self, Collected};
 use taskd::blobs::{BlobSettings, Blobs};
-use taskd::changes::Changes;
-use taskd::clock::Clock;
-use taskd::collector::{self, Collected};
 use taskd::config::TransferLimits;
+use taskd::domain::person::Person;
 use taskd::http::archives::ArchiveReaders;
 use taskd::http::auth::Caller;
 use taskd::http::drain::drain_unread;
 use taskd::http::oci::{self, Registry};
-use taskd::person::Person;
+use taskd::link::transfers::Transfers;
+use taskd::orders::changes::Changes;
 use taskd::store::{Store, sqlite_url};
-use taskd::transfers::Transfers;
+use taskd::system::clock::Clock;
 use tempfile::TempDir;
 
 pub const GRACE: Duration = Duration::from_secs(3600);

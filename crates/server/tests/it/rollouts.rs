@@ -5,8 +5,8 @@ use std::time::Duration;
 use serde_json::json;
 use task_proto::api::{DeploymentState, DeploymentView};
 use task_proto::report::Phase;
-use taskd::actions::ActionError;
-use taskd::rollout::{LOST_AFTER_MS, OFFLINE_GRACE_MS};
+use taskd::domain::rollout::{LOST_AFTER_MS, OFFLINE_GRACE_MS};
+use taskd::orders::actions::ActionError;
 use tokio::time::timeout;
 
 use crate::database::{TestDatabase, on_both_databases};

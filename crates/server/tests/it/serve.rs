@@ -10,9 +10,9 @@ use reqwest::{Method, StatusCode};
 use serde_json::{Value, json};
 use task_proto::report::Phase;
 use task_proto::topic::RobotTopic;
-use taskd::clock::Clock;
 use taskd::config::Config;
 use taskd::serve::{ServeError, Server};
+use taskd::system::clock::Clock;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpSocket, TcpStream};
 
@@ -26,7 +26,7 @@ async fn the_first_start_makes_what_is_needed_and_nobody_else_reads_it() {
     assert_eq!(mode(""), 0o700);
     assert_eq!((mode("operator.token"), mode("signing.key")), (0o600, 0o600));
     let addresses = std::fs::read(server.data().join("addresses.json")).expect("published");
-    let addresses: taskd::data_directory::Addresses = serde_json::from_slice(&addresses).expect("json");
+    let addresses: taskd::system::data_directory::Addresses = serde_json::from_slice(&addresses).expect("json");
     assert_eq!(addresses, *server.server.addresses());
     for path in ["/healthz", "/readyz"] {
         let status = server.bare(Method::GET, path).send().await.expect("an answer").status();
@@ -271,7 +271,7 @@ impl Program {
         BufReader::new(stdout).read_line(&mut said).expect("it says where it is");
         assert!(said.starts_with("taskd serves HTTP on http://127.0.0.1:"), "{said}");
         let addresses = std::fs::read(data.join("addresses.json")).expect("published");
-        let addresses: taskd::data_directory::Addresses = serde_json::from_slice(&addresses).expect("json");
+        let addresses: taskd::system::data_directory::Addresses = serde_json::from_slice(&addresses).expect("json");
         let token = std::fs::read_to_string(data.join("operator.token")).expect("a token").trim().to_owned();
         Self { process, http: addresses.http, mqtt: addresses.mqtt, token, directory }
     }

@@ -7,8 +7,8 @@ use task_proto::api::{CreateEnrollmentToken, DeploymentState, EditRobot};
 use task_proto::desired::Wanted;
 use task_proto::manifest::TaskKind;
 use task_proto::report::Phase;
-use taskd::actions::{ActionError, Actions, TaskOrder};
-use taskd::report_writer::ReportError;
+use taskd::orders::actions::{ActionError, Actions, TaskOrder};
+use taskd::orders::report_writer::ReportError;
 use taskd::store::Store;
 
 use crate::database::{TestDatabase, on_both_databases};

@@ -18,9 +18,9 @@ use task_proto::CaPin;
 use task_proto::api::{EnrollResponse, EnrollmentToken, RobotToken};
 use task_proto::token::Token;
 use task_transport::{ClientKey, Duplex, Route, Trust, dial};
-use taskd::clock::Clock;
 use taskd::config::Config;
 use taskd::http::listener::{Limits, Service, serve};
+use taskd::system::clock::Clock;
 use tempfile::TempDir;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
@@ -458,9 +458,9 @@ async fn a_thousand_half_open_connections_keep_nobody_out() {
 /// An HTTP listener that speaks TLS.
 async fn listener(limits: Limits) -> (SocketAddr, tokio_util::sync::DropGuard, TempDir) {
     let directory = TempDir::new().expect("a directory");
-    let data = taskd::data_directory::DataDirectory::open(directory.path()).expect("opens");
-    let tls = taskd::tls::Tls::open(Default::default(), &data, Clock::system()).expect("made");
-    let listener = taskd::backlog::listen(([127, 0, 0, 1], 0).into()).expect("listens");
+    let data = taskd::system::data_directory::DataDirectory::open(directory.path()).expect("opens");
+    let tls = taskd::net::tls::Tls::open(Default::default(), &data, Clock::system()).expect("made");
+    let listener = taskd::net::backlog::listen(([127, 0, 0, 1], 0).into()).expect("listens");
     let address = listener.local_addr().expect("bound");
     let stop = tokio_util::sync::CancellationToken::new();
     let (router, traffic) = (axum::Router::new(), Arc::default());

@@ -4,11 +4,11 @@
 use task_proto::RobotId;
 use task_proto::api::CreateEnrollmentToken;
 use task_proto::token::{Token, TokenKind};
-use taskd::actions::{ActionError, Enrolled};
-use taskd::person::Person;
-use taskd::report_writer::ReportError;
+use taskd::domain::person::Person;
+use taskd::net::tls::ClientProof;
+use taskd::orders::actions::{ActionError, Enrolled};
+use taskd::orders::report_writer::ReportError;
 use taskd::store::{Admitted, Store, StoreError, TokenHolder};
-use taskd::tls::ClientProof;
 
 use crate::database::{TestDatabase, on_both_databases};
 use crate::fleet::{Fleet, Robot, mac};

@@ -22,8 +22,8 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use super::{Health, Inbox, NotAsked, NotConnected, PartQos};
-use crate::broker_url::{BrokerUrl, BrokerUrls};
-use crate::clock::Clock;
+use crate::domain::broker_url::{BrokerUrl, BrokerUrls};
+use crate::system::clock::Clock;
 pub(super) use crowd::Crowd;
 use outbox::{Letter, Outbox};
 use present::Present;

@@ -22,7 +22,7 @@ use super::super::{Health, MAX_PART_BYTES, PartQos, RobotMessage};
 use super::outbox::Letter;
 use super::present::Turn;
 use super::{CANARY_LEVEL, External, Place, lock};
-use crate::broker_url::BrokerUrl;
+use crate::domain::broker_url::BrokerUrl;
 
 const KEEP_ALIVE: Duration = Duration::from_secs(20);
 /// How long connecting, and flushing, may take.

@@ -19,10 +19,10 @@ use super::access::{Visitor, may_publish};
 use super::codec::{Connect, DecodeError, Received, Will, decode, encode};
 use super::places::Claim;
 use super::takeover::SeatName;
-use crate::anteroom::Place;
 use crate::broker::{Login, Principal, Refusal};
-use crate::conduct::{SESSION_COST, Verdict, Watched, Way};
-use crate::tls::ClientProof;
+use crate::limits::conduct::{SESSION_COST, Verdict, Watched, Way};
+use crate::net::anteroom::Place;
+use crate::net::tls::ClientProof;
 
 /// The largest CONNECT, in bytes after the fixed header.
 const MAX_CONNECT_BYTES: usize = 4 * 1024;

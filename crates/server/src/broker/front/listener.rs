@@ -8,7 +8,7 @@ use std::time::Duration;
 use tokio::net::TcpListener;
 
 use super::Front;
-use crate::tls::ClientProof;
+use crate::net::tls::ClientProof;
 
 /// For the system to have file descriptors again.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);

@@ -34,10 +34,10 @@ use tokio_util::task::TaskTracker;
 
 use super::router::Router;
 use super::{BrokerConfig, BrokerError, Gatekeeper, Inbox, Limits, NotAsked, NotConnected};
-use crate::anteroom::Anteroom;
-use crate::backlog::listen;
-use crate::conduct::Conduct;
-use crate::tls::{ClientProof, Tls};
+use crate::limits::conduct::Conduct;
+use crate::net::anteroom::Anteroom;
+use crate::net::backlog::listen;
+use crate::net::tls::{ClientProof, Tls};
 use entrance::{Arrival, Rejection};
 pub(super) use entrance::{CANARY_ID, CanaryPass};
 use other_protocol::OtherProtocols;

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::timeout;
 
-use crate::anteroom::Anteroom;
+use crate::net::anteroom::Anteroom;
 
 /// Newcomers that wait for a place at a time: connections beyond those there may be.
 const MAX_WAITING: usize = 128;

@@ -30,7 +30,7 @@ use super::takeover::Seat;
 use super::traffic::{Count, Meter, Metered};
 use crate::broker::router::{Heard, Listener, Listening, RouterError};
 use crate::broker::{NotStored, RobotMessage};
-use crate::conduct::Watched;
+use crate::limits::conduct::Watched;
 
 mod conduct;
 mod parts;

@@ -16,10 +16,10 @@ use task_proto::{Digest, RepositoryName, RobotId};
 use super::manifests::deleted;
 use super::{Answer, OciError, Registry};
 use crate::blobs::{Blob, BytesFor};
+use crate::domain::person::Person;
 use crate::http::listener::Unencrypted;
-use crate::person::Person;
+use crate::link::transfers::Claim;
 use crate::store::{Act, Deed};
-use crate::transfers::Claim;
 
 /// It may be kept, but not be used before the server was asked.
 pub(super) const REVALIDATED: &str = "private, no-cache";

@@ -10,8 +10,8 @@ use task_proto::Digest;
 
 use super::super::error::{ApiError, DATABASE_CORRUPT};
 use crate::blobs::BlobError;
+use crate::link::transfers::NotYet;
 use crate::store::{Fault, StoreError};
-use crate::transfers::NotYet;
 
 /// When it is of use to ask again where something has to be collected first, in seconds.
 const COLLECTION_S: u64 = 300;

@@ -21,9 +21,9 @@ use super::parsed::{Parsed, is_json};
 use super::uploads::kept_bytes;
 use super::{Answer, OciError, Registry, empty, is_reserved, signed};
 use crate::blobs::Blob;
-use crate::changes::Change;
+use crate::domain::person::Person;
 use crate::http::packages::in_use;
-use crate::person::Person;
+use crate::orders::changes::Change;
 use crate::store::{Act, Deed, Deletion, NewManifest, NewOutput, PutManifest, Reference, StoredManifest, bytes_taken};
 
 /// The largest manifest; the specification asks for at least this.

@@ -27,11 +27,11 @@ pub use publish::publish;
 use super::archives::ArchiveReaders;
 use super::auth::Caller;
 use crate::blobs::Blobs;
-use crate::changes::Changes;
-use crate::clock::Clock;
-use crate::person::Person;
+use crate::domain::person::Person;
+use crate::link::transfers::Transfers;
+use crate::orders::changes::Changes;
 use crate::store::{Reference, Store};
-use crate::transfers::Transfers;
+use crate::system::clock::Clock;
 
 /// What is said of digests by another algorithm.
 const ALGORITHMS: &str = "only sha256 and sha512 are supported";

@@ -13,8 +13,8 @@ use tokio_util::io::ReaderStream;
 use super::manifests::{Push, push};
 use super::uploads::begun;
 use super::{OciError, Registry};
+use crate::domain::person::Person;
 use crate::package::Packed;
-use crate::person::Person;
 use crate::store::Reference;
 
 /// How much of the content is read at once.

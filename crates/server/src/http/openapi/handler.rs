@@ -16,7 +16,7 @@ use super::super::extract::{JsonBody, PathParam, PathParams, QueryParams, Tolera
 use super::super::oci::OciError;
 use super::super::shared_lists::SharedJson;
 use super::Draft;
-use crate::person::Person;
+use crate::domain::person::Person;
 
 /// 201, with what was made.
 pub(in crate::http) struct Created<T>(pub(in crate::http) T);

@@ -18,7 +18,7 @@ pub(super) use self::draft::{Draft, OrderKey};
 pub(super) use self::handler::{Created, Describe};
 use super::session::COOKIE;
 use super::{Route, routes};
-use crate::web::is_known;
+use crate::http::web::is_known;
 
 /// Operations are grouped by these.
 const TAGS: [(&str, &str); 12] = [

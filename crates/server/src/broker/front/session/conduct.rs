@@ -5,7 +5,7 @@ use tokio::time::{Instant, sleep_until};
 
 use super::{End, Session};
 use crate::broker::front::codec::{DecodeError, Received};
-use crate::conduct::{Offence, Verdict};
+use crate::limits::conduct::{Offence, Verdict};
 
 /// Subscriptions to what is not for it that a robot may try in one session.
 const MAX_REFUSED_FILTERS: u32 = 16;

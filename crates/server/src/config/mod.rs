@@ -1,0 +1,700 @@
+//! Owns the server's settings and where they come from; it never creates anything.
+//!
+//! Settings come from flags, then `TASKD_*` variables, then a TOML file, then defaults. One table
+//! names every setting, so the sources can't drift apart. The file is read and host names are
+//! resolved here.
+
+mod oidc;
+mod settings;
+mod tables;
+mod tls;
+
+use std::ffi::OsString;
+use std::net::{IpAddr, SocketAddr};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use clap::{Arg, ArgAction, ArgMatches};
+use task_proto::CaPin;
+use task_proto::id::LabelKey;
+use task_proto::part::DEFAULT_PART_BYTES;
+use task_proto::topic::TopicPrefix;
+
+pub use self::oidc::{OidcSettings, RoleRule, private_url};
+use self::settings::{SETTINGS, Setting};
+pub use self::tables::{PersonRates, SiteLimits, TransferLimits};
+pub use self::tls::TlsSettings;
+use crate::domain::broker_url::{BrokerUrl, BrokerUrls};
+use crate::domain::delivery::{Rule, Rules};
+use crate::limits::conduct::ConductLimits;
+
+/// Everything `taskd serve` can be told.
+#[derive(Debug, Clone)]
+pub struct Config {
+    /// The directory that holds all state.
+    pub data: PathBuf,
+    /// Where HTTP listens; port 0 takes a free one.
+    pub http: SocketAddr,
+    /// Where MQTT listens; port 0 takes a free one.
+    pub mqtt: SocketAddr,
+    /// The MQTT brokers to be a client of, one at a time; absent: the server's own, which listens at `mqtt`.
+    pub broker: Option<BrokerUrls>,
+    /// The authority behind its certificate; absent: the system's roots vouch for it.
+    pub broker_pin: Option<CaPin>,
+    /// The database's URL; absent: SQLite in the data directory.
+    pub database: Option<String>,
+    /// How often a SQLite database is checked in full.
+    pub database_check_interval: Duration,
+    /// What all MQTT topics start with.
+    pub topic_prefix: TopicPrefix,
+    /// Whether unencrypted listeners may be reached from other machines.
+    pub allow_plaintext: bool,
+    /// Whether and how the listeners encrypt.
+    pub tls: TlsSettings,
+    /// How long an assignment may stay undone.
+    pub assignment_expiry: Duration,
+    /// How long a signed desired state allows new work to be begun.
+    pub desired_lifetime: Duration,
+    /// The MQTT host robots are told; absent: the host of the URL they already use.
+    pub public_mqtt_host: Option<String>,
+    /// The MQTT port robots are told; absent: the one that is bound.
+    pub public_mqtt_port: Option<u16>,
+    /// After how long a silent robot that polls counts as offline; robots poll every 10 s unless told otherwise.
+    pub presence_timeout: Duration,
+    /// How blobs are read.
+    pub blob_read: BlobRead,
+    /// How long an unfinished upload or an unreferenced blob is kept.
+    pub blob_grace: Duration,
+    /// The most HTTP connections at once; more wait in the listener's backlog.
+    pub max_http_connections: usize,
+    /// The most MQTT connections at once; more are refused.
+    pub max_mqtt_connections: usize,
+    /// The most connections of one address that have shown no good token yet, over MQTT sent no CONNECT; the oldest is closed for a
+    /// further one.
+    pub max_silent_per_address: usize,
+    /// The addresses of reverse proxies that are believed about where a request came from.
+    pub trusted_proxies: Vec<IpAddr>,
+    /// By which provider people may sign in; without an issuer by none.
+    pub oidc: OidcSettings,
+    /// The most bytes one blob may have.
+    pub max_blob_bytes: u64,
+    /// The most bytes that are unpacked of a package that comes as a directory.
+    pub max_upload_bytes: u64,
+    /// The most bytes that are kept of what one robot brings back; absent: 40 GB, or less on a small disk.
+    pub max_robot_bytes: Option<u64>,
+    /// How packages travel to robots.
+    pub delivery: DeliverySettings,
+    /// What bounds the transfers of packages over HTTP.
+    pub transfers: TransferLimits,
+    /// What a robot may send.
+    pub robots: ConductLimits,
+    /// What a person may ask for.
+    pub people: PersonRates,
+    /// Whether every new robot waits to be approved.
+    pub enrolment_approval: bool,
+    /// How many robots an enrolment token is good for whose maker does not say.
+    pub enrolment_uses: u64,
+    /// How many robots may enrol in a minute; by one token half of them.
+    pub enrolment_per_minute: u64,
+    /// What people's packages and uploads leave free on the disk; absent: a fortieth of it, 1 GB at most.
+    pub disk_reserve: Option<u64>,
+}
+
+/// `[delivery]`: how packages travel to robots.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct DeliverySettings {
+    /// The size of a part in direct-push. A package that is not larger travels as one message.
+    pub part_bytes: u32,
+    /// The MQTT quality of service of parts: 0, 1 or 2.
+    pub qos: u8,
+    /// The most bytes of a package that ride inside an announcement.
+    pub inline_bytes: u32,
+    /// The label whose value says on which site a robot is.
+    pub site_label: LabelKey,
+    /// The operator's own rules, the first first.
+    pub own_rules: Vec<Rule>,
+}
+
+impl DeliverySettings {
+    /// All rules in their order.
+    pub fn rules(&self) -> Rules {
+        Rules::new(self.own_rules.clone(), self.inline_bytes.into())
+    }
+}
+
+impl Default for DeliverySettings {
+    fn default() -> Self {
+        Self {
+            part_bytes: DEFAULT_PART_BYTES,
+            qos: 1,
+            inline_bytes: 32 * 1024,
+            site_label: "site".parse().expect("a label's key"),
+            own_rules: Vec::new(),
+        }
+    }
+}
+
+/// How the blob handler gets at a file's bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum BlobRead {
+    /// Through the page cache, mapped into memory: fastest.
+    Mmap,
+    /// By positioned reads: a disk error is an error instead of a signal.
+    Pread,
+}
+
+/// Where a setting was read.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Origin {
+    /// A command line flag.
+    Flag(String),
+    /// An environment variable.
+    Variable(String),
+    /// A key in a file.
+    File {
+        /// The key.
+        key: String,
+        /// The file.
+        path: PathBuf,
+    },
+}
+
+impl std::fmt::Display for Origin {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Flag(flag) => f.write_str(flag),
+            Self::Variable(name) => f.write_str(name),
+            Self::File { key, path } => write!(f, "{key} in {}", path.display()),
+        }
+    }
+}
+
+/// Settings that can't be used.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// A value does not parse.
+    #[error("{origin}: {reason}")]
+    Value {
+        /// Where it stands.
+        origin: Origin,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// A setting that does not exist.
+    #[error("{origin}: there is no such setting{hint}")]
+    Unknown {
+        /// Where it stands.
+        origin: Origin,
+        /// The setting that was probably meant, if one is close.
+        hint: String,
+    },
+    /// The file can't be read.
+    #[error("can't read the configuration file {}", path.display())]
+    Unreadable {
+        /// Which.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// The file is not TOML.
+    #[error("{} is not valid TOML: {reason}", path.display())]
+    Syntax {
+        /// Which.
+        path: PathBuf,
+        /// Where and why.
+        reason: String,
+    },
+    /// No data directory is given and there is no home to put it in.
+    #[error("--data: no directory is given, and neither XDG_DATA_HOME nor HOME says where to put one")]
+    NoDataDirectory,
+    /// A password stands where every user of the machine can read it.
+    #[error(
+        "--{name}: everybody on this machine can read a command line, so a URL with a password belongs in the \
+         configuration file ({name} = \"…\") or in TASKD_{upper}", upper = name.to_uppercase()
+    )]
+    PasswordInSight {
+        /// Which setting.
+        name: &'static str,
+    },
+    /// One public place, where robots are told several brokers.
+    #[error(
+        "public_mqtt_host and public_mqtt_port name one place, and broker names several; robots are told the hosts and \
+         ports in broker"
+    )]
+    OnePlaceForSeveralBrokers,
+    /// The broker's password would cross the network readable.
+    #[error(
+        "broker = {address}: an unencrypted connection to another machine is refused; use mqtts://, a broker on this machine or \
+         give --allow-plaintext"
+    )]
+    PlaintextBroker {
+        /// Where the broker is.
+        address: String,
+    },
+    /// A certificate without its key, or the other way round.
+    #[error("{given}: {missing} is missing")]
+    HalfACertificate {
+        /// The setting there is.
+        given: &'static str,
+        /// The one there is not.
+        missing: &'static str,
+    },
+    /// Keys can't be shown where nobody shakes hands.
+    #[error(
+        "tls.client_certificates: robots can't show their keys to a server that does not encrypt; set tls.private_ca"
+    )]
+    KeysInPlainText,
+    /// The provider can't be used without it.
+    #[error("{missing} is missing, and signing in by a provider does not work without it")]
+    OidcIncomplete {
+        /// The setting there is not.
+        missing: &'static str,
+    },
+    /// An unencrypted listener would be reachable from other machines.
+    #[error(
+        "{key} = {address}: unencrypted connections from other machines are refused; leave out --tls-private-ca=false, \
+         bind a loopback address or give --allow-plaintext"
+    )]
+    Plaintext {
+        /// Which listener.
+        key: &'static str,
+        /// Its address.
+        address: SocketAddr,
+    },
+}
+
+/// Variables that other commands and tasks use; `serve` is not confused by finding them.
+const FOREIGN_VARIABLES: [&str; 5] = ["TASKD_SERVER", "TASKD_TOKEN", "TASKD_PIN", "TASKD_ASSIGNMENT", "TASKD_LOG"];
+/// What the test suite's own variables start with.
+const TEST_VARIABLES: &str = "TASKD_TEST_";
+/// The largest configuration file that is read.
+const MAX_FILE_BYTES: u64 = 1024 * 1024;
+
+impl Config {
+    /// The defaults, with all state in `data`.
+    pub fn with_data(data: PathBuf) -> Self {
+        const DAY: Duration = Duration::from_secs(24 * 60 * 60);
+        Self {
+            data,
+            http: SocketAddr::from(([127, 0, 0, 1], 8080)),
+            mqtt: SocketAddr::from(([127, 0, 0, 1], 1883)),
+            broker: None,
+            broker_pin: None,
+            database: None,
+            database_check_interval: DAY,
+            topic_prefix: TopicPrefix::default(),
+            allow_plaintext: false,
+            tls: TlsSettings::default(),
+            assignment_expiry: 7 * DAY,
+            desired_lifetime: 30 * DAY,
+            public_mqtt_host: None,
+            public_mqtt_port: None,
+            presence_timeout: Duration::from_secs(90),
+            blob_read: BlobRead::Mmap,
+            blob_grace: DAY,
+            max_http_connections: 20_000,
+            max_mqtt_connections: 20_000,
+            max_silent_per_address: 2048,
+            trusted_proxies: Vec::new(),
+            oidc: OidcSettings::default(),
+            max_blob_bytes: 16 << 30,
+            max_upload_bytes: 4 << 30,
+            max_robot_bytes: None,
+            delivery: DeliverySettings::default(),
+            transfers: TransferLimits::default(),
+            robots: ConductLimits::default(),
+            people: PersonRates::default(),
+            enrolment_approval: false,
+            enrolment_uses: 100,
+            enrolment_per_minute: 3_000,
+            disk_reserve: None,
+        }
+    }
+
+    /// Merges the sources. `environment` is the process's, handed in so that tests need not change it.
+    pub fn load(
+        flags: &ServeFlags,
+        environment: impl IntoIterator<Item = (OsString, OsString)>,
+    ) -> Result<Self, ConfigError> {
+        let environment: Vec<(OsString, OsString)> = environment.into_iter().collect();
+        let variable = |name: &str| environment.iter().find(|(key, _)| key == name).map(|(_, value)| value.clone());
+        let mut config = Self::with_data(PathBuf::new());
+        let file = flags.config.clone().or_else(|| variable("TASKD_CONFIG").map(PathBuf::from));
+        if let Some(path) = file {
+            config.apply_file(&path)?;
+        }
+        config.apply_environment(&environment)?;
+        for (name, text) in &flags.settings {
+            // A broker's URL always has a password.
+            if *name == "broker" && text != "embedded" || *name == "database" && has_password(text) {
+                return Err(ConfigError::PasswordInSight { name });
+            }
+            config.apply(&name.replace('-', "_"), text, Origin::Flag(format!("--{name}")))?;
+        }
+        if config.data.as_os_str().is_empty() {
+            config.data = default_data_directory(variable).ok_or(ConfigError::NoDataDirectory)?;
+        }
+        config.check()?;
+        Ok(config)
+    }
+
+    /// Refuses settings that do not go together.
+    fn check(&self) -> Result<(), ConfigError> {
+        self.oidc.check()?;
+        let is_exposed = |broker: &&BrokerUrl| !broker.tls && !broker.is_loopback() && !self.allow_plaintext;
+        let brokers = self.broker.as_ref().map(BrokerUrls::all).unwrap_or_default();
+        if let Some(broker) = brokers.iter().find(is_exposed) {
+            return Err(ConfigError::PlaintextBroker { address: broker.address() });
+        }
+        if brokers.len() > 1 && (self.public_mqtt_host.is_some() || self.public_mqtt_port.is_some()) {
+            return Err(ConfigError::OnePlaceForSeveralBrokers);
+        }
+        match (&self.tls.certificate, &self.tls.key) {
+            (Some(_), None) => Err(ConfigError::HalfACertificate { given: "tls.certificate", missing: "tls.key" }),
+            (None, Some(_)) => Err(ConfigError::HalfACertificate { given: "tls.key", missing: "tls.certificate" }),
+            _ => Ok(()),
+        }?;
+        if self.tls.client_certificates && !self.encrypts() {
+            return Err(ConfigError::KeysInPlainText);
+        }
+        match self.reached_from_elsewhere() {
+            Some((key, address)) if !self.encrypts() && !self.allow_plaintext => {
+                Err(ConfigError::Plaintext { key, address })
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Whether both listeners speak TLS.
+    pub fn encrypts(&self) -> bool {
+        self.tls.encrypts(self.reached_from_elsewhere().is_some(), self.allow_plaintext)
+    }
+
+    /// A listener that is reached from other machines.
+    fn reached_from_elsewhere(&self) -> Option<(&'static str, SocketAddr)> {
+        // Nothing listens for MQTT beside an external broker.
+        let mqtt = self.broker.is_none().then_some(("mqtt", self.mqtt));
+        [("http", self.http)].into_iter().chain(mqtt).find(|(_, address)| !address.ip().is_loopback())
+    }
+
+    fn apply(&mut self, key: &str, text: &str, origin: Origin) -> Result<(), ConfigError> {
+        let Some(setting) = Setting::by_key(key) else {
+            return Err(ConfigError::Unknown { hint: nearest(key), origin });
+        };
+        (setting.set)(self, text).map_err(|reason| ConfigError::Value { origin, reason })
+    }
+
+    fn apply_file(&mut self, path: &Path) -> Result<(), ConfigError> {
+        let unreadable = |source| ConfigError::Unreadable { path: path.to_owned(), source };
+        let syntax = |reason| ConfigError::Syntax { path: path.to_owned(), reason };
+        if std::fs::metadata(path).map_err(unreadable)?.len() > MAX_FILE_BYTES {
+            return Err(syntax(format!("it has more than {MAX_FILE_BYTES} bytes")));
+        }
+        let text = std::fs::read_to_string(path).map_err(unreadable)?;
+        let table: toml::Table = text.parse().map_err(|error: toml::de::Error| {
+            // Not the line itself, which may hold a password.
+            let line = error.span().map(|span| text[..span.start.min(text.len())].matches('\n').count() + 1);
+            let line = line.map(|line| format!("line {line}: ")).unwrap_or_default();
+            syntax(format!("{line}{}", error.message()))
+        })?;
+        for (key, value) in table {
+            match value {
+                toml::Value::Table(table) if tables::is_known(&key) => self.apply_table(path, &key, table)?,
+                value => self.apply_value(&key, value, Origin::File { key: key.clone(), path: path.to_owned() })?,
+            }
+        }
+        Ok(())
+    }
+
+    /// A setting from a file. `key` is its name all in one, `origin` where it stands.
+    fn apply_value(&mut self, key: &str, value: toml::Value, origin: Origin) -> Result<(), ConfigError> {
+        let text = match value {
+            toml::Value::String(text) => text,
+            toml::Value::Integer(number) => number.to_string(),
+            toml::Value::Boolean(yes) => yes.to_string(),
+            other => {
+                if Setting::by_key(key).is_none() {
+                    return Err(ConfigError::Unknown { hint: nearest(key), origin });
+                }
+                let reason = match other {
+                    toml::Value::Array(_) => "expected a text, a whole number or true or false, not an array",
+                    toml::Value::Table(_) => "expected a text, a whole number or true or false, not a table",
+                    _ => "expected a text, a whole number or true or false",
+                };
+                return Err(ConfigError::Value { origin, reason: reason.to_owned() });
+            }
+        };
+        self.apply(key, &text, origin)
+    }
+
+    fn apply_environment(&mut self, environment: &[(OsString, OsString)]) -> Result<(), ConfigError> {
+        for (name, value) in environment {
+            let Some(name) = name.to_str().filter(|name| name.starts_with("TASKD_")) else { continue };
+            if name == "TASKD_CONFIG" || FOREIGN_VARIABLES.contains(&name) || name.starts_with(TEST_VARIABLES) {
+                continue;
+            }
+            let origin = Origin::Variable(name.to_owned());
+            let Some(text) = value.to_str() else {
+                return Err(ConfigError::Value { origin, reason: "the value is not UTF-8".to_owned() });
+            };
+            self.apply(&name["TASKD_".len()..].to_ascii_lowercase(), text, origin)?;
+        }
+        Ok(())
+    }
+}
+
+/// The data directory of someone who names none.
+pub fn default_data_directory(variable: impl Fn(&str) -> Option<OsString>) -> Option<PathBuf> {
+    let set = |name| variable(name).filter(|value| !value.is_empty()).map(PathBuf::from);
+    let base = set("XDG_DATA_HOME").or_else(|| set("HOME").map(|home| home.join(".local/share")))?;
+    Some(base.join("taskd"))
+}
+
+/// The flags of `taskd serve`: `--config FILE` and one per setting.
+#[derive(Debug, Clone, Default)]
+pub struct ServeFlags {
+    /// The TOML file.
+    pub config: Option<PathBuf>,
+    /// Settings by flag name.
+    pub settings: Vec<(&'static str, String)>,
+}
+
+impl clap::Args for ServeFlags {
+    fn augment_args(command: clap::Command) -> clap::Command {
+        let config = Arg::new("config").long("config").value_name("FILE").value_parser(clap::value_parser!(PathBuf));
+        let mut command = command.arg(config.help("TOML file with the settings below, '_' in place of '-'"));
+        for setting in SETTINGS {
+            let arg = Arg::new(setting.name).long(setting.name).help(setting.help);
+            let arg = arg.value_name(setting.value_name).action(ArgAction::Set);
+            let is_switch = setting.value_name == "BOOL";
+            let arg =
+                if is_switch { arg.num_args(0..=1).require_equals(true).default_missing_value("true") } else { arg };
+            command = command.arg(arg);
+        }
+        command
+    }
+
+    fn augment_args_for_update(command: clap::Command) -> clap::Command {
+        Self::augment_args(command)
+    }
+}
+
+impl clap::FromArgMatches for ServeFlags {
+    fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
+        let text = |name: &'static str| matches.get_one::<String>(name).map(|text| (name, text.clone()));
+        Ok(Self {
+            config: matches.get_one::<PathBuf>("config").cloned(),
+            settings: SETTINGS.iter().filter_map(|setting| text(setting.name)).collect(),
+        })
+    }
+
+    fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
+        *self = Self::from_arg_matches(matches)?;
+        Ok(())
+    }
+}
+
+/// Reads a time that something may last: not nothing, and at most ten years.
+pub fn lifetime(text: &str) -> Result<Duration, String> {
+    const MOST: Duration = Duration::from_secs(3650 * 24 * 60 * 60);
+    match parse_duration(text) {
+        Some(time) if !time.is_zero() && time <= MOST => Ok(time),
+        _ => Err(format!("{text:?} is not a time: expected for example 90s, 15m, 12h or 7d, at most 3650d")),
+    }
+}
+
+/// Reads how many, which is at least one.
+pub fn at_least_one(text: &str) -> Result<u64, String> {
+    text.parse().ok().filter(|count| *count > 0).ok_or_else(|| "expected a whole number, 1 or more".to_owned())
+}
+
+/// Reads a whole number with a unit of time: `ms`, `s`, `m`, `h` or `d`. A number alone means seconds.
+pub fn parse_duration(text: &str) -> Option<Duration> {
+    let split = text.find(|c: char| !c.is_ascii_digit()).unwrap_or(text.len());
+    let number: u64 = text[..split].parse().ok()?;
+    let unit_ms = match &text[split..] {
+        "ms" => 1,
+        "s" | "" => 1_000,
+        "m" => 60_000,
+        "h" => 3_600_000,
+        "d" => 86_400_000,
+        _ => return None,
+    };
+    number.checked_mul(unit_ms).map(Duration::from_millis)
+}
+
+/// A suggestion for a mistyped key: the setting that shares its first letters or contains it.
+fn nearest(key: &str) -> String {
+    let shared = |other: &str| key.bytes().zip(other.bytes()).take_while(|(a, b)| a == b).count();
+    let best = SETTINGS.iter().map(Setting::key).max_by_key(|other| shared(other));
+    match best {
+        Some(best) if shared(&best) >= 3 => format!("; {best} is the closest one"),
+        _ => String::new(),
+    }
+}
+
+/// Whether a database's URL has a password: `user:password@`, or in its query. A file's name may hold an `@`.
+fn has_password(url: &str) -> bool {
+    let Some(("postgres" | "postgresql", rest)) = url.split_once("://") else { return false };
+    let (place, query) = rest.split_once('?').unwrap_or((rest, ""));
+    let user = place.rsplit_once('@').map_or("", |(user, _)| user);
+    user.contains(':') || query.split('&').any(|pair| pair.starts_with("password="))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    pub(super) fn load(
+        flags: &[(&'static str, &str)],
+        env: &[(&str, &str)],
+        file: Option<&str>,
+    ) -> Result<Config, String> {
+        let directory = tempfile::tempdir().expect("temp dir");
+        let path = directory.path().join("taskd.toml");
+        if let Some(text) = file {
+            std::fs::write(&path, text).expect("written");
+        }
+        let flags = ServeFlags {
+            config: file.map(|_| path.clone()),
+            settings: flags.iter().map(|(key, text)| (*key, (*text).to_owned())).collect(),
+        };
+        let env = env.iter().map(|(name, value)| (OsString::from(name), OsString::from(value)));
+        let env = env.chain([(OsString::from("HOME"), OsString::from("/home/ada"))]);
+        Config::load(&flags, env).map_err(|error| error.to_string().replace(&path.display().to_string(), "taskd.toml"))
+    }
+
+    #[test]
+    fn flags_win_over_variables_over_the_file_over_defaults() {
+        let file = Some("http = \"127.0.0.1:1\"\nmqtt = \"127.0.0.1:1\"\ndata = \"/file\"\nassignment_expiry = \"2d\"");
+        let env = [("TASKD_HTTP", "127.0.0.1:2"), ("TASKD_MQTT", "127.0.0.1:2"), ("PATH", "/bin")];
+        let config = load(&[("http", "127.0.0.1:3")], &env, file).expect("loads");
+        assert_eq!((config.http.port(), config.mqtt.port()), (3, 2));
+        assert_eq!(config.data, PathBuf::from("/file"));
+        assert_eq!(config.assignment_expiry, Duration::from_secs(172_800));
+        assert_eq!(config.desired_lifetime, Duration::from_secs(30 * 86_400));
+        assert_eq!(load(&[], &[], None).expect("loads").data, PathBuf::from("/home/ada/.local/share/taskd"));
+    }
+
+    #[test]
+    fn what_is_unknown_or_wrong_is_refused_by_name() {
+        for (name, value, expected) in [
+            ("TASKD_HTPT", "x", "TASKD_HTPT: there is no such setting"),
+            ("TASKD_MQTTS", "x", "TASKD_MQTTS: there is no such setting; mqtt is the closest one"),
+            ("TASKD_HTTP", "x", "TASKD_HTTP: \"x\" is not an address"),
+        ] {
+            let message = load(&[], &[(name, value)], None).expect_err(expected);
+            assert!(message.starts_with(expected), "{message}");
+        }
+        for (file, expected) in [
+            ("htpt = 1", "htpt in taskd.toml: there is no such setting"),
+            ("[limits]\nx = 1", "limits in taskd.toml: there is no such setting"),
+            ("http = [1]", "http in taskd.toml: expected a text, a whole number or true or false, not an array"),
+            ("[delivery]\nqos = 3", "delivery.qos in taskd.toml: \"3\" is not a quality of service: 0, 1 or 2"),
+            ("[delivery]\npart_byts = 3", "delivery.part_byts in taskd.toml: there is no such setting; delivery_part_"),
+            ("[delivery]\nqos = [3]", "delivery.qos in taskd.toml: expected a text, a whole number"),
+            ("[transfers]\nmax = 0", "transfers.max in taskd.toml: \"0\" is not a whole number from 1"),
+            ("blob_read = \"sendfile\"", "blob_read in taskd.toml: \"sendfile\" is neither"),
+            ("assignment_expiry = \"0s\"", "assignment_expiry in taskd.toml: \"0s\" is not a time"),
+            ("http =", "taskd.toml is not valid TOML"),
+        ] {
+            let message = load(&[], &[], Some(file)).expect_err(expected);
+            assert!(message.starts_with(expected), "{message}");
+        }
+        let config = load(&[], &[("TASKD_SERVER", "http://x"), ("TASKD_TEST_POSTGRES", "x")], None);
+        assert!(config.is_ok());
+    }
+
+    #[test]
+    fn plain_text_beyond_loopback_must_be_allowed() {
+        let elsewhere = ("mqtt", "0.0.0.0:1883");
+        let message = load(&[elsewhere, ("tls-private-ca", "false")], &[], None).expect_err("refused");
+        assert!(message.starts_with("mqtt = 0.0.0.0:1883: unencrypted"), "{message}");
+        let encrypts = |flags: &[_], file| load(flags, &[], file).expect("allowed").encrypts();
+        let own = Some("[tls]\ncertificate = \"/etc/c.pem\"\nkey = \"/etc/k.pem\"");
+        assert!(!encrypts(&[], None));
+        assert!(encrypts(&[elsewhere], None));
+        assert!(!encrypts(&[elsewhere, ("allow-plaintext", "true")], None));
+        assert!(!encrypts(&[elsewhere, ("broker", "embedded"), ("allow-plaintext", "true")], None));
+        assert!(encrypts(&[("tls-private-ca", "true")], None));
+        assert!(encrypts(&[("allow-plaintext", "true")], own));
+        assert!(encrypts(&[("tls-private-ca", "false")], own));
+    }
+
+    #[test]
+    fn robots_are_told_the_pin_unless_there_is_an_own_certificate() {
+        let tells_pin = |file: &str| load(&[], &[], Some(file)).expect("loads").tls.tells_pin();
+        let own = "[tls]\ncertificate = \"/etc/c.pem\"\nkey = \"/etc/k.pem\"\n";
+        assert!(tells_pin("http = \"0.0.0.0:8080\""));
+        assert!(!tells_pin(own));
+        assert!(tells_pin(&format!("{own}private_ca = true")));
+        for (file, expected) in [
+            ("[tls]\ncertificate = \"c.pem\"", "tls.certificate: tls.key is missing"),
+            ("[tls]\nkey = \"k.pem\"", "tls.key: tls.certificate is missing"),
+            ("[tls]\nnames = \"a b\"", "tls.names in taskd.toml: \"a b\" is neither a host name nor an address"),
+            ("[tls]\nclient_certificates = true", "tls.client_certificates: robots can't show"),
+            ("[tls]\ncert = \"c.pem\"", "tls.cert in taskd.toml: there is no such setting"),
+        ] {
+            let message = load(&[], &[], Some(file)).expect_err(expected);
+            assert!(message.starts_with(expected), "{message}");
+        }
+        let names = load(&[("tls-names", "fleet.lab, 10.0.0.7")], &[], None).expect("loads").tls.names;
+        assert_eq!(names, ["fleet.lab", "10.0.0.7"]);
+    }
+
+    #[test]
+    fn an_external_broker_and_its_password_stay_out_of_sight() {
+        let url = "mqtt://taskd:swordfish@localhost:1884";
+        let config = load(&[], &[("TASKD_BROKER", url), ("TASKD_MQTT", "0.0.0.0:1883")], None).expect("loads");
+        assert!(!format!("{config:?}").contains("swordfish"));
+        assert_eq!(config.broker.expect("external").first().address(), "localhost:1884");
+        let back = load(&[("broker", "embedded")], &[("TASKD_BROKER", url)], None).expect("loads");
+        assert_eq!(back.broker, None);
+        let elsewhere = Some("broker = \"mqtt://taskd:swordfish@broker.lab\"");
+        for message in [
+            load(&[("broker", url)], &[], None).expect_err("readable by everybody"),
+            load(&[], &[("TASKD_BROKER", "tcp://taskd:swordfish@localhost")], None).expect_err("no such scheme"),
+            load(&[], &[], elsewhere).expect_err("readable on the way"),
+        ] {
+            assert!(message.contains("broker") || message.contains("BROKER"), "{message}");
+            assert!(!message.contains("swordfish"), "{message}");
+        }
+        assert!(load(&[("allow-plaintext", "true")], &[], elsewhere).is_ok());
+    }
+
+    #[test]
+    fn list_of_brokers_is_checked_as_a_whole() {
+        let both = "mqtt://taskd:swordfish@localhost:1884,mqtts://taskd:swordfish@broker.lab";
+        let config = load(&[], &[("TASKD_BROKER", both)], None).expect("loads");
+        assert_eq!(config.broker.expect("external").all().len(), 2);
+        let one_place = load(&[("public-mqtt-host", "wifi.lab")], &[("TASKD_BROKER", both)], None);
+        assert!(one_place.expect_err("one host for two").contains("public_mqtt_host"));
+        let plain = both.replace("mqtts", "mqtt");
+        let refused = load(&[], &[("TASKD_BROKER", &plain)], None).expect_err("readable on the way");
+        assert!(refused.contains("broker.lab:1883"), "{refused}");
+    }
+
+    #[test]
+    fn a_database_password_is_not_repeated() {
+        for (url, is_secret) in [
+            ("postgres://ada:secret@host/db", true),
+            ("postgresql://host/db?user=ada&password=secret", true),
+            ("postgres://ada@host/db?sslmode=require", false),
+            ("sqlite:///var/lib/a:b@c/taskd.sqlite", false),
+        ] {
+            assert_eq!(load(&[("database", url)], &[], None).is_err(), is_secret, "{url}");
+        }
+        let message = load(&[("database", "mysql://ada:secret@host/db")], &[], None).expect_err("refused");
+        assert!(!message.contains("secret"), "{message}");
+    }
+
+    #[test]
+    fn durations_have_units() {
+        for (text, ms) in [("250ms", 250), ("90s", 90_000), ("90", 90_000), ("2m", 120_000), ("1h", 3_600_000)] {
+            assert_eq!(parse_duration(text), Some(Duration::from_millis(ms)), "{text}");
+        }
+        for bad in ["", "s", "-1s", "1.5h", "1w", "99999999999999999999s", "18446744073709551615d"] {
+            assert_eq!(parse_duration(bad), None, "{bad}");
+        }
+    }
+}

@@ -1,0 +1,645 @@
+//! Which mechanism brings a package to a robot: rules, of which the first that matches decides. Functions of values;
+//! [`crate::orders::chooser`] gathers them, [`crate::config`] reads the operator's rules.
+
+use std::fmt;
+
+use serde::Serialize;
+use task_proto::api::{DeliveryChoice, DeliveryDecision, RuleView};
+use task_proto::desired::Delivery;
+
+/// The most rules an operator may write.
+pub const MAX_RULES: usize = 64;
+/// The rule's name where the operator chose the mechanism.
+pub const ORDERED: &str = "ordered";
+/// The rule's name where a robot that could not be kept up to date was told to pull.
+pub const FELL_BEHIND: &str = "fell behind";
+/// The name of the rule that decides when no other does.
+const OTHERWISE: &str = "otherwise";
+
+/// What is known when one robot's part of a deployment begins.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+pub struct Inputs {
+    /// Bytes of the package as they travel: content and config.
+    pub size: u64,
+    /// Those of them that this robot does not have.
+    pub lacking: u64,
+    /// Robots in the deployment.
+    pub robots: u64,
+    /// Robots that begin together with this one.
+    pub batch: u64,
+    /// Robots of the deployment on the same site, this one included; `None` where no rule asks.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub same_site: Option<u64>,
+    /// Whether it is connected over MQTT.
+    pub connected: bool,
+    /// Whether its bytes cost money: the label `metered=true`.
+    pub metered: bool,
+    /// Its link, as earlier transfers have shown; `None`: not measured.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub throughput_bytes_per_s: Option<u64>,
+    /// Likewise.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rtt_ms: Option<u64>,
+    /// Transfers that broke off in the last hour before it reported.
+    pub losses: u64,
+    /// Sessions lost in that hour.
+    pub reconnects: u64,
+    /// What is left of its battery; `None`: not reported.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub battery_percent: Option<u64>,
+    /// Transfers that the server serves now.
+    pub transfers: u64,
+    /// Bytes of parts that wait in the server for listeners to take them.
+    pub backlog: u64,
+}
+
+/// Something that is counted or measured.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Quantity {
+    /// [`Inputs::size`].
+    Size,
+    /// [`Inputs::lacking`].
+    Lacking,
+    /// [`Inputs::robots`].
+    Robots,
+    /// [`Inputs::batch`].
+    Batch,
+    /// [`Inputs::same_site`].
+    SameSite,
+    /// [`Inputs::throughput_bytes_per_s`].
+    Throughput,
+    /// [`Inputs::rtt_ms`].
+    Rtt,
+    /// [`Inputs::losses`].
+    Losses,
+    /// [`Inputs::reconnects`].
+    Reconnects,
+    /// [`Inputs::battery_percent`].
+    Battery,
+    /// [`Inputs::transfers`].
+    Transfers,
+    /// [`Inputs::backlog`].
+    Backlog,
+}
+
+/// In what a quantity is given and shown.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Unit {
+    /// `256 KB`; a KB is 1,024 bytes.
+    Bytes,
+    /// The same, each second.
+    BytesPerSecond,
+    /// `100 ms`.
+    Milliseconds,
+    /// 0 to 100.
+    Percent,
+    /// A plain number.
+    Count,
+}
+
+/// How a quantity is compared with a rule's value.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Comparison {
+    /// `>`
+    Above,
+    /// `≤`
+    AtMost,
+    /// `≥`
+    AtLeast,
+    /// `<`
+    Below,
+}
+
+/// Something that is so or not.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Flag {
+    /// [`Inputs::metered`].
+    Metered,
+    /// [`Inputs::connected`].
+    Connected,
+}
+
+/// What a rule asks for. What is not known satisfies no condition.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Condition {
+    /// A quantity lies on one side of a value.
+    Measure(Quantity, Comparison, u64),
+    /// Something is so, or is not.
+    Flag(Flag, bool),
+}
+
+/// If all conditions hold, this mechanism.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Rule {
+    /// What it is called where a decision is shown.
+    pub name: String,
+    /// What must hold; nothing: it always decides.
+    pub conditions: Vec<Condition>,
+    /// What is used then.
+    pub mechanism: Delivery,
+}
+
+/// All rules: the operator's, then the built-in ones. The last resort is to push the link and let the robot pull.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Rules(Vec<Rule>);
+
+impl Rules {
+    /// `own` rules before the built-in ones. No rule puts more than `inline_bytes` into an announcement.
+    pub fn new(own: Vec<Rule>, inline_bytes: u64) -> Self {
+        let mut rules: Vec<Rule> = own.into_iter().chain(Self::built_in()).collect();
+        for rule in rules.iter_mut().filter(|rule| rule.mechanism == Delivery::Inline) {
+            rule.conditions.push(Condition::Measure(Quantity::Size, Comparison::AtMost, inline_bytes));
+        }
+        Self(rules)
+    }
+
+    /// The rules that hold after the operator's: nothing was measured to be faster or cheaper than these and the last resort,
+    /// see docs/delivery.md.
+    pub fn built_in() -> Vec<Rule> {
+        // The announcement's size, which is the setting, is added to its conditions.
+        vec![Rule { name: "tiny".to_owned(), conditions: Vec::new(), mechanism: Delivery::Inline }]
+    }
+
+    /// All of them in their order, in words, with the last resort.
+    pub fn views(&self) -> Vec<RuleView> {
+        let said = |rule: &Rule| rule.conditions.iter().map(Condition::words).collect::<Vec<_>>().join(", ");
+        let last = Rule { name: OTHERWISE.to_owned(), conditions: Vec::new(), mechanism: Delivery::PushPull };
+        let view = |(order, rule): (u64, &Rule)| RuleView {
+            order,
+            name: rule.name.clone(),
+            condition: said(rule),
+            mechanism: rule.mechanism,
+            own: !Self::is_reserved(&rule.name),
+        };
+        (1..).zip(self.0.iter().chain([&last])).map(view).collect()
+    }
+
+    /// Whether `name` is taken by a rule that the operator did not write.
+    pub fn is_reserved(name: &str) -> bool {
+        [ORDERED, FELL_BEHIND, OTHERWISE].contains(&name) || Self::built_in().iter().any(|rule| rule.name == name)
+    }
+
+    /// Whether any rule asks for `quantity`.
+    pub fn ask_for(&self, quantity: Quantity) -> bool {
+        let asks = |condition: &Condition| matches!(condition, Condition::Measure(asked, ..) if *asked == quantity);
+        self.0.iter().any(|rule| rule.conditions.iter().any(asks))
+    }
+}
+
+/// How the bytes travel to a robot of which `inputs` are known, where `choice` was ordered.
+pub fn choose(rules: &Rules, choice: DeliveryChoice, inputs: &Inputs) -> DeliveryDecision {
+    if let Some(mechanism) = choice.mechanism() {
+        let because = format!("the order says {mechanism}");
+        return DeliveryDecision { mechanism, rule: ORDERED.to_owned(), because };
+    }
+    let matching = rules.0.iter().position(|rule| rule.conditions.iter().all(|condition| condition.holds(inputs)));
+    let (before, name, mechanism, conditions) = match matching {
+        Some(at) => {
+            let rule = &rules.0[at];
+            (&rules.0[..at], rule.name.as_str(), rule.mechanism, rule.conditions.as_slice())
+        }
+        None => (rules.0.as_slice(), OTHERWISE, Delivery::PushPull, &[][..]),
+    };
+    let decisive: Vec<Condition> =
+        if conditions.is_empty() { in_the_way(before, mechanism, inputs) } else { conditions.to_vec() };
+    let said: Vec<String> = decisive.iter().map(|condition| condition.said_of(inputs)).collect();
+    let because = if said.is_empty() { "it has no condition".to_owned() } else { said.join(", ") };
+    DeliveryDecision { mechanism, rule: name.to_owned(), because }
+}
+
+/// What kept the rules before from choosing something else than `mechanism`: of each its first condition that does not
+/// hold, of conditions about the same thing the last.
+fn in_the_way(before: &[Rule], mechanism: Delivery, inputs: &Inputs) -> Vec<Condition> {
+    let mut found: Vec<Condition> = Vec::new();
+    for rule in before.iter().filter(|rule| rule.mechanism != mechanism) {
+        if let Some(failed) = rule.conditions.iter().find(|condition| !condition.holds(inputs)) {
+            found.retain(|earlier| earlier.subject() != failed.subject());
+            found.push(*failed);
+        }
+    }
+    found
+}
+
+impl Condition {
+    /// Every condition there is, by its key in the configuration; those of quantities without their value.
+    pub fn by_key(key: &str) -> Option<ConditionKey> {
+        if let Some(flag) = Flag::ALL.into_iter().find(|flag| flag.name() == key) {
+            return Some(ConditionKey::Flag(flag));
+        }
+        Comparison::ALL.into_iter().find_map(|comparison| {
+            let quantity = key.strip_suffix(comparison.word())?.strip_suffix('_')?;
+            let quantity = Quantity::ALL.into_iter().find(|known| known.key() == quantity)?;
+            Some(ConditionKey::Measure(quantity, comparison))
+        })
+    }
+
+    /// Whether it holds.
+    pub fn holds(&self, inputs: &Inputs) -> bool {
+        match *self {
+            Self::Measure(quantity, comparison, value) => {
+                quantity.of(inputs).is_some_and(|found| comparison.holds(found, value))
+            }
+            Self::Flag(flag, wanted) => flag.of(inputs) == wanted,
+        }
+    }
+
+    /// How things stand with it, whether it holds or not: `size 9.7 MB > 256 KB`.
+    fn said_of(&self, inputs: &Inputs) -> String {
+        match *self {
+            Self::Measure(quantity, comparison, value) => {
+                let Some(found) = quantity.of(inputs) else { return format!("{} not known", quantity.shown()) };
+                let said = if comparison.holds(found, value) { comparison } else { comparison.opposite() };
+                let (mut left, mut right) = (quantity.unit().show(found), quantity.unit().show(value));
+                if left == right && found != value {
+                    (left, right) = (format!("{found} B"), format!("{value} B"));
+                }
+                format!("{} {left} {} {right}", quantity.shown(), said.sign())
+            }
+            Self::Flag(flag, _) if flag.of(inputs) => flag.name().to_owned(),
+            Self::Flag(flag, _) => format!("not {}", flag.name()),
+        }
+    }
+
+    /// What it asks for: `size ≤ 256 KB`.
+    fn words(&self) -> String {
+        match *self {
+            Self::Measure(quantity, comparison, value) => {
+                format!("{} {} {}", quantity.shown(), comparison.sign(), quantity.unit().show(value))
+            }
+            Self::Flag(flag, true) => flag.name().to_owned(),
+            Self::Flag(flag, false) => format!("not {}", flag.name()),
+        }
+    }
+
+    fn subject(&self) -> &'static str {
+        match self {
+            Self::Measure(quantity, ..) => quantity.key(),
+            Self::Flag(flag, _) => flag.name(),
+        }
+    }
+}
+
+/// A condition whose value is still to be read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ConditionKey {
+    /// It needs a value in the quantity's unit.
+    Measure(Quantity, Comparison),
+    /// It needs true or false.
+    Flag(Flag),
+}
+
+impl Quantity {
+    /// All of them.
+    pub const ALL: [Self; 12] = [
+        Self::Size,
+        Self::Lacking,
+        Self::Robots,
+        Self::Batch,
+        Self::SameSite,
+        Self::Throughput,
+        Self::Rtt,
+        Self::Losses,
+        Self::Reconnects,
+        Self::Battery,
+        Self::Transfers,
+        Self::Backlog,
+    ];
+
+    /// What its keys in the configuration begin with.
+    pub fn key(self) -> &'static str {
+        match self {
+            Self::Size => "size",
+            Self::Lacking => "lacking",
+            Self::Robots => "robots",
+            Self::Batch => "batch",
+            Self::SameSite => "same_site",
+            Self::Throughput => "throughput",
+            Self::Rtt => "rtt",
+            Self::Losses => "losses",
+            Self::Reconnects => "reconnects",
+            Self::Battery => "battery",
+            Self::Transfers => "transfers",
+            Self::Backlog => "backlog",
+        }
+    }
+
+    fn shown(self) -> &'static str {
+        if self == Self::SameSite { "robots on site" } else { self.key() }
+    }
+
+    /// In what its values are given.
+    pub fn unit(self) -> Unit {
+        match self {
+            Self::Size | Self::Lacking | Self::Backlog => Unit::Bytes,
+            Self::Throughput => Unit::BytesPerSecond,
+            Self::Rtt => Unit::Milliseconds,
+            Self::Battery => Unit::Percent,
+            Self::Robots | Self::Batch | Self::SameSite | Self::Losses | Self::Reconnects | Self::Transfers => {
+                Unit::Count
+            }
+        }
+    }
+
+    fn of(self, inputs: &Inputs) -> Option<u64> {
+        match self {
+            Self::Size => Some(inputs.size),
+            Self::Lacking => Some(inputs.lacking),
+            Self::Robots => Some(inputs.robots),
+            Self::Batch => Some(inputs.batch),
+            Self::SameSite => inputs.same_site,
+            Self::Throughput => inputs.throughput_bytes_per_s,
+            Self::Rtt => inputs.rtt_ms,
+            Self::Losses => Some(inputs.losses),
+            Self::Reconnects => Some(inputs.reconnects),
+            Self::Battery => inputs.battery_percent,
+            Self::Transfers => Some(inputs.transfers),
+            Self::Backlog => Some(inputs.backlog),
+        }
+    }
+}
+
+impl Unit {
+    /// A value as people read it.
+    pub fn show(self, value: u64) -> String {
+        match self {
+            Self::Bytes => shown_bytes(value),
+            Self::BytesPerSecond => format!("{}/s", shown_bytes(value)),
+            Self::Milliseconds => format!("{value} ms"),
+            Self::Percent => format!("{value}%"),
+            Self::Count => value.to_string(),
+        }
+    }
+}
+
+/// Bytes in the units in which the configuration gives them: `9.7 MB`.
+pub fn shown_bytes(bytes: u64) -> String {
+    let units = [(1u64 << 30, "GB"), (1 << 20, "MB"), (1 << 10, "KB")];
+    let Some((one, unit)) = units.into_iter().find(|(one, _)| bytes >= *one) else { return format!("{bytes} B") };
+    let tenths = (u128::from(bytes) * 10 + u128::from(one) / 2) / u128::from(one);
+    if tenths.is_multiple_of(10) || tenths >= 1000 {
+        format!("{} {unit}", tenths / 10)
+    } else {
+        format!("{}.{} {unit}", tenths / 10, tenths % 10)
+    }
+}
+
+impl Comparison {
+    /// All of them.
+    pub const ALL: [Self; 4] = [Self::Above, Self::AtMost, Self::AtLeast, Self::Below];
+
+    /// What a key in the configuration ends in.
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::Above => "above",
+            Self::AtMost => "at_most",
+            Self::AtLeast => "at_least",
+            Self::Below => "below",
+        }
+    }
+
+    /// The least and the most that satisfy it; `None`: nothing does.
+    pub fn range(self, value: u64) -> Option<(u64, u64)> {
+        match self {
+            Self::Above => Some((value.checked_add(1)?, u64::MAX)),
+            Self::AtMost => Some((0, value)),
+            Self::AtLeast => Some((value, u64::MAX)),
+            Self::Below => Some((0, value.checked_sub(1)?)),
+        }
+    }
+
+    fn holds(self, found: u64, value: u64) -> bool {
+        self.range(value).is_some_and(|(least, most)| (least..=most).contains(&found))
+    }
+
+    fn opposite(self) -> Self {
+        match self {
+            Self::Above => Self::AtMost,
+            Self::AtMost => Self::Above,
+            Self::AtLeast => Self::Below,
+            Self::Below => Self::AtLeast,
+        }
+    }
+
+    fn sign(self) -> &'static str {
+        match self {
+            Self::Above => ">",
+            Self::AtMost => "≤",
+            Self::AtLeast => "≥",
+            Self::Below => "<",
+        }
+    }
+}
+
+impl Flag {
+    /// All of them.
+    pub const ALL: [Self; 2] = [Self::Metered, Self::Connected];
+
+    /// Its key in the configuration.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Metered => "metered",
+            Self::Connected => "connected",
+        }
+    }
+
+    fn of(self, inputs: &Inputs) -> bool {
+        match self {
+            Self::Metered => inputs.metered,
+            Self::Connected => inputs.connected,
+        }
+    }
+}
+
+impl fmt::Display for ConditionKey {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Measure(quantity, comparison) => write!(f, "{}_{}", quantity.key(), comparison.word()),
+            Self::Flag(flag) => f.write_str(flag.name()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    const KB: u64 = 1 << 10;
+    const MB: u64 = 1 << 20;
+
+    fn rule(name: &str, conditions: &[(&str, u64)], mechanism: Delivery) -> Rule {
+        let condition = |(key, value): &(&str, u64)| match Condition::by_key(key).expect(key) {
+            ConditionKey::Measure(quantity, comparison) => Condition::Measure(quantity, comparison, *value),
+            ConditionKey::Flag(flag) => Condition::Flag(flag, *value == 1),
+        };
+        Rule { name: name.to_owned(), conditions: conditions.iter().map(condition).collect(), mechanism }
+    }
+
+    fn decided(own: &[Rule], inputs: Inputs) -> (Delivery, String, String) {
+        let decision = choose(&Rules::new(own.to_vec(), 32 * KB), DeliveryChoice::Adaptive, &inputs);
+        (decision.mechanism, decision.rule, decision.because)
+    }
+
+    /// What the condition `key` with `value` says of inputs that satisfy it, and of some that do not.
+    #[track_caller]
+    fn check(key: &str, value: u64, yes: Inputs, because: &str, no: Inputs) {
+        let own = [rule("own", &[(key, value)], Delivery::Poll)];
+        assert_eq!(decided(&own, yes), (Delivery::Poll, "own".to_owned(), because.to_owned()));
+        assert_ne!(decided(&own, no).1, "own", "{key}");
+    }
+
+    #[test]
+    fn every_condition_decides_and_says_so() {
+        let of = Inputs::default;
+        check(
+            "size_above",
+            256 * KB,
+            Inputs { size: 97 * MB / 10, ..of() },
+            "size 9.7 MB > 256 KB",
+            Inputs { size: 256 * KB, ..of() },
+        );
+        check(
+            "size_at_most",
+            2 * MB,
+            Inputs { size: 2 * MB, ..of() },
+            "size 2 MB ≤ 2 MB",
+            Inputs { size: 2 * MB + 1, ..of() },
+        );
+        check(
+            "lacking_at_most",
+            10,
+            Inputs { lacking: 0, ..of() },
+            "lacking 0 B ≤ 10 B",
+            Inputs { lacking: 11, ..of() },
+        );
+        check("robots_at_least", 8, Inputs { robots: 40, ..of() }, "robots 40 ≥ 8", Inputs { robots: 7, ..of() });
+        check("batch_at_least", 8, Inputs { batch: 8, ..of() }, "batch 8 ≥ 8", Inputs { batch: 7, robots: 9, ..of() });
+        let on_site = |robots| Inputs { same_site: Some(robots), ..of() };
+        check("same_site_at_least", 3, on_site(4), "robots on site 4 ≥ 3", on_site(2));
+        let carrying = |rate| Inputs { throughput_bytes_per_s: rate, ..of() };
+        check("throughput_below", MB, carrying(Some(MB / 2)), "throughput 512 KB/s < 1 MB/s", carrying(Some(MB)));
+        check("throughput_below", MB, carrying(Some(0)), "throughput 0 B/s < 1 MB/s", carrying(None));
+        let away = |rtt_ms| Inputs { rtt_ms, ..of() };
+        check("rtt_above", 100, away(Some(120)), "rtt 120 ms > 100 ms", away(Some(100)));
+        check("rtt_above", 100, away(Some(101)), "rtt 101 ms > 100 ms", away(None));
+        check("losses_above", 2, Inputs { losses: 3, ..of() }, "losses 3 > 2", Inputs { losses: 2, ..of() });
+        check(
+            "reconnects_above",
+            5,
+            Inputs { reconnects: 6, ..of() },
+            "reconnects 6 > 5",
+            Inputs { reconnects: 5, ..of() },
+        );
+        check("metered", 1, Inputs { metered: true, ..of() }, "metered", of());
+        check("metered", 0, of(), "not metered", Inputs { metered: true, ..of() });
+        check("connected", 0, of(), "not connected", Inputs { connected: true, ..of() });
+        check("connected", 1, Inputs { connected: true, ..of() }, "connected", of());
+        let charged = |battery_percent| Inputs { battery_percent, ..of() };
+        check("battery_below", 20, charged(Some(15)), "battery 15% < 20%", charged(Some(20)));
+        check("battery_below", 20, charged(Some(0)), "battery 0% < 20%", charged(None));
+        check(
+            "transfers_at_least",
+            16,
+            Inputs { transfers: 16, ..of() },
+            "transfers 16 ≥ 16",
+            Inputs { transfers: 15, ..of() },
+        );
+        check(
+            "backlog_at_least",
+            100,
+            Inputs { backlog: 200, ..of() },
+            "backlog 200 B ≥ 100 B",
+            Inputs { backlog: 99, ..of() },
+        );
+    }
+
+    #[test]
+    fn every_quantity_has_every_comparison() {
+        for quantity in Quantity::ALL {
+            for comparison in Comparison::ALL {
+                let key = ConditionKey::Measure(quantity, comparison);
+                assert_eq!(Condition::by_key(&key.to_string()), Some(key));
+            }
+        }
+        for unknown in ["", "size", "size_", "_above", "size_over", "sizeabove", "weather_above", "metered_above"] {
+            assert_eq!(Condition::by_key(unknown), None, "{unknown}");
+        }
+    }
+
+    /// The built-in rules one by one, as docs/delivery.md shows them.
+    #[test]
+    fn the_built_in_rules_decide() {
+        let expect = |size, mechanism, rule: &str, because: &str| {
+            let inputs = Inputs { size, batch: 40, robots: 40, connected: true, ..Inputs::default() };
+            assert_eq!(decided(&[], inputs), (mechanism, rule.to_owned(), because.to_owned()));
+        };
+        expect(20 * KB, Delivery::Inline, "tiny", "size 20 KB ≤ 32 KB");
+        expect(10_171_187, Delivery::PushPull, "otherwise", "size 9.7 MB > 32 KB");
+    }
+
+    #[test]
+    fn the_first_rule_that_matches_wins() {
+        let own = [
+            rule("far and slow", &[("rtt_above", 100), ("throughput_below", MB)], Delivery::Poll),
+            rule("far", &[("rtt_above", 100)], Delivery::DirectPush),
+            rule("all others", &[], Delivery::PushPull),
+        ];
+        let far = Inputs { size: 1, rtt_ms: Some(150), ..Inputs::default() };
+        let slow = Inputs { throughput_bytes_per_s: Some(KB), ..far };
+        assert_eq!(decided(&own, slow).1, "far and slow");
+        assert_eq!(decided(&own, slow).2, "rtt 150 ms > 100 ms, throughput 1 KB/s < 1 MB/s");
+        assert_eq!(decided(&own, far).1, "far");
+        let because = "rtt not known".to_owned();
+        assert_eq!(decided(&own, Inputs::default()), (Delivery::PushPull, "all others".to_owned(), because));
+        let only = [rule("all", &[], Delivery::Poll)];
+        assert_eq!(decided(&only, far), (Delivery::Poll, "all".to_owned(), "it has no condition".to_owned()));
+    }
+
+    #[test]
+    fn no_rule_makes_an_announcement_too_large() {
+        let own = [rule("always inside", &[("robots_at_least", 1)], Delivery::Inline)];
+        let inputs = Inputs { size: 32 * KB, robots: 1, ..Inputs::default() };
+        assert_eq!(decided(&own, inputs).1, "always inside");
+        let decision = decided(&own, Inputs { size: 32 * KB + 1, ..inputs });
+        assert_eq!((decision.0, decision.1.as_str()), (Delivery::PushPull, "otherwise"));
+        assert_eq!(decision.2, "size 32769 B > 32768 B");
+    }
+
+    #[test]
+    fn what_the_operator_ordered_is_not_discussed() {
+        let rules = Rules::new(Vec::new(), 32 * KB);
+        let decision = choose(&rules, DeliveryChoice::DirectPush, &Inputs { metered: true, ..Inputs::default() });
+        assert_eq!((decision.mechanism, decision.rule.as_str()), (Delivery::DirectPush, "ordered"));
+        assert_eq!(decision.because, "the order says direct-push");
+    }
+
+    #[test]
+    fn bytes_are_shown_in_the_units_of_the_configuration() {
+        let shown = [0, 1023, 1024, 1536, 256 * KB, 10_171_187, 100 * MB + 52_429, u64::MAX].map(shown_bytes);
+        assert_eq!(shown, ["0 B", "1023 B", "1 KB", "1.5 KB", "256 KB", "9.7 MB", "100 MB", "17179869184 GB"]);
+    }
+
+    proptest! {
+        /// A comparison and its opposite share nothing and leave nothing out.
+        #[test]
+        fn a_comparison_or_its_opposite_holds(found in any::<u64>(), value in any::<u64>(), near in 0u64..3) {
+            for value in [value, found.saturating_add(near), found.saturating_sub(near)] {
+                for comparison in Comparison::ALL {
+                    prop_assert_ne!(comparison.holds(found, value), comparison.opposite().holds(found, value));
+                }
+            }
+        }
+
+        #[test]
+        fn whatever_is_known_something_is_chosen_and_a_reason_given(
+            size in 0u64..1_000_000, batch in 0u64..20, losses in 0u64..5, metered in any::<bool>(), connected in any::<bool>(),
+        ) {
+            let inputs = Inputs { size, batch, losses, metered, connected, ..Inputs::default() };
+            let (mechanism, rule, because) = decided(&[], inputs);
+            prop_assert!(!because.is_empty() && !rule.is_empty());
+            prop_assert!(mechanism != Delivery::Inline || size <= 32 * KB);
+            prop_assert!(matches!(mechanism, Delivery::Inline | Delivery::PushPull));
+        }
+    }
+}

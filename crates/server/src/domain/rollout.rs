@@ -1,0 +1,275 @@
+//! When a deployment's next batch begins, and when it pauses. Functions of values; [`crate::orders::advance`] carries it out.
+//!
+//! A batched rollout waits for robots that can act. A robot that is offline when its turn comes keeps
+//! its place and is passed over until it is back. A robot that goes offline after its batch began is
+//! waited for during [`OFFLINE_GRACE_MS`] or, where it has begun to work on the package, during
+//! [`LOST_AFTER_MS`]. After that time the rollout goes on without it. A robot that was lost while it worked
+//! on the package counts as a failure until it is back, so that a package that takes robots off
+//! the network stops at `max_failures`.
+
+/// How long a robot that has not begun may be offline before its batch goes on without it: a
+/// reconnect or the restart of the agent takes less.
+pub const OFFLINE_GRACE_MS: u64 = 60_000;
+/// How long a robot that has begun to work on the package may be offline before it counts as lost:
+/// a reboot takes less.
+pub const LOST_AFTER_MS: u64 = 10 * 60_000;
+
+/// What the order said about its pace, and what has been decided since.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Rollout {
+    /// Robots at a time; `None`: all at once.
+    pub batch: Option<u64>,
+    /// Failures it bears; `None`: any number.
+    pub max_failures: Option<u64>,
+    /// Failures that the operator has forgiven by resuming it.
+    pub forgiven: u64,
+    /// Whether it waits for the operator.
+    pub paused: bool,
+}
+
+/// Where a robot stands whose assignment has not settled.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Standing {
+    /// Its batch has not begun.
+    Waiting,
+    /// Its batch has begun, and the robot has not begun to work on the package.
+    Released,
+    /// The robot works on the package.
+    Begun,
+}
+
+/// What the rollout makes of a robot whose assignment has not settled.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Part {
+    /// It may begin with the next batch.
+    Ready,
+    /// It is offline: it begins when it is back.
+    Offline,
+    /// The next batch waits for it.
+    Busy,
+    /// It went offline while it worked on the package, and stays away.
+    Lost,
+    /// Nothing waits for it.
+    Ignored,
+}
+
+impl Part {
+    /// The part of a robot that has been offline for `offline_ms`; `None`: it is online.
+    pub fn of(standing: Standing, offline_ms: Option<u64>) -> Self {
+        match (standing, offline_ms) {
+            (Standing::Waiting, None) => Self::Ready,
+            (Standing::Waiting, Some(_)) => Self::Offline,
+            (Standing::Released, Some(OFFLINE_GRACE_MS..)) => Self::Ignored,
+            (Standing::Begun, Some(LOST_AFTER_MS..)) => Self::Lost,
+            (Standing::Released | Standing::Begun, _) => Self::Busy,
+        }
+    }
+}
+
+/// How many of its robots have which part.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Tally {
+    /// Online, and their batch has not begun.
+    pub ready: u64,
+    /// Offline, and their batch has not begun.
+    pub offline: u64,
+    /// Released, not settled, and waited for.
+    pub busy: u64,
+    /// Lost while they worked on the package.
+    pub lost: u64,
+    /// Settled by failing.
+    pub failed: u64,
+}
+
+impl Tally {
+    /// Counts the robots that have not settled, beside those that have failed.
+    pub fn of(failed: u64, parts: impl IntoIterator<Item = Part>) -> Self {
+        let mut tally = Self { failed, ..Self::default() };
+        for part in parts {
+            match part {
+                Part::Ready => tally.ready += 1,
+                Part::Offline => tally.offline += 1,
+                Part::Busy => tally.busy += 1,
+                Part::Lost => tally.lost += 1,
+                Part::Ignored => {}
+            }
+        }
+        tally
+    }
+
+    /// Failures as `max_failures` counts them.
+    pub fn failures(&self) -> u64 {
+        self.failed + self.lost
+    }
+}
+
+/// What to do next.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Move {
+    /// Nothing, until something settles, a robot comes or goes, or the operator resumes it.
+    Wait,
+    /// Begin a batch of so many robots: those that are ready or, without batches, all that are left.
+    Release(u64),
+    /// Only offline robots are left: let their time run.
+    AwaitOffline,
+    /// Too many have failed: begin no more.
+    Pause,
+}
+
+/// The next move of a rollout.
+pub fn next_move(rollout: &Rollout, tally: &Tally) -> Move {
+    let waiting = tally.ready + tally.offline;
+    if rollout.paused || waiting == 0 {
+        return Move::Wait;
+    }
+    let failures = tally.failures().saturating_sub(rollout.forgiven);
+    if rollout.max_failures.is_some_and(|most| failures > most) {
+        return Move::Pause;
+    }
+    match rollout.batch {
+        None => Move::Release(waiting),
+        Some(_) if tally.busy > 0 => Move::Wait,
+        Some(_) if tally.ready == 0 => Move::AwaitOffline,
+        Some(batch) => Move::Release(batch.clamp(1, tally.ready)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    /// A robot of the model: how it ends, and when it is offline.
+    #[derive(Debug, Clone)]
+    struct Robot {
+        fails: bool,
+        /// Offline from the first time until the second, in minutes.
+        offline: Option<(u64, u64)>,
+        standing: Standing,
+        has_settled: bool,
+    }
+
+    fn any_robot() -> impl Strategy<Value = Robot> {
+        let offline = proptest::option::of((0u64..60, 1u64..120).prop_map(|(from, minutes)| (from, from + minutes)));
+        (any::<bool>(), offline).prop_map(|(fails, offline)| Robot {
+            fails,
+            offline,
+            standing: Standing::Waiting,
+            has_settled: false,
+        })
+    }
+
+    impl Robot {
+        fn offline_ms(&self, minute: u64) -> Option<u64> {
+            self.offline
+                .filter(|(from, until)| (*from..*until).contains(&minute))
+                .map(|(from, _)| (minute - from) * 60_000)
+        }
+
+        fn part(&self, minute: u64) -> Option<Part> {
+            (!self.has_settled).then(|| Part::of(self.standing, self.offline_ms(minute)))
+        }
+    }
+
+    fn tally(robots: &[Robot], minute: u64) -> Tally {
+        let failed = robots.iter().filter(|robot| robot.has_settled && robot.fails).count() as u64;
+        Tally::of(failed, robots.iter().filter_map(|robot| robot.part(minute)))
+    }
+
+    proptest! {
+        /// A whole rollout, minute by minute: each robot that is online takes a step.
+        #[test]
+        fn batches_of_online_robots_never_overlap_and_failures_stop_them(
+            mut robots in proptest::collection::vec(any_robot(), 1..40),
+            batch in proptest::option::of(1u64..9),
+            max_failures in proptest::option::of(0u64..6),
+        ) {
+            let mut rollout = Rollout { batch, max_failures, forgiven: 0, paused: false };
+            // All are back for good after three hours, and a batch of one takes two minutes and at most ten of waiting.
+            for minute in 0..(180 + 12 * robots.len() as u64) {
+                loop {
+                    let now = tally(&robots, minute);
+                    match next_move(&rollout, &now) {
+                        Move::Release(count) => {
+                            prop_assert!(count >= 1 && max_failures.is_none_or(|most| now.failures() <= most));
+                            prop_assert!(batch.is_none_or(|batch| now.busy == 0 && count <= batch.min(now.ready)));
+                            let waiting = robots.iter_mut().filter(|robot| match batch {
+                                Some(_) => robot.part(minute) == Some(Part::Ready),
+                                None => !robot.has_settled,
+                            });
+                            waiting.take(count as usize).for_each(|robot| robot.standing = Standing::Released);
+                        }
+                        Move::Pause => {
+                            prop_assert!(max_failures.is_some_and(|most| now.failures() > most));
+                            rollout.paused = true;
+                        }
+                        Move::AwaitOffline => {
+                            prop_assert!(now.busy == 0 && now.ready == 0 && now.offline > 0);
+                            break;
+                        }
+                        Move::Wait => {
+                            prop_assert!(rollout.paused || now.busy > 0 || now.ready + now.offline == 0);
+                            break;
+                        }
+                    }
+                }
+                for robot in &mut robots {
+                    match robot.standing {
+                        _ if robot.has_settled || robot.offline_ms(minute).is_some() => {}
+                        Standing::Waiting => {}
+                        Standing::Released => robot.standing = Standing::Begun,
+                        Standing::Begun => robot.has_settled = true,
+                    }
+                }
+            }
+            // It ends only when all have had their turn, or it was paused.
+            prop_assert!(rollout.paused || robots.iter().all(|robot| robot.has_settled));
+        }
+
+        /// However long the others stay away, those that are online have their turn within the hour that the absence of
+        /// one batch can cost.
+        #[test]
+        fn offline_robots_never_hold_back_the_others(absent in 1u64..50, online in 1u64..50, batch in 1u64..9) {
+            let rollout = Rollout { batch: Some(batch), max_failures: Some(0), forgiven: 0, paused: false };
+            let tally = Tally { ready: online, offline: absent, ..Tally::default() };
+            prop_assert_eq!(next_move(&rollout, &tally), Move::Release(batch.min(online)));
+            prop_assert_eq!(next_move(&rollout, &Tally { ready: 0, ..tally }), Move::AwaitOffline);
+        }
+    }
+
+    #[test]
+    fn a_robot_is_waited_for_until_it_is_away_for_long() {
+        use Standing::{Begun, Released, Waiting};
+        let cases = [
+            (Waiting, None, Part::Ready),
+            (Waiting, Some(0), Part::Offline),
+            (Released, None, Part::Busy),
+            (Released, Some(OFFLINE_GRACE_MS - 1), Part::Busy),
+            (Released, Some(OFFLINE_GRACE_MS), Part::Ignored),
+            (Begun, None, Part::Busy),
+            (Begun, Some(LOST_AFTER_MS - 1), Part::Busy),
+            (Begun, Some(LOST_AFTER_MS), Part::Lost),
+        ];
+        for (standing, offline_ms, part) in cases {
+            assert_eq!(Part::of(standing, offline_ms), part, "{standing:?}, {offline_ms:?}");
+        }
+    }
+
+    #[test]
+    fn a_lost_robot_counts_as_a_failure() {
+        let rollout = Rollout { batch: Some(2), max_failures: Some(0), forgiven: 0, paused: false };
+        let tally = Tally { ready: 5, lost: 1, ..Tally::default() };
+        assert_eq!(next_move(&rollout, &tally), Move::Pause);
+        assert_eq!(next_move(&Rollout { max_failures: Some(1), ..rollout }, &tally), Move::Release(2));
+        assert_eq!(next_move(&Rollout { max_failures: None, ..rollout }, &tally), Move::Release(2));
+    }
+
+    #[test]
+    fn a_resumed_rollout_bears_as_many_failures_again() {
+        let rollout = Rollout { batch: Some(2), max_failures: Some(1), forgiven: 2, paused: false };
+        let tally = Tally { ready: 5, failed: 3, ..Tally::default() };
+        assert_eq!(next_move(&rollout, &tally), Move::Release(2));
+        assert_eq!(next_move(&rollout, &Tally { failed: 4, ..tally }), Move::Pause);
+    }
+}

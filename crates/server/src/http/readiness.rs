@@ -1,0 +1,203 @@
+//! Whether the server can do its work. One background job checks the parts that it needs and keeps the last verdict on each;
+//! `/readyz` only reads the verdicts, so a request costs nothing, however many come. Other jobs add components of their own.
+
+use std::collections::BTreeMap;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use tokio::task::JoinHandle;
+use tokio::time::{MissedTickBehavior, interval, timeout};
+use tokio_util::sync::CancellationToken;
+
+use crate::broker::{Broker, Health};
+use crate::store::Store;
+use crate::system::data_directory::room;
+
+/// Time between two checks of the database and the disk.
+const CHECK_INTERVAL: Duration = Duration::from_secs(5);
+/// How long one component may take to answer.
+const PATIENCE: Duration = Duration::from_secs(5);
+/// A file system with less room than this is full.
+const LEAST_FREE_BYTES: u64 = 16 << 20;
+/// On a small file system it is this share.
+const LEAST_FREE_SHARE: u64 = 64;
+
+/// A part that the server cannot work without.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Component {
+    /// The database answers.
+    Database,
+    /// The MQTT broker serves.
+    Broker,
+    /// The data directory can be written.
+    Disk,
+}
+
+impl Component {
+    /// The component's key in the answer of `/readyz`.
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Self::Database => "database",
+            Self::Broker => "broker",
+            Self::Disk => "disk",
+        }
+    }
+}
+
+/// The last verdict on each component: `None` where it is well, otherwise the problem. Clones share the verdicts.
+#[derive(Debug, Clone, Default)]
+pub struct Readiness(Arc<Mutex<BTreeMap<Component, Option<String>>>>);
+
+impl Readiness {
+    /// Replaces the verdict on a component.
+    pub fn set(&self, component: Component, problem: Option<String>) {
+        self.lock().insert(component, problem);
+    }
+
+    /// The verdicts on all components that were checked.
+    pub fn verdicts(&self) -> BTreeMap<Component, Option<String>> {
+        self.lock().clone()
+    }
+
+    fn lock(&self) -> MutexGuard<'_, BTreeMap<Component, Option<String>>> {
+        // Every change under this lock is one insertion.
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// The job that checks database, broker and disk.
+pub struct ReadinessCheck {
+    /// Where the verdicts go.
+    pub readiness: Readiness,
+    /// The database.
+    pub store: Store,
+    /// The MQTT broker.
+    pub broker: Broker,
+    /// The data directory.
+    pub disk: DiskProbe,
+}
+
+impl ReadinessCheck {
+    /// Checks everything once.
+    pub async fn check(&mut self) {
+        let (database, disk) = tokio::join!(timeout(PATIENCE, self.store.ping()), self.disk.problem());
+        self.readiness.set(
+            Component::Database,
+            match database {
+                Ok(Ok(())) => self.store.state().problem(),
+                Ok(Err(_)) => self.store.state().problem().or_else(|| Some("it refuses a statement".to_owned())),
+                Err(_) => Some("it does not answer".to_owned()),
+            },
+        );
+        self.readiness.set(Component::Disk, disk);
+        self.readiness.set(Component::Broker, broker_problem(&self.broker.health().borrow()));
+    }
+
+    /// Checks the database and the disk at intervals, and the broker whenever its health changes, until `stop`.
+    pub async fn run(mut self, stop: CancellationToken) {
+        let mut health = self.broker.health();
+        let mut ticks = interval(CHECK_INTERVAL);
+        ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        // The first would be due at once, and the server has checked before it listened.
+        ticks.reset();
+        loop {
+            tokio::select! {
+                () = stop.cancelled() => return,
+                _ = ticks.tick() => self.check().await,
+                Ok(()) = health.changed() => {
+                    self.readiness.set(Component::Broker, broker_problem(&health.borrow_and_update()));
+                }
+            }
+        }
+    }
+}
+
+fn broker_problem(health: &Health) -> Option<String> {
+    match health {
+        Health::Serving => None,
+        Health::Recovering(seen) | Health::Failed(seen) => Some(seen.clone()),
+    }
+}
+
+/// Writes a small file into the data directory, one write at a time: a file system that hangs holds one thread, not one
+/// for each check.
+pub struct DiskProbe {
+    data: PathBuf,
+    patience: Duration,
+    running: Option<JoinHandle<io::Result<()>>>,
+}
+
+impl DiskProbe {
+    /// A probe of this directory.
+    pub fn new(data: PathBuf) -> Self {
+        Self { data, patience: PATIENCE, running: None }
+    }
+
+    /// The reason why the directory can't be written, if it can't.
+    async fn problem(&mut self) -> Option<String> {
+        let data = self.data.clone();
+        let probe = self.running.get_or_insert_with(|| tokio::task::spawn_blocking(move || probe_disk(&data)));
+        let finished = timeout(self.patience, probe).await.ok();
+        if finished.is_some() {
+            self.running = None;
+        }
+        match finished {
+            Some(Ok(Ok(()))) => None,
+            Some(Ok(Err(error))) if error.kind() == io::ErrorKind::StorageFull => {
+                let free = room(&self.data).map_or(0, |(free, _)| free);
+                Some(format!("the data directory's disk is full: {free} bytes are free"))
+            }
+            Some(Ok(Err(error))) => Some(format!("the data directory can't be written: {}", error.kind())),
+            Some(Err(_)) => Some("the data directory can't be checked".to_owned()),
+            None => Some("the data directory does not answer".to_owned()),
+        }
+    }
+}
+
+fn probe_disk(data: &Path) -> io::Result<()> {
+    std::fs::write(data.join(".ready"), b"ready\n")?;
+    // The file is short and was there before, so it may be written again where nothing else can.
+    match room(data) {
+        Some((free, total)) if free < LEAST_FREE_BYTES.min(total / LEAST_FREE_SHARE) => {
+            Err(io::ErrorKind::StorageFull.into())
+        }
+        _ => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn disk_probe_names_the_problem_and_recovers() {
+        let parent = tempfile::tempdir().expect("a directory");
+        let data = parent.path().join("data");
+        let mut probe = DiskProbe::new(data.clone());
+        let problem = probe.problem().await.expect("the directory is missing");
+        assert_eq!(problem, "the data directory can't be written: entity not found");
+        std::fs::create_dir(&data).expect("made");
+        assert_eq!(probe.problem().await, None);
+    }
+
+    #[tokio::test]
+    async fn disk_probe_that_hangs_runs_once_and_its_end_is_noticed() {
+        let data = tempfile::tempdir().expect("a directory");
+        let (release, held) = tokio::sync::oneshot::channel::<()>();
+        let hanging = tokio::spawn(async move {
+            held.await.expect("released");
+            Ok(())
+        });
+        let mut probe =
+            DiskProbe { data: data.path().to_owned(), patience: Duration::from_millis(1), running: Some(hanging) };
+        for _ in 0..3 {
+            assert_eq!(probe.problem().await.as_deref(), Some("the data directory does not answer"));
+        }
+        assert!(!data.path().join(".ready").exists(), "a second write was begun");
+        release.send(()).expect("it waits");
+        probe.patience = PATIENCE;
+        assert_eq!(probe.problem().await, None);
+    }
+}

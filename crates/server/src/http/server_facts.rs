@@ -1,0 +1,67 @@
+//! What holds for as long as the server runs: since when it does, where it listens, by which rules it decides and what it
+//! allows. Made once, from the configuration; nothing in it is secret.
+
+use std::time::Duration;
+
+use task_proto::api::{LimitView, ListenerView, ServerRules};
+use tokio::time::Instant;
+
+use crate::blobs::{BlobSettings, Blobs};
+use crate::config::Config;
+use crate::domain::delivery::shown_bytes;
+
+/// Facts about this server.
+#[derive(Debug)]
+pub struct ServerFacts {
+    /// Since when it runs.
+    pub began: Instant,
+    /// Where it listens.
+    pub listeners: Vec<ListenerView>,
+    /// How it decides, and what it allows.
+    pub rules: ServerRules,
+}
+
+impl ServerFacts {
+    /// Of a server with this configuration that listens there.
+    pub fn new(config: &Config, blobs: &Blobs, listeners: Vec<ListenerView>) -> Self {
+        let rules = config.delivery.rules().views();
+        Self {
+            began: Instant::now(),
+            listeners,
+            rules: ServerRules { rules, limits: limits(config, blobs.settings()) },
+        }
+    }
+}
+
+fn limits(config: &Config, blobs: BlobSettings) -> Vec<LimitView> {
+    let limit = |key: &str, value: String| LimitView { key: key.to_owned(), value };
+    let count = |most: Option<u64>| most.map_or("none".to_owned(), |most| most.to_string());
+    let speed = |most: Option<u64>| most.map_or("none".to_owned(), |most| format!("{}/s", shown_bytes(most)));
+    let seconds = |time: Duration| format!("{} s", time.as_secs());
+    let (transfers, robots, delivery) = (&config.transfers, &config.robots, &config.delivery);
+    let mut limits = vec![
+        limit("assignment_expiry", seconds(config.assignment_expiry)),
+        limit("delivery.inline_bytes", shown_bytes(delivery.inline_bytes.into())),
+        limit("delivery.part_bytes", shown_bytes(delivery.part_bytes.into())),
+        limit("desired_lifetime", seconds(config.desired_lifetime)),
+        limit("disk_reserve", shown_bytes(blobs.reserve_bytes)),
+        limit("enrolment.per_minute", config.enrolment_per_minute.to_string()),
+        limit("enrolment.uses", config.enrolment_uses.to_string()),
+        limit("max_blob_bytes", shown_bytes(blobs.max_blob_bytes)),
+        limit("max_http_connections", config.max_http_connections.to_string()),
+        limit("max_mqtt_connections", config.max_mqtt_connections.to_string()),
+        limit("people.requests_per_s", config.people.requests_per_s.to_string()),
+        limit("presence_timeout", seconds(config.presence_timeout)),
+        limit("robots.bytes_per_s", speed(Some(robots.bytes_per_s))),
+        limit("robots.messages_per_s", robots.messages_per_s.to_string()),
+        limit("robots.output_bytes", shown_bytes(blobs.max_robot_bytes)),
+        limit("robots.requests_per_s", robots.requests_per_s.to_string()),
+        limit("transfers.max", count(transfers.all.max)),
+        limit("transfers.bytes_per_s", speed(transfers.all.bytes_per_s)),
+    ];
+    for (site, of_site) in &transfers.sites {
+        limits.push(limit(&format!("transfers.sites.{site}.max"), count(of_site.max)));
+        limits.push(limit(&format!("transfers.sites.{site}.bytes_per_s"), speed(of_site.bytes_per_s)));
+    }
+    limits
+}

@@ -1,0 +1,237 @@
+//! One package's fan-out from its first listener to its last: reads slices of the blob, publishes them as parts, and keeps
+//! the broker's grant what the database says.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::ops::RangeInclusive;
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::Bytes;
+use task_proto::desired::BlobRef;
+use task_proto::part::{Cut, MAX_PARTS};
+use task_proto::{DeploymentId, RobotId};
+use tokio::sync::Notify;
+use tokio::time::{Instant, timeout};
+
+use super::FanOutWorker;
+use super::course::{Course, GivenUp, Step};
+use crate::blobs::Blob;
+use crate::broker::{FanOut, FanOutError, FanOutSettings, Part, PartQos};
+use crate::fleet::part_requests::Listening;
+use crate::store::StoreError;
+
+/// How often it is looked who listens, and whether it is time for the next step.
+const TURN: Duration = Duration::from_millis(250);
+/// How long to wait for others once somebody has begun to listen: they tend to come together.
+const JOIN_PAUSE: Duration = Duration::from_millis(20);
+/// How often the database is asked at most who still needs the package,
+const SYNC_PAUSE: Duration = Duration::from_millis(200);
+/// and how often if nothing is known to have changed.
+const SYNC_INTERVAL: Duration = Duration::from_secs(2);
+/// How long the last parts may take to be acknowledged before robots are waited for in another way.
+const SETTLE: Duration = Duration::from_secs(10);
+
+/// Before a fan-out that was interrupted is tried again.
+const PAUSE: Duration = Duration::from_secs(2);
+
+/// A fan-out under way.
+struct Package<'a> {
+    worker: &'a FanOutWorker,
+    content: BlobRef,
+    cut: Cut,
+    blob: Blob,
+    fan_out: FanOut,
+    requests: Listening,
+    course: Course,
+    started: Instant,
+    /// Whose part of which deployments it is.
+    owners: BTreeMap<RobotId, Vec<DeploymentId>>,
+    changed: Arc<Notify>,
+    synced_at: Option<Instant>,
+    /// Whether orders may have changed since then.
+    is_stale: bool,
+}
+
+/// Why a fan-out ends before its time. It is tried again from the start.
+#[derive(Debug, thiserror::Error)]
+enum Interrupted {
+    #[error("the database failed")]
+    Store(#[from] StoreError),
+    #[error("the orders could not be changed")]
+    Action(#[from] crate::orders::actions::ActionError),
+    #[error("the blob can't be read")]
+    Blob(#[from] crate::blobs::BlobError),
+    #[error("the broker refused")]
+    Broker(#[from] FanOutError),
+}
+
+impl FanOutWorker {
+    /// Fans out `content` until nobody is left who needs it so.
+    pub(super) async fn fan_out(&self, content: BlobRef, changed: Arc<Notify>) {
+        let done = match self.prepare(content, changed).await {
+            Ok(Some(package)) => package.run().await,
+            Ok(None) => self.give_up_on_all(content).await,
+            Err(error) => Err(error),
+        };
+        match done {
+            Ok(()) => tracing::info!(digest = %content.digest, "a fan-out has ended"),
+            Err(error) => {
+                tracing::warn!(
+                    digest = %content.digest,
+                    error = &error as &dyn std::error::Error,
+                    "a fan-out was interrupted; it is tried again"
+                );
+                tokio::time::sleep(PAUSE).await;
+            }
+        }
+    }
+
+    /// `None`: there is nothing that could be sent.
+    async fn prepare(&self, content: BlobRef, changed: Arc<Notify>) -> Result<Option<Package<'_>>, Interrupted> {
+        let Some(blob) = self.blobs.get(content.digest).await?.filter(|blob| blob.size() == content.size) else {
+            return Ok(None);
+        };
+        // So many parts that a robot could not remember them would be made larger.
+        let least = u32::try_from(content.size.div_ceil(u64::from(MAX_PARTS))).unwrap_or(u32::MAX);
+        let Ok(cut) = Cut::new(content.size, self.settings.part_bytes.max(least)) else { return Ok(None) };
+        let qos = match self.settings.qos {
+            0 => PartQos::AtMostOnce,
+            1 => PartQos::AtLeastOnce,
+            _ => PartQos::ExactlyOnce,
+        };
+        let largest = u64::from(cut.part_bytes()).min(content.size);
+        let settings = FanOutSettings { part_bytes: usize::try_from(largest).unwrap_or(usize::MAX), qos };
+        let fan_out = self.broker.fan_out(content.digest, settings, Vec::new())?;
+        Ok(Some(Package {
+            worker: self,
+            content,
+            cut,
+            blob,
+            fan_out,
+            requests: self.changes.part_requests().listen(content.digest),
+            course: Course::begin(cut.count(), 0),
+            started: Instant::now(),
+            owners: BTreeMap::new(),
+            changed,
+            synced_at: None,
+            is_stale: true,
+        }))
+    }
+
+    async fn give_up_on_all(&self, content: BlobRef) -> Result<(), Interrupted> {
+        let open = self.store.awaiting_parts(&content.digest).await?;
+        Ok(self.actions.pull_instead(&open, "the server has no such content").await?)
+    }
+}
+
+impl Package<'_> {
+    async fn run(mut self) -> Result<(), Interrupted> {
+        loop {
+            self.sync().await?;
+            match self.course.next(self.now_ms()) {
+                Step::Publish(parts) => self.publish(parts).await?,
+                Step::Wait => self.wait().await,
+                Step::Over => {
+                    self.tell_to_pull().await?;
+                    // Whoever was released meanwhile is found by the next look.
+                    return Ok(());
+                }
+            }
+        }
+    }
+
+    /// Waits until something has happened, or the next turn.
+    async fn wait(&self) {
+        tokio::select! {
+            () = self.changed.notified() => {}
+            () = self.requests.news() => {}
+            () = self.fan_out.joined() => tokio::time::sleep(JOIN_PAUSE).await,
+            () = tokio::time::sleep(TURN) => {}
+        }
+    }
+
+    /// Publishes `parts` in their order. Between them orders may change, and robots come and go.
+    async fn publish(&mut self, parts: Vec<RangeInclusive<u32>>) -> Result<(), Interrupted> {
+        for index in parts.into_iter().flatten() {
+            let range = self.cut.range(index);
+            let bytes = self.blob.slice(range).await?;
+            let part = Part { header: Bytes::copy_from_slice(&self.cut.header(index)), bytes };
+            // Cut off, nothing was sent.
+            loop {
+                match timeout(TURN, self.fan_out.publish(part.clone())).await {
+                    Ok(sent) => break sent?,
+                    Err(_) => self.sync().await?,
+                }
+            }
+            if self.synced_at.is_none_or(|at| at.elapsed() >= SYNC_INTERVAL) {
+                self.sync().await?;
+            }
+            if self.course.is_over() {
+                break;
+            }
+        }
+        self.fan_out.settle(SETTLE).await;
+        self.course.sent(self.now_ms());
+        Ok(())
+    }
+
+    /// Takes note of everything that may have happened, and tells those that were given up on to pull.
+    async fn sync(&mut self) -> Result<(), Interrupted> {
+        let now_ms = self.now_ms();
+        self.is_stale |= tokio::select! {
+            biased;
+            () = self.changed.notified() => true,
+            () = std::future::ready(()) => false,
+        };
+        let pause = if self.is_stale { SYNC_PAUSE } else { SYNC_INTERVAL };
+        let is_due = self.synced_at.is_none_or(|at| at.elapsed() >= pause);
+        if is_due {
+            self.read_orders(now_ms).await?;
+        }
+        for robot in self.fan_out.take_put_out() {
+            self.course.put_out(robot);
+        }
+        let said = self.requests.take();
+        said.keys().for_each(|robot| self.fan_out.told(robot, true));
+        let fan_out = &self.fan_out;
+        self.course.set_listening(|robot| fan_out.is_listening(robot), now_ms);
+        for (robot, missing) in said {
+            self.course.lacks(&robot, missing, now_ms);
+        }
+        self.tell_to_pull().await
+    }
+
+    async fn read_orders(&mut self, now_ms: u64) -> Result<(), Interrupted> {
+        (self.synced_at, self.is_stale) = (Some(Instant::now()), false);
+        self.owners.clear();
+        for (deployment, robot) in self.worker.store.awaiting_parts(&self.content.digest).await? {
+            self.owners.entry(robot).or_default().push(deployment);
+        }
+        let robots: BTreeSet<RobotId> = self.owners.keys().cloned().collect();
+        let (new, gone) = self.course.set_robots(&robots, now_ms);
+        self.fan_out.admit(new);
+        for robot in gone {
+            self.fan_out.withdraw(&robot);
+        }
+        Ok(())
+    }
+
+    async fn tell_to_pull(&mut self) -> Result<(), Interrupted> {
+        let mut by_reason: BTreeMap<GivenUp, Vec<(DeploymentId, RobotId)>> = BTreeMap::new();
+        for (robot, why) in self.course.take_given_up() {
+            self.fan_out.withdraw(&robot);
+            let deployments = self.owners.remove(&robot).unwrap_or_default();
+            let parts = deployments.into_iter().map(|deployment| (deployment, robot.clone()));
+            by_reason.entry(why).or_default().extend(parts);
+        }
+        for (why, parts) in by_reason {
+            tracing::info!(digest = %self.content.digest, robots = parts.len(), why = why.as_str(), "robots are told to pull");
+            self.worker.actions.pull_instead(&parts, why.as_str()).await?;
+        }
+        Ok(())
+    }
+
+    fn now_ms(&self) -> u64 {
+        u64::try_from(self.started.elapsed().as_millis()).unwrap_or(u64::MAX)
+    }
+}

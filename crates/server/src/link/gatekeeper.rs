@@ -1,0 +1,84 @@
+//! Who may come in over MQTT: the broker's question, answered from the database for each connection, so that a token
+//! that was revoked a moment ago no longer opens anything. A robot that comes in by a new token thereby ends its old one, by
+//! whatever way it comes: what follows of that is said here for both.
+
+use std::sync::Arc;
+
+use futures_util::FutureExt as _;
+use futures_util::future::BoxFuture;
+use task_proto::RobotId;
+use task_proto::person::Permission;
+use task_proto::token::Token;
+
+use crate::broker::{Gatekeeper, Login, Principal, Refusal};
+use crate::fleet::presence::Presence;
+use crate::net::http_connections::HttpConnections;
+use crate::orders::changes::{Change, Changes};
+use crate::store::{Admitted, Store, StoreError, TokenHolder};
+use crate::system::clock::Clock;
+
+/// Answers by the tokens in the database.
+pub struct StoreGatekeeper {
+    store: Store,
+    clock: Clock,
+    presence: Arc<Presence>,
+    http_connections: Arc<HttpConnections>,
+    changes: Changes,
+}
+
+impl StoreGatekeeper {
+    /// One that asks this database, and tells the rest when a robot goes over to a new token.
+    pub fn new(
+        store: Store,
+        clock: Clock,
+        presence: Arc<Presence>,
+        http_connections: Arc<HttpConnections>,
+        changes: Changes,
+    ) -> Self {
+        Self { store, clock, presence, http_connections, changes }
+    }
+
+    async fn decide(&self, login: Login) -> Result<Principal, Refusal> {
+        let password = login.password.as_deref().ok_or(Refusal::BadCredentials)?;
+        let token: Token = password.parse().map_err(|_| Refusal::BadCredentials)?;
+        let unchecked = |error: StoreError| {
+            error.log("a login over MQTT could not be checked");
+            Refusal::Unavailable
+        };
+        let admitted = self.store.admit(&token, &login.proof, self.clock.now_ms()).await.map_err(unchecked)?;
+        let Some(Admitted { holder, is_first_use }) = admitted else {
+            let is_revoked = self.store.is_of_revoked_robot(&token).await.map_err(unchecked)?;
+            return Err(if is_revoked { Refusal::NotAuthorised } else { Refusal::BadCredentials });
+        };
+        match holder {
+            TokenHolder::Robot { robot, token_number, .. } => {
+                if is_first_use {
+                    ended_others(&self.presence, &self.http_connections, &self.changes, &robot);
+                }
+                Ok(Principal::Robot { robot, token_number, is_first_use })
+            }
+            // Over MQTT one hears every robot, so it is not for who is limited to some.
+            TokenHolder::Person(person) if person.may(Permission::Read) && person.scope.is_everything() => {
+                Ok(Principal::Operator(person.name))
+            }
+            TokenHolder::Person(_) | TokenHolder::Enrolment | TokenHolder::Pending { .. } => {
+                Err(Refusal::NotAuthorised)
+            }
+        }
+    }
+}
+
+impl Gatekeeper for StoreGatekeeper {
+    fn admit(&self, login: Login) -> BoxFuture<'_, Result<Principal, Refusal>> {
+        self.decide(login).boxed()
+    }
+}
+
+/// The robot has used a token for the first time, which ended its others: its connections over HTTP are cut, nobody displaces
+/// it any more, and it is told of its state. Its MQTT session is the broker's to end.
+pub fn ended_others(presence: &Presence, http_connections: &HttpConnections, changes: &Changes, robot: &RobotId) {
+    presence.ended_others(robot);
+    http_connections.end(robot);
+    changes.announce(Change::Robot(robot.clone()));
+    changes.ring([robot.clone()]);
+}

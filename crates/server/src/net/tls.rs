@@ -1,0 +1,249 @@
+//! TLS as both listeners speak it: with the operator's own certificate, or with one by the server's private authority. Who
+//! pinned that authority always gets the latter. Certificates change while connections live; none of them notices.
+//! It accepts no connection and keeps no time for a handshake: the listeners do.
+
+mod authority;
+mod client;
+mod files;
+
+use std::fmt;
+use std::io;
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, PoisonError, RwLock};
+use std::time::Duration;
+
+use rustls::crypto::ring;
+use rustls::server::{ClientHello, ResolvesServerCert};
+use rustls::sign::CertifiedKey;
+use rustls::{ClientConfig, ServerConfig};
+use task_proto::CaPin;
+use task_proto::pin::PINNED_PROTOCOL;
+use task_transport::Trust;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio_rustls::TlsAcceptor;
+use tokio_rustls::server::TlsStream;
+use tokio_util::sync::CancellationToken;
+
+use self::authority::{Audience, Authority};
+use self::client::AnyKey;
+pub use self::client::ClientProof;
+use self::files::Files;
+use crate::config::TlsSettings;
+use crate::system::clock::Clock;
+use crate::system::data_directory::{DataDirectory, DataError};
+
+/// How often the authority makes new certificates, for names and addresses that the machine has got meanwhile.
+const RENEWAL: Duration = Duration::from_secs(7 * 86_400);
+
+/// Why there is no certificate to show.
+#[derive(Debug, thiserror::Error)]
+pub enum TlsError {
+    /// The private authority can't be kept.
+    #[error(transparent)]
+    Data(#[from] DataError),
+    /// The private authority can't be made, or can't make a certificate.
+    #[error("the private certificate authority can't make a certificate")]
+    Authority(#[from] rcgen::Error),
+    /// The certificate that it made can't be used.
+    #[error("the private certificate authority made a certificate that can't be used")]
+    Unusable(#[source] rustls::Error),
+    /// A file of the operator's can't be read.
+    #[error("can't read {}", path.display())]
+    Unreadable {
+        /// Which.
+        path: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+    /// It holds something else.
+    #[error("{} does not hold {expected} in PEM", path.display())]
+    Content {
+        /// Which.
+        path: PathBuf,
+        /// What should be in it.
+        expected: &'static str,
+    },
+    /// The two do not belong together, or are of a kind that is not known.
+    #[error("the certificate in {} can't be used with the key in {}", certificate.display(), key.display())]
+    Unfit {
+        /// The certificate's file.
+        certificate: PathBuf,
+        /// The key's file.
+        key: PathBuf,
+        /// Why.
+        source: rustls::Error,
+    },
+}
+
+/// TLS, ready to be spoken. Clones are the same.
+#[derive(Clone)]
+pub struct Tls(Arc<Parts>);
+
+struct Parts {
+    acceptor: TlsAcceptor,
+    shown: Arc<Shown>,
+    authority: Authority,
+    own: Option<Mutex<Files>>,
+    settings: TlsSettings,
+    clock: Clock,
+}
+
+/// The certificates that hold now.
+#[derive(Debug)]
+struct Shown(RwLock<Certificates>);
+
+#[derive(Debug, Clone)]
+struct Certificates {
+    /// For those who ask for the pinned authority's.
+    pinned: Arc<CertifiedKey>,
+    /// For everybody else.
+    common: Arc<CertifiedKey>,
+}
+
+impl ResolvesServerCert for Shown {
+    fn resolve(&self, hello: ClientHello<'_>) -> Option<Arc<CertifiedKey>> {
+        let asks_for_pinned = hello.alpn().is_some_and(|mut asked| asked.any(|protocol| protocol == PINNED_PROTOCOL));
+        let certificates = self.0.read().unwrap_or_else(PoisonError::into_inner);
+        Some(if asks_for_pinned { certificates.pinned.clone() } else { certificates.common.clone() })
+    }
+}
+
+impl Tls {
+    /// Reads or makes what is to be shown. Own files that can't be used are an error here; later they are not.
+    pub fn open(settings: TlsSettings, data: &DataDirectory, clock: Clock) -> Result<Self, TlsError> {
+        let authority = Authority::open(data)?;
+        let mut own = settings.own_files().map(|(certificate, key)| Files::new(certificate, key));
+        let now_ms = clock.now_ms();
+        let names = names_of_this_machine(&settings.names);
+        let common = match own.as_mut().map(Files::read_news).transpose()?.flatten() {
+            Some(own) => own,
+            None => authority.issue(Audience::Browsers, &names, now_ms)?,
+        };
+        let pinned = authority.issue(Audience::Robots, &names, now_ms)?;
+        let certificates = Certificates { pinned: Arc::new(pinned), common: Arc::new(common) };
+        let shown = Arc::new(Shown(RwLock::new(certificates)));
+        let builder = ServerConfig::builder_with_provider(Arc::new(ring::default_provider()));
+        let builder = builder.with_safe_default_protocol_versions().map_err(TlsError::Unusable)?;
+        let builder = match settings.client_certificates {
+            true => builder.with_client_cert_verifier(AnyKey::new()),
+            false => builder.with_no_client_auth(),
+        };
+        let mut config = builder.with_cert_resolver(shown.clone());
+        // Robots that come back all at once do so for half of the work, and the server remembers none of them.
+        config.ticketer = ring::Ticketer::new().map_err(TlsError::Unusable)?;
+        config.send_tls13_tickets = 1;
+        let acceptor = TlsAcceptor::from(Arc::new(config));
+        Ok(Self(Arc::new(Parts { acceptor, shown, authority, own: own.map(Mutex::new), settings, clock })))
+    }
+
+    /// Shakes hands; gives what the client has proven on that occasion. Waits for it for as long as it takes.
+    pub async fn accept<S: AsyncRead + AsyncWrite + Unpin>(
+        &self,
+        stream: S,
+    ) -> io::Result<(TlsStream<S>, ClientProof)> {
+        let stream = self.0.acceptor.accept(stream).await?;
+        let proof = match self.0.settings.client_certificates {
+            true => ClientProof::of(stream.get_ref().1.peer_certificates()),
+            false => ClientProof::NotAsked,
+        };
+        Ok((stream, proof))
+    }
+
+    /// The private authority's pin.
+    pub fn pin(&self) -> CaPin {
+        self.0.authority.pin()
+    }
+
+    /// The pin that robots are told: none where the system's root certificates vouch for the operator's own certificate.
+    pub fn told_pin(&self) -> Option<CaPin> {
+        self.0.settings.tells_pin().then(|| self.pin())
+    }
+
+    /// How this process connects to itself.
+    pub fn client_config(&self) -> Arc<ClientConfig> {
+        Arc::new(Trust::Pinned(self.pin()).client_config(Clock::for_certificates()))
+    }
+
+    /// Takes what is new in the operator's files. On an error all stays as it was.
+    pub fn reload(&self) -> Result<(), TlsError> {
+        let Some(own) = &self.0.own else { return Ok(()) };
+        let news = own.lock().unwrap_or_else(PoisonError::into_inner).read_news()?;
+        if let Some(news) = news {
+            self.0.shown.write().common = Arc::new(news);
+            tracing::info!("new connections are shown the certificate that was put in place");
+        }
+        Ok(())
+    }
+
+    /// Makes new certificates by the private authority.
+    fn renew(&self) -> Result<(), TlsError> {
+        let (authority, now_ms) = (&self.0.authority, self.0.clock.now_ms());
+        let names = names_of_this_machine(&self.0.settings.names);
+        let pinned = Arc::new(authority.issue(Audience::Robots, &names, now_ms)?);
+        let common = match self.0.own {
+            Some(_) => None,
+            None => Some(Arc::new(authority.issue(Audience::Browsers, &names, now_ms)?)),
+        };
+        let mut shown = self.0.shown.write();
+        shown.pinned = pinned;
+        if let Some(common) = common {
+            shown.common = common;
+        }
+        Ok(())
+    }
+
+    /// Looks for new files, and renews what the authority made, until `stop`.
+    pub async fn keep_current(self, stop: CancellationToken) {
+        let mut looks = tokio::time::interval(self.0.settings.look_interval);
+        let mut renewals = tokio::time::interval(RENEWAL);
+        looks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        // The first tick comes at once, and all has just been read and made.
+        renewals.tick().await;
+        loop {
+            let task = tokio::select! {
+                () = stop.cancelled() => return,
+                _ = looks.tick() => Self::reload,
+                _ = renewals.tick() => Self::renew,
+            };
+            let tls = self.clone();
+            let outcome = tokio::task::spawn_blocking(move || task(&tls)).await;
+            if let Ok(Err(error)) = outcome {
+                self.complain(&error);
+            }
+        }
+    }
+
+    fn complain(&self, error: &TlsError) {
+        let error = error as &dyn std::error::Error;
+        tracing::warn!(error, "the certificate stays what it was");
+    }
+}
+
+impl Shown {
+    fn write(&self) -> std::sync::RwLockWriteGuard<'_, Certificates> {
+        self.0.write().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl fmt::Debug for Tls {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Tls").field("pin", &self.pin()).finish_non_exhaustive()
+    }
+}
+
+/// What the machine is reached by, as far as it knows, and what the operator says besides. Who trusts a pin does not look.
+fn names_of_this_machine(further: &[String]) -> Vec<String> {
+    let mut names = vec!["localhost".to_owned()];
+    let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
+    names.extend(Some(host.trim().to_owned()).filter(|host| !host.is_empty()));
+    let interfaces = nix::ifaddrs::getifaddrs().into_iter().flatten();
+    names.extend(interfaces.filter_map(|interface| {
+        let address = interface.address?;
+        let v4 = address.as_sockaddr_in().map(|address| address.ip().to_string());
+        v4.or_else(|| address.as_sockaddr_in6().map(|address| address.ip().to_string()))
+    }));
+    names.extend(further.iter().cloned());
+    names.sort();
+    names.dedup();
+    names
+}

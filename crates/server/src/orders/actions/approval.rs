@@ -1,0 +1,75 @@
+//! Robots that wait to be approved, and what becomes of them.
+
+use task_proto::RobotId;
+use task_proto::api::PendingRobotList;
+
+use super::robots::known_robot;
+use super::{ActionError, Actions, DAY_MS};
+use crate::domain::person::Person;
+use crate::orders::changes::Change;
+use crate::store::{Act, Deed, KnownRobot, StoreError, Write};
+
+/// The most robots that may wait.
+const MOST_PENDING: u64 = 1_000;
+/// How long one may wait.
+const PENDING_LIFETIME_MS: u64 = 7 * DAY_MS;
+
+impl Actions {
+    /// The robots that wait to be approved.
+    pub async fn pending_robots(&self) -> Result<PendingRobotList, ActionError> {
+        Ok(PendingRobotList { robots: self.store.pending_robots().await? })
+    }
+
+    /// Lets a robot in that waits. Doing it twice is harmless.
+    pub async fn approve_robot(&self, by: &Person, robot: &RobotId) -> Result<(), ActionError> {
+        let now_ms = self.clock.now_ms();
+        let mut write = self.store.begin().await?;
+        let known = known_robot(&mut write, robot.as_str()).await?;
+        if !write.is_pending(robot).await? {
+            return Ok(());
+        }
+        write.approve_robot(robot).await?;
+        let deed = Deed::by(by, Act::RobotApprove, robot).with("name", &known.name).with("mac", known.mac);
+        write.audit(&deed, now_ms).await?;
+        write.commit().await?;
+        self.changes.announce(Change::Robot(known.id));
+        Ok(())
+    }
+
+    /// Turns a robot away that waits, and forgets it. One that does not wait is not meant: that would be removing it.
+    pub async fn reject_robot(&self, by: &Person, robot: &RobotId) -> Result<(), ActionError> {
+        let now_ms = self.clock.now_ms();
+        let mut write = self.store.begin().await?;
+        let known = known_robot(&mut write, robot.as_str()).await?;
+        if !write.is_pending(robot).await? {
+            return Err(ActionError::NotPending(known.name));
+        }
+        turn_away(&mut write, &known, Deed::by(by, Act::RobotReject, robot), now_ms).await?;
+        write.commit().await?;
+        self.changes.announce(Change::RobotRemoved(Box::new(known)));
+        Ok(())
+    }
+}
+
+/// An error if so many wait that no other may.
+pub(super) async fn check_room(write: &mut Write) -> Result<(), ActionError> {
+    if write.count_pending().await? < MOST_PENDING { Ok(()) } else { Err(ActionError::TooManyPending(MOST_PENDING)) }
+}
+
+/// Turns away whoever has waited for too long, and says who that was.
+pub(super) async fn give_up_pending(write: &mut Write, now_ms: u64) -> Result<Vec<KnownRobot>, StoreError> {
+    let given_up = write.pending_since(now_ms.saturating_sub(PENDING_LIFETIME_MS)).await?;
+    for known in &given_up {
+        let deed = Deed::new("server".to_owned(), None, None, Act::RobotReject, &known.id)
+            .with("because", "nobody approved it");
+        turn_away(write, known, deed, now_ms).await?;
+    }
+    Ok(given_up)
+}
+
+async fn turn_away(write: &mut Write, known: &KnownRobot, deed: Deed, now_ms: u64) -> Result<(), StoreError> {
+    let robots = std::slice::from_ref(&known.id);
+    write.revoke_tokens(robots, now_ms).await?;
+    write.remove_robots(robots, now_ms).await?;
+    write.audit(&deed.with("name", &known.name).with("mac", known.mac), now_ms).await
+}

@@ -1,0 +1,449 @@
+//! What people and robots may order. Each order is one write to the store; after its commit the change is announced and
+//! the robots concerned are rung. No HTTP and no MQTT here, and no SQL.
+
+mod again;
+mod approval;
+mod bulk;
+mod deployments;
+mod desired;
+mod fallen_behind;
+pub mod people;
+mod robots;
+pub mod sign_in;
+mod tasks;
+
+use std::collections::HashSet;
+use std::fmt;
+use std::str::FromStr;
+use std::sync::Arc;
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use task_proto::api::MatchedRobot;
+use task_proto::envelope::SigningKey;
+use task_proto::selector::Selector;
+use task_proto::{CaPin, DeploymentId, Digest, MacAddress, RobotId, RobotName, TaskName, TokenId, UserName, Version};
+
+use crate::auth::passwords::Passwords;
+use crate::auth::sign_ins::SignIns;
+use crate::domain::person::Person;
+use crate::limits::pace::Pace;
+use crate::orders::changes::Changes;
+use crate::orders::chooser::Chooser;
+use crate::store::{KnownRobot, Matching, PastOrder, Store, StoreError, Write};
+use crate::system::clock::Clock;
+
+pub use crate::store::TaskOrder;
+pub use again::Rollback;
+pub use desired::Desired;
+pub use robots::Enrolled;
+
+/// The orders. Clones are the same.
+#[derive(Clone)]
+pub struct Actions {
+    store: Store,
+    clock: Clock,
+    changes: Changes,
+    key: Arc<SigningKey>,
+    settings: ActionSettings,
+    chooser: Chooser,
+    envelopes: Arc<desired::Envelopes>,
+    passwords: Passwords,
+    sign_ins: Arc<SignIns>,
+    enrolments: Arc<Enrolments>,
+}
+
+/// How often robots enrol.
+struct Enrolments {
+    by_token: Pace,
+    all: Pace,
+}
+
+/// Lifetimes the operator may set.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ActionSettings {
+    /// How long an assignment may take when the order does not say.
+    pub assignment_lifetime_ms: u64,
+    /// How long a signed desired state may be acted upon.
+    pub desired_lifetime_ms: u64,
+    /// How long an enrolment token is good for when its maker does not say.
+    pub enrolment_token_lifetime_ms: u64,
+    /// How many robots it is good for when its maker does not say.
+    pub enrolment_token_uses: u64,
+    /// How many robots may enrol in a minute; by one token half of them.
+    pub enrolments_per_minute: u64,
+    /// The certificate authority that robots are told to trust, if they are to trust the server's own.
+    pub ca_pin: Option<CaPin>,
+    /// Whether every new robot waits to be approved.
+    pub enrolment_approval: bool,
+}
+
+const DAY_MS: u64 = 24 * 60 * 60 * 1000;
+/// The longest lifetime anyone may ask for.
+const MAX_LIFETIME_MS: u64 = 10 * 365 * DAY_MS;
+
+impl Default for ActionSettings {
+    fn default() -> Self {
+        Self {
+            assignment_lifetime_ms: 7 * DAY_MS,
+            desired_lifetime_ms: 30 * DAY_MS,
+            enrolment_token_lifetime_ms: DAY_MS,
+            enrolment_token_uses: 100,
+            enrolments_per_minute: 3_000,
+            ca_pin: None,
+            enrolment_approval: false,
+        }
+    }
+}
+
+impl Actions {
+    /// Orders that go to `store` and are announced to `changes`; desired states are signed with `key`, and how
+    /// packages travel is up to `chooser`.
+    pub fn new(
+        store: Store,
+        clock: Clock,
+        changes: Changes,
+        key: SigningKey,
+        settings: ActionSettings,
+        chooser: Chooser,
+    ) -> Self {
+        let (key, envelopes) = (Arc::new(key), Arc::default());
+        let (passwords, sign_ins) = (Passwords::default(), Arc::default());
+        let per_minute = settings.enrolments_per_minute;
+        let (by_token, all) = (Pace::per_minute(per_minute / 2), Pace::per_minute(per_minute));
+        let enrolments = Arc::new(Enrolments { by_token, all });
+        Self { store, clock, changes, key, settings, chooser, envelopes, passwords, sign_ins, enrolments }
+    }
+
+    /// What was answered when `key` came with this `request` before; an error if it came with another, or from someone else.
+    /// Robots that are no longer the person's are left out.
+    async fn answered_before<T: Remembered>(
+        &self,
+        write: &mut Write,
+        by: &Person,
+        key: impl Into<Option<&IdempotencyKey>>,
+        request: &str,
+    ) -> Result<Option<T>, ActionError> {
+        let Some(key) = key.into() else { return Ok(None) };
+        let Some(past) = write.past_order(&key.0).await? else { return Ok(None) };
+        if past.request != remembered(by, request) {
+            return Err(ActionError::IdempotencyKeyReused(key.to_string()));
+        }
+        let answer = serde_json::from_str(&past.answer);
+        let mut answer: T = answer.map_err(|_| StoreError::Unreadable { column: "orders.answer" })?;
+        if !by.scope.is_everything() {
+            let own: HashSet<RobotId> = write.robots_ever_in(&by.scope).await?.into_iter().collect();
+            answer.keep_robots(&own);
+        }
+        Ok(Some(answer))
+    }
+
+    /// Remembers the answer to `request`, so that a retry gets the same.
+    async fn remember_answer<T: Remembered>(
+        &self,
+        write: &mut Write,
+        by: &Person,
+        key: impl Into<Option<&IdempotencyKey>>,
+        request: &str,
+        answer: &T,
+        now_ms: u64,
+    ) -> Result<(), ActionError> {
+        let Some(key) = key.into() else { return Ok(()) };
+        let answer = serde_json::to_string(answer).expect("an answer always has a JSON form");
+        let order = PastOrder { request: remembered(by, request), answer };
+        Ok(write.remember_order(&key.0, &order, now_ms).await?)
+    }
+}
+
+/// An answer that is given again when its order comes again.
+trait Remembered: Serialize + DeserializeOwned {
+    /// Leaves out the robots that are not among these.
+    fn keep_robots(&mut self, own: &HashSet<RobotId>);
+}
+
+impl Remembered for Vec<MatchedRobot> {
+    fn keep_robots(&mut self, own: &HashSet<RobotId>) {
+        self.retain(|robot| own.contains(&robot.id));
+    }
+}
+
+impl Remembered for DeploymentId {
+    /// It names none: what is shown of the deployment is a question of its own.
+    fn keep_robots(&mut self, _own: &HashSet<RobotId>) {}
+}
+
+/// A request as it is remembered with its answer. That of the first token is remembered as it was before there were users.
+fn remembered(by: &Person, request: &str) -> String {
+    let text = if by.is_first() { request.to_owned() } else { format!("{} {request}", by.name) };
+    Digest::of(text.as_bytes()).to_string()
+}
+
+/// Refuses an order as a whole if one of the robots it means is not the person's: a part of it would be a surprise.
+/// `what` says what means them.
+fn check_scope(by: &Person, robots: &[KnownRobot], what: impl FnOnce() -> String) -> Result<(), ActionError> {
+    let outside = robots.iter().filter(|robot| !by.scope.covers(&robot.id, &robot.name, &robot.labels)).count();
+    if outside == 0 {
+        return Ok(());
+    }
+    let (meant, what, person, scope) = (robots.len(), what(), by.name.clone(), by.scope.to_string());
+    Err(ActionError::OutOfScope { outside, meant, what, person, scope })
+}
+
+/// The robots that match. A name that no robot of the person's has is a mistake that would go unnoticed.
+fn all_known(matching: Matching) -> Result<Vec<KnownRobot>, ActionError> {
+    if matching.unknown.is_empty() { Ok(matching.robots) } else { Err(ActionError::UnknownRobots(matching.unknown)) }
+}
+
+/// The first names of a list that may be long.
+fn listed(names: &[RobotName]) -> String {
+    const MAX_NAMES: usize = 20;
+    let listed: Vec<&str> = names.iter().take(MAX_NAMES).map(RobotName::as_str).collect();
+    match names.len().saturating_sub(MAX_NAMES) {
+        0 => listed.join(", "),
+        more => format!("{} and {more} more", listed.join(", ")),
+    }
+}
+
+fn out_of_scope(outside: usize, meant: usize, what: &str, person: &UserName, scope: &str) -> String {
+    if meant == 1 {
+        return format!("{what} is outside of {person}'s scope {scope:?}; nothing was done");
+    }
+    format!("{outside} of the {meant} robots of {what} are outside of {person}'s scope {scope:?}; nothing was done")
+}
+
+/// A selector in an error.
+fn quoted(selector: &Selector) -> String {
+    let text: String = selector.to_string().chars().take(80).collect();
+    format!("{text:?}")
+}
+
+/// Why an order was not carried out. Nothing of it was.
+#[derive(Debug, thiserror::Error)]
+pub enum ActionError {
+    /// The selector means nobody, or nobody who has the task.
+    #[error("no robots match {0}")]
+    NoRobotsMatch(String),
+    /// The selector names robots that there are not, or that are none of the person's.
+    #[error("selector: no robot that takes orders has the name or id {}; nothing was done", listed(.0))]
+    UnknownRobots(Vec<RobotName>),
+    /// The key came with another order before.
+    #[error("the idempotency key {0:?} was used for another order")]
+    IdempotencyKeyReused(String),
+    /// Text that is no idempotency key.
+    #[error("an idempotency key has 1 to 128 visible ASCII characters")]
+    InvalidIdempotencyKey,
+    /// Some of the robots meant are not the person's.
+    #[error("{}", out_of_scope(*outside, *meant, what, person, scope))]
+    OutOfScope {
+        /// How many are not.
+        outside: usize,
+        /// How many are meant.
+        meant: usize,
+        /// By what.
+        what: String,
+        /// Whose scope.
+        person: UserName,
+        /// The scope.
+        scope: String,
+    },
+    /// It takes something else than the person has.
+    #[error("{0}")]
+    NotPermitted(String),
+    /// Name and password don't belong together, or there is no such user.
+    #[error("the user name or the password is wrong")]
+    SignInRefused,
+    /// Too many were wrong.
+    #[error("too many wrong passwords; try again in {seconds} s")]
+    SignInBlocked {
+        /// When the next one is looked at.
+        seconds: u64,
+    },
+    /// More at once than can be checked.
+    #[error("too many sign-ins at once; try again")]
+    TooManySignIns,
+    /// No rule gives whoever came by the provider a role.
+    #[error("nothing that the provider says of you gives you a role here; ask an administrator")]
+    NoRole {
+        /// Who was a user until now.
+        removed: Option<UserName>,
+    },
+    /// The provider does not say what to call them.
+    #[error("the provider has no name for you that is a user name here; ask an administrator")]
+    NoName,
+    /// The provider and the rules for it decide.
+    #[error("{0} signs in by the provider: what {0} may is for oidc.rules in the configuration to say")]
+    OfProvider(UserName),
+    /// It could not be hashed.
+    #[error("the password could not be hashed")]
+    PasswordFailed,
+    /// The name is taken.
+    #[error("there is a user {0} already, or the name stands for something else")]
+    UserExists(UserName),
+    /// No such user.
+    #[error("there is no user {0}")]
+    UserNotFound(UserName),
+    /// No such token, or somebody else's.
+    #[error("there is no token {0} of yours")]
+    TokenNotFound(TokenId),
+    /// Without them nobody could administer the server any more.
+    #[error("{0} is the last administrator with a way in; give another one a password first")]
+    LastAdministrator(UserName),
+    /// A request that makes no sense.
+    #[error("{key}: {reason}")]
+    Invalid {
+        /// The request's key.
+        key: &'static str,
+        /// What is wrong with its value.
+        reason: String,
+    },
+    /// More than an announcement may carry was ordered to ride inside one.
+    #[error("delivery: {package} has {size}, inline carries at most {most}")]
+    TooLargeForInline {
+        /// Name and version.
+        package: String,
+        /// What it has.
+        size: String,
+        /// What is possible.
+        most: String,
+    },
+    /// Someone is registered by this MAC.
+    #[error("a robot with MAC {mac} is registered as {name}; to register it again, make a token for that robot")]
+    MacKnown {
+        /// The MAC.
+        mac: MacAddress,
+        /// Who has it.
+        name: RobotName,
+    },
+    /// A token made for one robot was used by another.
+    #[error("this token is for the robot {name} with MAC {mac}")]
+    TokenForOther {
+        /// Whose it is.
+        name: RobotName,
+        /// The MAC of that robot.
+        mac: MacAddress,
+    },
+    /// Someone has this name.
+    #[error("a robot named {0} exists")]
+    NameTaken(RobotName),
+    /// It was approved before, or never had to be.
+    #[error("robot {0} does not wait to be approved; taskd robot rm removes it")]
+    NotPending(RobotName),
+    /// So many wait that no other may.
+    #[error("{0} robots wait to be approved: approve or reject some of them first")]
+    TooManyPending(u64),
+    /// So many enrol that this one has to wait.
+    #[error("too many robots enrol at once; try again in {seconds} s (enrolment.per_minute)")]
+    TooManyEnrolments {
+        /// When there is room.
+        seconds: u64,
+    },
+    /// No such enrolment token, or it has ended.
+    #[error("there is no enrolment token {0}")]
+    EnrolmentNotFound(TokenId),
+    /// The enrolment token is unknown, used up, expired or revoked.
+    #[error("the enrolment token is unknown, used up, expired or revoked")]
+    TokenRefused,
+    /// The robot was registered again and the token made then waits for its first use: the old agent gets no other.
+    #[error("robot {0} was registered again and its new token was not used yet")]
+    EnrolledAnew(RobotId),
+    /// There is no such robot.
+    #[error("there is no robot {0:?}")]
+    RobotNotFound(String),
+    /// There is no such deployment.
+    #[error("there is no deployment {0}")]
+    DeploymentNotFound(DeploymentId),
+    /// It has ended well everywhere, or something else was ordered since.
+    #[error(
+        "there is no such robot for which deployment {0} has ended badly and of which nothing else was ordered since"
+    )]
+    NothingToRetry(DeploymentId),
+    /// Nobody had another package of the task before.
+    #[error("none of these robots had another package of {0} before that has run there and is still on the server")]
+    NothingToRollBack(TaskName),
+    /// It was deleted.
+    #[error("{0} {1} is no longer on the server: push it again")]
+    PackageNotFound(TaskName, Version),
+    /// The deployment was cancelled before.
+    #[error("deployment {0} was cancelled")]
+    DeploymentCancelled(DeploymentId),
+    /// It is over, and nothing of it can be put back.
+    #[error(
+        "deployment {0} is over: nothing of it is under way or has failed, so it is left as it is; stop, remove or roll back the task instead"
+    )]
+    NothingToCancel(DeploymentId),
+    /// It does not wait for the operator.
+    #[error("deployment {id} is not paused: {why}")]
+    NotPaused {
+        /// The deployment.
+        id: DeploymentId,
+        /// What it waits for.
+        why: String,
+    },
+    /// The robot's generation is higher than ours: the database was restored. It is left alone until its next order.
+    #[error("robot {0} reports a later state than the server knows; it is left alone until its next order")]
+    Diverged(RobotId),
+    /// The database failed.
+    #[error("the database failed")]
+    Store(#[from] StoreError),
+}
+
+impl ActionError {
+    /// The stable code of the error on the wire.
+    pub fn code(&self) -> &'static str {
+        match self {
+            Self::NoRobotsMatch(_) => "no_robots_match",
+            Self::UnknownRobots(_) => "unknown_robots",
+            Self::OutOfScope { .. } => "out_of_scope",
+            Self::NotPermitted(_) => "forbidden",
+            Self::SignInBlocked { .. }
+            | Self::TooManySignIns
+            | Self::TooManyPending(_)
+            | Self::TooManyEnrolments { .. } => "too_many_requests",
+            Self::NotPending(_) => "not_pending",
+            Self::NoRole { .. } => "no_role",
+            Self::NoName => "no_name",
+            Self::OfProvider(_) => "of_provider",
+            Self::UserExists(_) => "user_exists",
+            Self::LastAdministrator(_) => "last_administrator",
+            Self::IdempotencyKeyReused(_) => "idempotency_key_reused",
+            Self::InvalidIdempotencyKey | Self::Invalid { .. } => "invalid_request",
+            Self::TooLargeForInline { .. } => "package_too_large",
+            Self::MacKnown { .. } => "mac_known",
+            Self::TokenForOther { .. } => "token_for_other_robot",
+            Self::NameTaken(_) => "name_taken",
+            Self::TokenRefused | Self::SignInRefused => "unauthorized",
+            Self::EnrolledAnew(_) => "enrolled_anew",
+            Self::RobotNotFound(_)
+            | Self::DeploymentNotFound(_)
+            | Self::UserNotFound(_)
+            | Self::TokenNotFound(_)
+            | Self::EnrolmentNotFound(_) => "not_found",
+            Self::DeploymentCancelled(_) => "deployment_cancelled",
+            Self::NotPaused { .. } => "not_paused",
+            Self::NothingToCancel(_) => "nothing_to_cancel",
+            Self::NothingToRetry(_) => "nothing_to_retry",
+            Self::NothingToRollBack(_) => "nothing_to_roll_back",
+            Self::PackageNotFound(..) => "package_not_found",
+            Self::Diverged(_) => "diverged",
+            Self::Store(_) | Self::PasswordFailed => "internal",
+        }
+    }
+}
+
+/// What makes an order safe to repeat: 1 to 128 visible ASCII characters.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct IdempotencyKey(String);
+
+impl FromStr for IdempotencyKey {
+    type Err = ActionError;
+    fn from_str(text: &str) -> Result<Self, ActionError> {
+        let valid = (1..=128).contains(&text.len()) && text.bytes().all(|byte| byte.is_ascii_graphic());
+        if valid { Ok(Self(text.to_owned())) } else { Err(ActionError::InvalidIdempotencyKey) }
+    }
+}
+
+impl fmt::Display for IdempotencyKey {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}

@@ -1,0 +1,196 @@
+//! Decides, inside the write that begins a batch, how the bytes travel to each of its robots: gathers what is known, lets
+//! [`crate::domain::delivery`] choose, stores the choice with its reason. It never changes what was decided before.
+
+use std::collections::HashMap;
+use std::net::IpAddr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use task_proto::desired::{BlobRef, Delivery, PackageRef};
+use task_proto::id::{LabelKey, LabelValue, Labels};
+use task_proto::report::{Phase, TaskReport};
+use task_proto::{DeploymentId, RobotId};
+
+use crate::config::DeliverySettings;
+use crate::domain::delivery::{Inputs, Quantity, Rules, choose};
+use crate::fleet::presence::Presence;
+use crate::store::{Decided, RobotFacts, StoreError, Write};
+
+/// Who decides. Clones decide alike.
+#[derive(Clone)]
+pub struct Chooser {
+    rules: Arc<Rules>,
+    inline_bytes: u64,
+    site_label: LabelKey,
+    presence: Arc<Presence>,
+    load: Arc<ServerLoad>,
+}
+
+/// What the server was doing for robots when it was looked at last.
+#[derive(Debug, Default)]
+pub struct ServerLoad {
+    transfers: AtomicU64,
+    backlog: AtomicU64,
+}
+
+/// Where a robot is: what its label says, else the network its address belongs to.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+enum Site {
+    Label(LabelValue),
+    V4([u8; 3]),
+    V6([u16; 4]),
+}
+
+impl ServerLoad {
+    /// So many transfers are under way, and so many bytes of parts wait for their listeners.
+    pub fn set(&self, transfers: u64, backlog: u64) {
+        self.transfers.store(transfers, Ordering::Relaxed);
+        self.backlog.store(backlog, Ordering::Relaxed);
+    }
+}
+
+impl Chooser {
+    /// Decides by `settings` and by what `presence` and `load` say at the time.
+    pub fn new(settings: &DeliverySettings, presence: Arc<Presence>, load: Arc<ServerLoad>) -> Self {
+        Self {
+            rules: Arc::new(settings.rules()),
+            inline_bytes: settings.inline_bytes.into(),
+            site_label: settings.site_label.clone(),
+            presence,
+            load,
+        }
+    }
+
+    /// The most bytes of a package that ride inside an announcement.
+    pub fn inline_bytes(&self) -> u64 {
+        self.inline_bytes
+    }
+
+    /// For how long each of these robots has been offline; `None`: it is online.
+    pub fn offline_ms<'a>(&self, robots: impl IntoIterator<Item = &'a RobotId>, now_ms: u64) -> Vec<Option<u64>> {
+        self.presence.offline_ms(robots, now_ms)
+    }
+
+    /// Decides for `batch`, robots of `deployment` that begin now.
+    pub async fn decide(
+        &self,
+        write: &mut Write,
+        deployment: &DeploymentId,
+        batch: &[RobotId],
+        now_ms: u64,
+    ) -> Result<Vec<(RobotId, Delivery)>, StoreError> {
+        let order = write.delivery_order(deployment).await?;
+        let known = write.robot_facts(batch, &order.package.content.digest).await?;
+        let sites = self.robots_by_site(write, deployment, now_ms).await?;
+        let common = Inputs {
+            size: travelling_bytes(&order.package),
+            robots: order.robots,
+            batch: batch.len() as u64,
+            transfers: self.load.transfers.load(Ordering::Relaxed),
+            backlog: self.load.backlog.load(Ordering::Relaxed),
+            ..Inputs::default()
+        };
+        let decide = |facts: RobotFacts| {
+            let inputs = self.inputs_of(&facts, &order.package, sites.as_ref(), common, now_ms);
+            let decision = choose(&self.rules, order.choice, &inputs);
+            let inputs = serde_json::to_string(&inputs).expect("plain numbers always have a JSON form");
+            Decided { robot: facts.robot, decision, inputs }
+        };
+        let decided: Vec<Decided> = known.into_iter().map(decide).collect();
+        write.store_decisions(deployment, &decided).await?;
+        Ok(decided.into_iter().map(|decided| (decided.robot, decided.decision.mechanism)).collect())
+    }
+
+    fn inputs_of(
+        &self,
+        facts: &RobotFacts,
+        package: &PackageRef,
+        sites: Option<&HashMap<Site, u64>>,
+        common: Inputs,
+        now_ms: u64,
+    ) -> Inputs {
+        let link = facts.link.unwrap_or_default();
+        let sighting = self.presence.get(&facts.robot, now_ms);
+        // A robot of which no site is known is alone on its own.
+        let on_site = |sites: &HashMap<Site, u64>| {
+            let site = self.site_of(
+                &facts.labels,
+                sighting.as_ref().and_then(|sighting| sighting.address).map(|address| address.ip()),
+            );
+            site.and_then(|site| sites.get(&site).copied()).unwrap_or(1)
+        };
+        Inputs {
+            lacking: lacking_bytes(package, facts.has.as_ref()),
+            same_site: sites.map(on_site),
+            connected: sighting.as_ref().is_some_and(|sighting| sighting.connection.is_some()),
+            metered: facts.labels.iter().any(|(key, value)| (key.as_str(), value.as_str()) == ("metered", "true")),
+            throughput_bytes_per_s: link.throughput_bytes_per_s,
+            rtt_ms: link.rtt_ms.map(u64::from),
+            losses: link.losses.into(),
+            reconnects: link.reconnects.into(),
+            battery_percent: facts.battery_percent,
+            ..common
+        }
+    }
+
+    /// How many robots of `deployment` are on each site; `None` where no rule asks, for all their labels must be read.
+    async fn robots_by_site(
+        &self,
+        write: &mut Write,
+        deployment: &DeploymentId,
+        now_ms: u64,
+    ) -> Result<Option<HashMap<Site, u64>>, StoreError> {
+        if !self.rules.ask_for(Quantity::SameSite) {
+            return Ok(None);
+        }
+        let mut sites = HashMap::new();
+        for (robot, labels) in write.labels_in(deployment).await? {
+            let address =
+                self.presence.get(&robot, now_ms).and_then(|sighting| sighting.address).map(|address| address.ip());
+            if let Some(site) = self.site_of(&labels, address) {
+                *sites.entry(site).or_default() += 1;
+            }
+        }
+        Ok(Some(sites))
+    }
+
+    fn site_of(&self, labels: &Labels, address: Option<IpAddr>) -> Option<Site> {
+        if let Some(value) = labels.get(&self.site_label) {
+            return Some(Site::Label(value.clone()));
+        }
+        Some(match address?.to_canonical() {
+            IpAddr::V4(address) => {
+                let [a, b, c, _] = address.octets();
+                Site::V4([a, b, c])
+            }
+            IpAddr::V6(address) => {
+                let [a, b, c, d, ..] = address.segments();
+                Site::V6([a, b, c, d])
+            }
+        })
+    }
+}
+
+/// The bytes of a package that travel to a robot which has none of them.
+pub fn travelling_bytes(package: &PackageRef) -> u64 {
+    package.content.size.saturating_add(package.config.size)
+}
+
+/// Those that a robot lacks which reports `has`, a task with the same content.
+fn lacking_bytes(package: &PackageRef, has: Option<&TaskReport>) -> u64 {
+    let Some(has) = has else { return travelling_bytes(package) };
+    let content = match has.phase {
+        Phase::Unpacking
+        | Phase::Building
+        | Phase::Staged
+        | Phase::Starting
+        | Phase::Running
+        | Phase::Succeeded
+        | Phase::Stopped
+        | Phase::RolledBack => 0,
+        Phase::Fetching => package.content.size.saturating_sub(has.progress.map_or(0, |progress| progress.done)),
+        _ => package.content.size,
+    };
+    let BlobRef { digest, size } = package.config;
+    content.saturating_add(if has.package.config.digest == digest && content == 0 { 0 } else { size })
+}

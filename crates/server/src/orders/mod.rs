@@ -1,0 +1,10 @@
+//! Owns how orders and reports change the fleet's state, and who is told of it; it never speaks
+//! HTTP or MQTT and holds no SQL.
+
+pub mod actions;
+pub mod advance;
+pub mod changes;
+pub mod chooser;
+pub mod feed;
+pub mod report_meter;
+pub mod report_writer;

@@ -1,0 +1,162 @@
+//! The database beside the service: opened, waited for where its server is away, and checked in full now and then. It holds no
+//! SQL and serves nobody.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use task_proto::token::Token;
+use tokio::sync::watch;
+use tokio_util::sync::CancellationToken;
+
+use crate::fleet::presence::{Claim, Presence};
+use crate::store::{Fault, ReportedBy, Store, StoreError};
+use crate::system::clock::Clock;
+
+/// The first and the longest pause before a database that is away is tried again.
+const PAUSES: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(5)];
+
+/// The first operator, whose token every server has.
+pub struct FirstOperator {
+    /// The token.
+    pub token: Token,
+    /// The file with the token.
+    pub path: PathBuf,
+}
+
+/// A database, and the steps between its opening and its first use.
+pub struct Database {
+    store: Store,
+    operator: FirstOperator,
+    /// Learns from the database which agent each robot had last.
+    presence: Arc<Presence>,
+    /// The database knows the first operator, and the presence the agents.
+    is_ready: bool,
+    clock: Clock,
+    /// Why the database can't be used, once it is known.
+    unusable: watch::Sender<Option<String>>,
+}
+
+impl Database {
+    /// Opens the database at `url`. A Postgres that is away or has no connection left is left to [`Self::attend`].
+    pub async fn open(
+        url: &str,
+        operator: FirstOperator,
+        presence: Arc<Presence>,
+        clock: Clock,
+    ) -> Result<Self, StoreError> {
+        let store = match Store::open(url).await {
+            Err(error) if passes(&error) && url.starts_with("postgres") => {
+                let error = &error as &dyn std::error::Error;
+                tracing::warn!(error, "the database can't be opened now; the server waits for it");
+                Store::unopened(url)
+            }
+            opened => opened?,
+        };
+        let unusable = watch::Sender::default();
+        let mut database = Self { store, operator, presence, is_ready: false, clock, unusable };
+        match database.make_ready().await {
+            Err(error) if error.fault() == Some(Fault::Away) => {}
+            made => made?,
+        }
+        Ok(database)
+    }
+
+    /// The database.
+    pub fn store(&self) -> &Store {
+        &self.store
+    }
+
+    /// Becomes the reason when the database was waited for and then can't be used.
+    pub fn unusable(&self) -> watch::Receiver<Option<String>> {
+        self.unusable.subscribe()
+    }
+
+    /// Waits for the database whenever it is away, until `stop`.
+    pub async fn attend(mut self, stop: CancellationToken) {
+        tokio::select! {
+            () = stop.cancelled() => {}
+            () = self.wait_whenever_away() => {}
+        }
+    }
+
+    async fn wait_whenever_away(&mut self) {
+        let [first, longest] = PAUSES;
+        loop {
+            let mut pause = first;
+            while !self.store.state().is_there() || !self.is_ready {
+                tokio::time::sleep(pause).await;
+                pause = longest.min(pause * 2);
+                let Err(error) = self.bring_up().await else { continue };
+                if !passes(&error) {
+                    let error = anyhow::Error::new(error);
+                    self.unusable.send_replace(Some(format!("{error:#}")));
+                    return;
+                }
+            }
+            self.store.state().away().await;
+        }
+    }
+
+    /// Asks the database whether it is there; does what is to be done once, if that was not done yet.
+    async fn bring_up(&mut self) -> Result<(), StoreError> {
+        if !self.store.state().is_open() {
+            self.store.prepare().await?;
+        }
+        if !self.is_ready {
+            return self.make_ready().await;
+        }
+        // Whatever else it answers, it is there.
+        match self.store.ping().await {
+            Err(error) if error.fault() == Some(Fault::Away) => Err(error),
+            _ => Ok(()),
+        }
+    }
+
+    /// Does, once, the steps that precede the first use.
+    async fn make_ready(&mut self) -> Result<(), StoreError> {
+        self.register_operator().await?;
+        let now_ms = self.clock.now_ms();
+        for (robot, ReportedBy { instance, place }) in self.store.last_agents().await? {
+            self.presence.remember(&robot, Claim { instance, place }, now_ms);
+        }
+        self.is_ready = true;
+        Ok(())
+    }
+
+    /// Makes sure that the token in the directory opens this database, which may be new or restored.
+    async fn register_operator(&self) -> Result<(), StoreError> {
+        let (now_ms, FirstOperator { token, path }) = (self.clock.now_ms(), &self.operator);
+        if self.store.token_holder(token, now_ms).await?.is_some() {
+            return Ok(());
+        }
+        match self.store.create_operator_token(token, now_ms).await {
+            Err(error) if error.is_unique_violation() => {
+                tracing::warn!("the token in {} was revoked and stays so", path.display());
+                Ok(())
+            }
+            created => created,
+        }
+    }
+}
+
+/// Whether the error is of a kind that passes by itself.
+fn passes(error: &StoreError) -> bool {
+    matches!(error.fault(), Some(Fault::Away | Fault::Busy))
+}
+
+/// Checks the database in full at once and then at this interval, until `stop`.
+pub async fn keep_checked(store: Store, clock: Clock, interval: Duration, stop: CancellationToken) {
+    let mut ticks = tokio::time::interval(interval);
+    ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    loop {
+        tokio::select! {
+            () = stop.cancelled() => return,
+            _ = ticks.tick() => {}
+        }
+        // Ends soon after `stop`.
+        if let Err(error) = store.check(clock.now_ms(), stop.clone()).await {
+            error.log("the database could not be checked");
+        }
+    }
+}

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use task_proto::oci::{MANIFEST_TYPE, PACKAGE_TYPE};
-use taskd::http::oci::parsed::Parsed;
+use taskd::http::registry::oci::parsed::Parsed;
 
 /// An OCI manifest: its parts are known each once, its texts fit a header, and one that calls itself a package is that
 /// package when it is written again.

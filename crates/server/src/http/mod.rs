@@ -1,45 +1,19 @@
 //! Owns the HTTP edge: one table of routes, each with who may call it, and their handlers; it never
 //! holds SQL and never decides what an order means.
 
-pub mod archives;
-mod ask;
-pub mod attempts;
+pub mod accounts;
 pub mod auth;
-mod broker;
-mod bulk;
-mod conduct;
-mod deployments;
-pub mod drain;
-mod enroll;
+pub mod connection;
 pub mod error;
 pub mod events;
 pub mod extract;
-mod feed;
-mod health;
-mod history;
-pub mod listener;
-mod logs;
-mod mqtt;
-pub mod oci;
-mod oidc;
+mod fleet;
 mod openapi;
-mod outputs;
-mod packages;
-mod people;
-pub mod person_limits;
-mod proxy;
-pub mod readiness;
-mod robots;
-pub mod server_facts;
-pub mod session;
+mod orders;
+pub mod registry;
+pub mod server;
 pub mod shared_lists;
-pub mod status;
-mod tasks;
-pub mod traffic;
-pub mod upload;
 mod views;
-mod vitals;
-pub mod web;
 
 use std::net::IpAddr;
 use std::ops::Deref;
@@ -60,8 +34,8 @@ use task_proto::person::Permission;
 use task_proto::selector::MAX_SELECTOR_BYTES;
 use tokio_util::sync::CancellationToken;
 
-use self::readiness::Readiness;
-use self::server_facts::ServerFacts;
+use self::server::readiness::Readiness;
+use self::server::server_facts::ServerFacts;
 use crate::auth::oidc::Provider;
 use crate::blobs::Blobs;
 use crate::broker::Broker;
@@ -79,9 +53,14 @@ use crate::orders::feed::Feed;
 use crate::orders::report_writer::ReportWriter;
 use crate::store::Store;
 use crate::system::clock::Clock;
+use accounts::{oidc, people, session};
 use auth::{Access, Gate, guard};
 use error::ApiError;
+use fleet::{ask, broker, bulk, enroll, feed, history, logs, mqtt, outputs, robots, vitals};
 use openapi::{Describe as _, Draft};
+use orders::{deployments, tasks};
+use registry::{archives, oci, packages, upload};
+use server::{health, status, web};
 
 /// What handlers work with. Clones are the same: a request makes several on its way.
 #[derive(Clone)]
@@ -114,9 +93,9 @@ pub struct AppParts {
     /// Whose turn it is to pull them.
     pub transfers: Transfers,
     /// Where packages are packed that come as directories.
-    pub uploads: upload::UploadSpace,
+    pub uploads: registry::upload::UploadSpace,
     /// Who is signed in at the page.
-    pub sessions: Arc<session::Sessions>,
+    pub sessions: Arc<accounts::session::Sessions>,
     /// Robots' requests that are under way.
     pub http_connections: Arc<HttpConnections>,
     /// How robots behave.
@@ -124,15 +103,15 @@ pub struct AppParts {
     /// By whom people may sign in, if there is such a provider.
     pub provider: Option<Arc<Provider>>,
     /// What people ask for.
-    pub people: Arc<person_limits::PersonLimits>,
+    pub people: Arc<auth::person_limits::PersonLimits>,
     /// Failed authentications.
-    pub attempts: Arc<attempts::FailedAttempts>,
+    pub attempts: Arc<auth::attempts::FailedAttempts>,
     /// What happened last.
     pub feed: Feed,
     /// What holds for as long as the server runs.
     pub facts: Arc<ServerFacts>,
     /// What was found out about it last.
-    pub slow_figures: Arc<status::SlowFigures>,
+    pub slow_figures: Arc<server::status::SlowFigures>,
     /// The long lists that are being rendered.
     pub lists: Arc<shared_lists::SharedLists>,
     /// The event stream's source.
@@ -146,7 +125,7 @@ pub struct AppParts {
     /// The addresses of reverse proxies that are believed about where a request came from.
     pub trusted_proxies: Arc<[IpAddr]>,
     /// What went over HTTP.
-    pub http_traffic: Arc<traffic::HttpTotals>,
+    pub http_traffic: Arc<connection::traffic::HttpTotals>,
     /// The data directory.
     pub data: PathBuf,
     /// Whether the server can do its work.
@@ -170,7 +149,7 @@ impl Deref for App {
     }
 }
 
-impl FromRef<App> for oci::Registry {
+impl FromRef<App> for registry::oci::Registry {
     fn from_ref(app: &App) -> Self {
         Self {
             store: app.store.clone(),
@@ -383,11 +362,11 @@ pub fn router(app: App) -> Router {
         .fallback(nothing_here)
         .method_not_allowed_fallback(method_not_allowed)
         .layer(middleware::map_response(harden))
-        .layer(middleware::map_request(drain::drain_unread));
+        .layer(middleware::map_request(connection::drain::drain_unread));
     // Nothing stands in the way of each request where nobody is to be believed.
     let router = match trusted.is_empty() {
         true => router,
-        false => router.layer(middleware::map_request_with_state(trusted, proxy::see_through)),
+        false => router.layer(middleware::map_request_with_state(trusted, connection::proxy::see_through)),
     };
     router.with_state(app)
 }

@@ -9,7 +9,7 @@ use task_proto::{Digest, RepositoryName, RobotId};
 use taskd::blobs::BlobSettings;
 use taskd::config::BlobRead;
 use taskd::http::auth::Caller;
-use taskd::http::oci::Registry;
+use taskd::http::registry::oci::Registry;
 use taskd::store::{NewManifest, PutManifest, StoredManifest};
 
 use crate::database::{TestDatabase, on_both_databases};

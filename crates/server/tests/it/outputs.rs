@@ -11,7 +11,7 @@ use task_proto::output::{OUTPUT_TYPE, OutputFile, OutputSet};
 use task_proto::{Digest, RobotId};
 use taskd::blobs::BlobSettings;
 use taskd::blobs::collector;
-use taskd::http::oci::Registry;
+use taskd::http::registry::oci::Registry;
 
 use crate::database::{TestDatabase, on_both_databases};
 use crate::harness::{TestRobot, TestServer, refusal};

@@ -19,7 +19,7 @@ use task_proto::api::{EnrollResponse, EnrollmentToken, RobotToken};
 use task_proto::token::Token;
 use task_transport::{ClientKey, Duplex, Route, Trust, dial};
 use taskd::config::Config;
-use taskd::http::listener::{Limits, Service, serve};
+use taskd::http::connection::listener::{Limits, Service, serve};
 use taskd::system::clock::Clock;
 use tempfile::TempDir;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};

@@ -13,7 +13,6 @@ use utoipa::{IntoParams, ToSchema};
 use super::super::auth::Caller;
 use super::super::error::ApiError;
 use super::super::extract::{JsonBody, PathParam, PathParams, QueryParams, TolerantJson};
-use super::super::oci::OciError;
 use super::super::shared_lists::SharedJson;
 use super::Draft;
 use crate::domain::person::Person;
@@ -120,12 +119,6 @@ impl Answer for NoContent {
 }
 
 impl<T: Answer> Answer for Result<T, ApiError> {
-    fn describe(draft: &mut Draft) {
-        T::describe(draft);
-    }
-}
-
-impl<T: Answer> Answer for Result<T, OciError> {
     fn describe(draft: &mut Draft) {
         T::describe(draft);
     }

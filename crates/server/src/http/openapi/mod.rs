@@ -15,10 +15,10 @@ use utoipa::openapi::tag::TagBuilder;
 use utoipa::openapi::{ComponentsBuilder, InfoBuilder, License, OpenApi, OpenApiBuilder, Paths};
 
 pub(super) use self::draft::{Draft, OrderKey};
-pub(super) use self::handler::{Created, Describe};
-use super::session::COOKIE;
+pub(super) use self::handler::{Answer, Created, Describe};
+use super::auth::COOKIE;
 use super::{Route, routes};
-use crate::http::web::is_known;
+use crate::http::server::web::is_known;
 
 /// Operations are grouped by these.
 const TAGS: [(&str, &str); 12] = [

@@ -1,0 +1,177 @@
+//! People: who they are, how they sign in by the command line, their tokens, and what they did. What concerns someone's
+//! rights ends the MQTT sessions that they have by their old ones.
+
+use std::net::SocketAddr;
+
+use axum::Json;
+use axum::extract::{ConnectInfo, State};
+use axum::response::NoContent;
+use serde::Deserialize;
+use task_proto::api::{
+    AccessToken, AddUser, AuditPage, AuditQuery, ChangePassword, CreateToken, EditUser, LogIn, Me, SetPassword,
+    TokenList, TokenOrigin, UserList, UserView,
+};
+use task_proto::person::Permission;
+use task_proto::{TokenId, UserName};
+use utoipa::IntoParams;
+
+use crate::domain::person::Person;
+use crate::http::App;
+use crate::http::auth::not_permitted;
+use crate::http::error::ApiError;
+use crate::http::extract::{JsonBody, PathParam, QueryParams};
+use crate::http::openapi::Created;
+
+/// Says who is asking, and what they may.
+#[utoipa::path(get, path = "/api/v1/me", tag = "people")]
+pub(in crate::http) async fn me(by: Person) -> Json<Me> {
+    let permissions = Permission::ALL.into_iter().filter(|&permission| by.may(permission)).collect();
+    let Person { name, roles, scope, token, .. } = by;
+    Json(Me { name, roles, permissions, scope: scope.selectors().to_vec(), token })
+}
+
+/// Lists the users.
+#[utoipa::path(get, path = "/api/v1/users", tag = "people")]
+pub(in crate::http) async fn users(State(app): State<App>) -> Result<Json<UserList>, ApiError> {
+    let users = app.store.users().await?;
+    Ok(Json(UserList { users: users.into_iter().map(crate::store::User::view).collect() }))
+}
+
+/// Adds a user.
+#[utoipa::path(post, path = "/api/v1/users", tag = "people",
+    responses((status = 409, description = "`user_exists`: the name is taken.")))]
+pub(in crate::http) async fn add_user(
+    State(app): State<App>,
+    by: Person,
+    JsonBody(order): JsonBody<AddUser>,
+) -> Result<Created<UserView>, ApiError> {
+    Ok(Created(app.actions.add_user(&by, &order).await?))
+}
+
+/// Changes what a user may do.
+#[utoipa::path(patch, path = "/api/v1/users/{user}", tag = "people",
+    responses((status = 409, description = "`last_administrator`, or `of_provider`: the provider says what they may.")))]
+pub(in crate::http) async fn edit_user(
+    State(app): State<App>,
+    by: Person,
+    PathParam(user): PathParam<UserName>,
+    JsonBody(edit): JsonBody<EditUser>,
+) -> Result<Json<UserView>, ApiError> {
+    let view = app.actions.edit_user(&by, &user, &edit).await?;
+    app.broker.disconnect_person(&user);
+    Ok(Json(view))
+}
+
+/// Removes a user; their tokens and sessions end.
+#[utoipa::path(delete, path = "/api/v1/users/{user}", tag = "people",
+    responses((status = 409, description = "`last_administrator`: somebody has to be able to administer.")))]
+pub(in crate::http) async fn remove_user(
+    State(app): State<App>,
+    by: Person,
+    PathParam(user): PathParam<UserName>,
+) -> Result<NoContent, ApiError> {
+    app.actions.remove_user(&by, &user).await?;
+    app.broker.disconnect_person(&user);
+    Ok(NoContent)
+}
+
+/// Sets anybody's password. What was signed in with the old one has ended.
+#[utoipa::path(put, path = "/api/v1/users/{user}/password", tag = "people",
+    responses((status = 409, description = "`of_provider`: who signs in by the provider has no password here.")))]
+pub(in crate::http) async fn set_password(
+    State(app): State<App>,
+    by: Person,
+    PathParam(user): PathParam<UserName>,
+    JsonBody(order): JsonBody<SetPassword>,
+) -> Result<NoContent, ApiError> {
+    app.actions.set_password(&by, &user, &order.password).await?;
+    app.broker.disconnect_person(&user);
+    Ok(NoContent)
+}
+
+/// Sets one's own password. What was signed in with the old one has ended.
+#[utoipa::path(put, path = "/api/v1/password", tag = "people",
+    responses((status = 409, description = "`of_provider`: who signs in by the provider has no password here."),
+        (status = 429, description = "The old password was wrong too often.")))]
+pub(in crate::http) async fn change_password(
+    State(app): State<App>,
+    by: Person,
+    JsonBody(order): JsonBody<ChangePassword>,
+) -> Result<NoContent, ApiError> {
+    app.actions.change_password(&by, &order).await?;
+    app.broker.disconnect_person(&by.name);
+    Ok(NoContent)
+}
+
+/// Exchanges name and password for a token.
+#[utoipa::path(post, path = "/api/v1/login", tag = "session",
+    responses((status = 401, description = "Name or password is not right."),
+        (status = 429, description = "Too many attempts failed, of this user or from this address.")))]
+pub(in crate::http) async fn log_in(
+    State(app): State<App>,
+    ConnectInfo(peer): ConnectInfo<SocketAddr>,
+    JsonBody(order): JsonBody<LogIn>,
+) -> Result<Created<AccessToken>, ApiError> {
+    let signed_in = app.actions.sign_in(&order, TokenOrigin::Login, peer.ip().to_canonical()).await?;
+    let id = signed_in.token.id().parse().map_err(|error| ApiError::internal(&error))?;
+    let (token, expires_at_ms) = (signed_in.token.reveal(), signed_in.expires_at_ms);
+    Ok(Created(AccessToken { id, token, user: signed_in.user, expires_at_ms }))
+}
+
+/// The query of `GET /tokens`.
+#[derive(Deserialize, IntoParams)]
+#[serde(deny_unknown_fields)]
+pub(in crate::http) struct TokensQuery {
+    /// Everybody's, which takes the permission `administer`.
+    #[serde(default)]
+    all: bool,
+}
+
+/// Lists one's own tokens, or everybody's.
+#[utoipa::path(get, path = "/api/v1/tokens", tag = "people")]
+pub(in crate::http) async fn tokens(
+    State(app): State<App>,
+    by: Person,
+    QueryParams(query): QueryParams<TokensQuery>,
+) -> Result<Json<TokenList>, ApiError> {
+    if query.all && !by.may(Permission::Administer) {
+        return Err(not_permitted(&by, Permission::Administer));
+    }
+    Ok(Json(app.actions.tokens(&by, query.all).await?))
+}
+
+/// Makes a token that may do as much as one may oneself, or less.
+#[utoipa::path(post, path = "/api/v1/tokens", tag = "people",
+    responses((status = 404, description = "There is no such user.")))]
+pub(in crate::http) async fn create_token(
+    State(app): State<App>,
+    by: Person,
+    JsonBody(order): JsonBody<CreateToken>,
+) -> Result<Created<AccessToken>, ApiError> {
+    Ok(Created(app.actions.create_token(&by, &order).await?))
+}
+
+/// Revokes a token.
+#[utoipa::path(delete, path = "/api/v1/tokens/{token}", tag = "people")]
+pub(in crate::http) async fn revoke_token(
+    State(app): State<App>,
+    by: Person,
+    PathParam(token): PathParam<TokenId>,
+) -> Result<NoContent, ApiError> {
+    let user = app.actions.revoke_token(&by, &token).await?;
+    app.broker.disconnect_person(&user);
+    Ok(NoContent)
+}
+
+/// Reads what was done, by whom and from where.
+#[utoipa::path(get, path = "/api/v1/audit", tag = "people")]
+pub(in crate::http) async fn audit(
+    State(app): State<App>,
+    QueryParams(query): QueryParams<AuditQuery>,
+) -> Result<Json<AuditPage>, ApiError> {
+    let texts = [("who", &query.who), ("target", &query.target), ("act", &query.act)];
+    if let Some((key, _)) = texts.iter().find(|(_, text)| text.as_ref().is_some_and(|text| text.contains('\0'))) {
+        return Err(ApiError::invalid(format!("{key}: it has a control character")));
+    }
+    Ok(Json(app.store.audit(&query).await?))
+}

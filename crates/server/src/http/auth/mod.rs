@@ -1,0 +1,493 @@
+//! Owns the guard before every route, who is calling and whether they may; it never decides what a
+//! caller's order means.
+//!
+//! Every route names its [`Access`]; the guard finds the [`Caller`] and refuses the rest.
+
+pub mod attempts;
+pub(super) mod conduct;
+pub mod person_limits;
+
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use axum::body::Body;
+use axum::extract::rejection::RawPathParamsRejection;
+use axum::extract::{ConnectInfo, FromRequestParts, RawPathParams, Request, State};
+use axum::middleware::Next;
+use axum::response::{IntoResponse, Response};
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use futures_util::{StreamExt as _, stream};
+use http::request::Parts;
+use http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, header};
+use http_body::Body as _;
+use task_proto::person::Permission;
+use task_proto::token::Token;
+use task_proto::{RobotId, UserName};
+use tokio::time::{Instant, timeout_at};
+
+use self::conduct::hold_up;
+use self::person_limits::{RequestKind, UnderWay};
+use super::App;
+use super::error::{ApiError, ROBOT_REVOKED};
+use crate::domain::person::Person;
+use crate::limits::conduct::Way;
+use crate::link::gatekeeper::ended_others;
+use crate::net::http_connections::{Connection, Holder};
+use crate::net::tls::ClientProof;
+use crate::store::{Admitted, Fault, StoreError, TokenHolder, with_shared_reads};
+
+/// The name of a session's cookie.
+pub(super) const COOKIE: &str = "taskd_session";
+
+/// Who may call a route.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Access {
+    /// Everybody, known or not.
+    Anyone,
+    /// A person, by a token or a signed-in page, who has the permission. Which robots it holds for is the handler's to look at.
+    Person(Permission),
+    /// The robot that the path's `{robot}` names, and no other.
+    OwnRobot,
+    /// A machine with an enrolment token that is still good.
+    Enrolment,
+    /// A person or any robot; the handler narrows what each of them gets.
+    PersonOrRobot,
+}
+
+/// Which of its tokens a robot called with, by number. Handlers for robots may take it as an extension.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct TokenNumber(pub u64);
+
+/// Who is calling, as the guard found out. Handlers take it as an argument.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Caller {
+    /// Nobody known: only on routes for anyone.
+    Anyone,
+    /// A person.
+    Person(Person),
+    /// A robot.
+    Robot(RobotId),
+    /// The holder of an enrolment token.
+    Enrolment(Box<Token>),
+}
+
+impl Caller {
+    /// The robot that calls; `None` for everybody else.
+    pub fn robot(&self) -> Option<&RobotId> {
+        match self {
+            Self::Robot(robot) => Some(robot),
+            _ => None,
+        }
+    }
+
+    /// The person that calls; `None` for everybody else.
+    pub fn person(&self) -> Option<&Person> {
+        match self {
+            Self::Person(person) => Some(person),
+            _ => None,
+        }
+    }
+
+    /// For whom the connection of such a request counts; `None`: for nobody known.
+    fn holder(&self) -> Option<Holder> {
+        match self {
+            Self::Anyone => None,
+            Self::Person(person) => Some(Holder::Person(person.name.clone())),
+            Self::Robot(robot) => Some(Holder::Robot(robot.clone())),
+            Self::Enrolment(token) => Some(Holder::Enrolment(token.id())),
+        }
+    }
+
+    fn may(&self, access: Access, own: Option<&str>) -> bool {
+        match access {
+            Access::Anyone => true,
+            Access::Person(permission) => matches!(self, Self::Person(person) if person.may(permission)),
+            Access::OwnRobot => self.robot().is_some_and(|robot| own == Some(robot.as_str())),
+            Access::Enrolment => matches!(self, Self::Enrolment(_)),
+            Access::PersonOrRobot => matches!(self, Self::Person(_) | Self::Robot(_)),
+        }
+    }
+}
+
+impl<S: Sync> FromRequestParts<S> for Caller {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, _state: &S) -> Result<Self, ApiError> {
+        // Absent only if a handler was mounted without the guard: then nobody is let in.
+        parts.extensions.get::<Self>().cloned().ok_or_else(|| ApiError::unauthorized("this route has no guard"))
+    }
+}
+
+impl<S: Sync> FromRequestParts<S> for Person {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, ApiError> {
+        match Caller::from_request_parts(parts, state).await? {
+            Caller::Person(person) => Ok(person),
+            _ => Err(ApiError::forbidden("only people may do that")),
+        }
+    }
+}
+
+/// What the guard of one route knows.
+#[derive(Clone)]
+pub(super) struct Gate {
+    pub(super) app: App,
+    pub(super) access: Access,
+    pub(super) deadline: Option<Duration>,
+    pub(super) waits_for_robot: bool,
+}
+
+/// Stands before every handler: finds the caller, refuses whoever may not, and ends what takes too long.
+pub(super) async fn guard(
+    State(gate): State<Gate>,
+    ConnectInfo(peer): ConnectInfo<SocketAddr>,
+    params: Result<RawPathParams, RawPathParamsRejection>,
+    mut request: Request,
+    next: Next,
+) -> Response {
+    let is_oci = request.uri().path().starts_with("/v2");
+    // A path that is no text names nobody; the handler says that there is no such thing.
+    let own = params.iter().flatten().find(|(name, _)| *name == "robot").map(|(_, value)| value);
+    let proof = request.extensions().get::<ClientProof>().cloned().unwrap_or_default();
+    let begun = match admit(&gate, peer, own, Showing::of(&request, &proof)).await {
+        Ok((caller, token_number)) => begin(&gate, caller, request.method()).await.map(|begun| (begun, token_number)),
+        Err(error) => Err(error),
+    };
+    let (Begun { mut caller, counted }, token_number) = match begun {
+        Ok(begun) => begun,
+        Err(error) if is_oci => return error.into_oci_response(),
+        Err(error) => return error.into_response(),
+    };
+    if let Caller::Person(person) = &mut caller {
+        person.address = Some(peer.ip().to_canonical());
+    }
+    request.extensions_mut().insert(caller);
+    request.extensions_mut().insert(token_number);
+    let answer = answered(request, next, gate.deadline, counted.map(|counted| (gate.app.clone(), counted)));
+    let Some(deadline) = gate.deadline else { return answer.await };
+    tokio::time::timeout(deadline, answer).await.unwrap_or_else(|_| {
+        if !gate.app.store.state().is_there() {
+            return ApiError::from(Fault::Away).into_response();
+        }
+        let message = "the request took too long to arrive or to be answered";
+        ApiError::new(StatusCode::REQUEST_TIMEOUT, "timeout", message).into_response()
+    })
+}
+
+/// A request whose turn it is.
+struct Begun {
+    caller: Caller,
+    counted: Option<Counted>,
+}
+
+/// A person's request, while it counts as under way.
+struct Counted {
+    person: UserName,
+    kind: RequestKind,
+    under_way: UnderWay,
+}
+
+/// Holds up or refuses a caller that sends too much.
+async fn begin(gate: &Gate, caller: Caller, method: &Method) -> Result<Begun, ApiError> {
+    let counted = match &caller {
+        Caller::Person(person) => {
+            let kind = match gate.waits_for_robot {
+                true => RequestKind::Question,
+                false => RequestKind::of(gate.access, method, gate.deadline.is_none()),
+            };
+            let under_way = gate.app.people.begin(&person.name, kind).await?;
+            Some(Counted { person: person.name.clone(), kind, under_way })
+        }
+        Caller::Robot(robot) => {
+            if let Some(way) = way_of(gate.access, method) {
+                hold_up(&gate.app, robot, way, method).await?;
+            }
+            None
+        }
+        Caller::Anyone | Caller::Enrolment(_) => None,
+    };
+    Ok(Begun { caller, counted })
+}
+
+/// By which way a robot that asks for this comes; none if it pulls a package's bytes, which has limits of its own.
+fn way_of(access: Access, method: &Method) -> Option<Way> {
+    match access {
+        Access::OwnRobot => Some(Way::Http),
+        Access::PersonOrRobot if *method != Method::GET => Some(Way::Outputs),
+        _ => None,
+    }
+}
+
+/// The handler's answer. What changes something goes on to its end even if nobody waits for it any more: what is done after a
+/// commit, like cutting off whoever has lost their rights, belongs to it. Only its body has to have come by then.
+async fn answered(
+    request: Request,
+    next: Next,
+    deadline: Option<Duration>,
+    counted: Option<(App, Counted)>,
+) -> Response {
+    if request.method().is_safe() {
+        return run(request, next, counted).await;
+    }
+    let request = match deadline {
+        Some(deadline) => request.map(|body| arriving_within(deadline, body)),
+        None => request,
+    };
+    match tokio::spawn(run(request, next, counted)).await {
+        Ok(response) => response,
+        Err(panic) => std::panic::resume_unwind(panic.into_panic()),
+    }
+}
+
+/// Runs the handler. What people only ask for leaves some of the database's connections to robots and orders.
+async fn run(request: Request, next: Next, counted: Option<(App, Counted)>) -> Response {
+    let Some((app, Counted { person, kind, under_way })) = counted else { return next.run(request).await };
+    let response = match kind {
+        RequestKind::Order => next.run(request).await,
+        _ => with_shared_reads(next.run(request)).await,
+    };
+    if kind != RequestKind::Stream {
+        app.people.answered(&person, kind, response.body().size_hint().lower());
+    }
+    drop(under_way);
+    response
+}
+
+/// A body that breaks off where it takes longer.
+fn arriving_within(deadline: Duration, body: Body) -> Body {
+    let end = Instant::now() + deadline;
+    Body::from_stream(stream::unfold(body.into_data_stream(), move |mut chunks| async move {
+        match timeout_at(end, chunks.next()).await {
+            Ok(chunk) => chunk.map(|chunk| (chunk, chunks)),
+            Err(late) => Some((Err(axum::Error::new(late)), chunks)),
+        }
+    }))
+}
+
+/// What a request shows of who sent it.
+struct Showing<'a> {
+    method: &'a Method,
+    headers: &'a HeaderMap,
+    proof: &'a ClientProof,
+    connection: Option<&'a Connection>,
+}
+
+impl<'a> Showing<'a> {
+    fn of(request: &'a Request, proof: &'a ClientProof) -> Self {
+        Self { method: request.method(), headers: request.headers(), proof, connection: request.extensions().get() }
+    }
+}
+
+async fn admit(
+    gate: &Gate,
+    peer: SocketAddr,
+    own: Option<&str>,
+    showing: Showing<'_>,
+) -> Result<(Caller, TokenNumber), ApiError> {
+    if gate.access == Access::Anyone {
+        return Ok((Caller::Anyone, TokenNumber(0)));
+    }
+    match identify_on_connection(&gate.app, &showing).await {
+        Ok((caller, token_number)) if caller.may(gate.access, own) => Ok((caller, token_number)),
+        Ok((Caller::Anyone, _)) => Err(ApiError::unauthorized("a token is needed: Authorization: Bearer …")),
+        Ok((Caller::Person(person), _)) if let Access::Person(permission) = gate.access => {
+            Err(not_permitted(&person, permission))
+        }
+        Ok(_) => Err(ApiError::forbidden("this token may not do that")),
+        // Its token was known, so nobody is guessing.
+        Err(error) if error.code == ROBOT_REVOKED => Err(error),
+        Err(error) if error.status == StatusCode::UNAUTHORIZED => {
+            let is_too_many = gate.app.attempts.record(peer.ip(), gate.app.clock.now_ms());
+            Err(if is_too_many { ApiError::too_many("too many wrong tokens from this address") } else { error })
+        }
+        Err(error) => Err(error),
+    }
+}
+
+/// Says what is missing, so that people know whom to ask for what.
+pub(super) fn not_permitted(person: &Person, permission: Permission) -> ApiError {
+    let (name, roles) = (&person.name, &person.roles);
+    ApiError::forbidden(if person.roles.allow(permission) {
+        format!("{name} is limited to the robots {:?}, and this concerns all of them", person.scope.to_string())
+    } else {
+        format!("{name} has no permission to {permission} (roles: {roles})")
+    })
+}
+
+/// Who calls. From now on the connection counts for them, and if it is a robot, it is cut when the robot is put out. What
+/// comes without a token changes nothing: a connection stays with the last one that was shown on it.
+async fn identify_on_connection(app: &App, showing: &Showing<'_>) -> Result<(Caller, TokenNumber), ApiError> {
+    let arrival = app.http_connections.arrival();
+    let identified = identify(app, showing).await?;
+    let (Some(connection), Some(holder)) = (showing.connection, identified.0.holder()) else { return Ok(identified) };
+    let is_still_good = arrival.identified(&holder, connection);
+    if is_still_good || !matches!(holder, Holder::Robot(_)) { Ok(identified) } else { identify(app, showing).await }
+}
+
+/// Who sent this request. `Anyone` if it does not say; an error if it says it wrongly.
+async fn identify(app: &App, showing: &Showing<'_>) -> Result<(Caller, TokenNumber), ApiError> {
+    let &Showing { method, headers, .. } = showing;
+    let now_ms = app.clock.now_ms();
+    let is_read = matches!(*method, Method::GET | Method::HEAD);
+    let token = if let Some(value) = headers.get(header::AUTHORIZATION) {
+        let Presented { text, is_from_browser } = presented(value)?;
+        // Browsers keep a password for a site and send it along with whatever another page makes them send. Programs send no
+        // origin.
+        if is_from_browser && !is_read && comes_from_page(headers) {
+            require_same_origin(headers)?;
+        }
+        parsed(&text)?
+    } else if let Some(session) = app.sessions.find(headers, now_ms) {
+        if !is_read {
+            require_same_origin(headers)?;
+        }
+        session.token
+    } else {
+        return Ok((Caller::Anyone, TokenNumber(0)));
+    };
+    let Some(holder) = let_in(app, &token, showing, now_ms).await? else {
+        if app.store.is_of_revoked_robot(&token).await? {
+            return Err(ApiError::robot_revoked());
+        }
+        return Err(ApiError::unauthorized("the token is unknown, expired or revoked"));
+    };
+    Ok(match holder {
+        TokenHolder::Person(person) => (Caller::Person(person), TokenNumber(0)),
+        TokenHolder::Enrolment => (Caller::Enrolment(Box::new(token)), TokenNumber(0)),
+        TokenHolder::Pending { .. } => return Err(ApiError::awaits_approval()),
+        TokenHolder::Robot { robot, token_number, .. } => (Caller::Robot(robot), TokenNumber(token_number)),
+    })
+}
+
+/// Whose token this is, if it is good. Goes on to its end even if the client does not wait for it: a robot's first use of a
+/// token has ended its others by then, and who came in by those has to go.
+async fn let_in(
+    app: &App,
+    token: &Token,
+    showing: &Showing<'_>,
+    now_ms: u64,
+) -> Result<Option<TokenHolder>, StoreError> {
+    let (app, token, proof) = (app.clone(), token.clone(), showing.proof.clone());
+    let connection = showing.connection.cloned();
+    let _lookup = match &connection {
+        Some(connection) => Some(connection.lookup().await),
+        None => None,
+    };
+    let admitting = tokio::spawn(async move {
+        let Some(Admitted { holder, is_first_use }) = app.store.admit(&token, &proof, now_ms).await? else {
+            return Ok(None);
+        };
+        if let Some(connection) = connection.as_ref().filter(|_| !matches!(holder, TokenHolder::Pending { .. })) {
+            connection.authenticate();
+        }
+        if let TokenHolder::Robot { robot, .. } = &holder
+            && is_first_use
+        {
+            // Whoever is connected came in by the token that has just ended; this request's own connection stays.
+            app.broker.disconnect(robot);
+            if let Some(connection) = connection {
+                connection.release();
+            }
+            ended_others(&app.presence, &app.http_connections, &app.changes, robot);
+        }
+        Ok(Some(holder))
+    });
+    match admitting.await {
+        Ok(admitted) => admitted,
+        Err(panic) => std::panic::resume_unwind(panic.into_panic()),
+    }
+}
+
+/// The token that these headers show.
+pub(super) fn shown_token(headers: &HeaderMap) -> Result<Token, ApiError> {
+    let value = headers.get(header::AUTHORIZATION);
+    let value = value.ok_or_else(|| ApiError::unauthorized("Authorization: it is missing"))?;
+    parsed(&presented(value)?.text)
+}
+
+fn parsed(token: &str) -> Result<Token, ApiError> {
+    token.parse().map_err(|error| ApiError::unauthorized(format!("Authorization: {error}")))
+}
+
+/// The token in an `Authorization` header.
+#[derive(Debug, PartialEq, Eq)]
+struct Presented {
+    text: String,
+    /// It came as a password (`Basic`), which a browser adds by itself once it knows one.
+    is_from_browser: bool,
+}
+
+fn presented(value: &HeaderValue) -> Result<Presented, ApiError> {
+    let presented = value.to_str().ok().and_then(presented_token);
+    presented.ok_or_else(|| ApiError::unauthorized("Authorization: expected Bearer or Basic and a token"))
+}
+
+/// The token of `Bearer TOKEN` or `Basic base64(anything:TOKEN)`.
+fn presented_token(value: &str) -> Option<Presented> {
+    let (scheme, rest) = value.trim().split_once(' ')?;
+    if scheme.eq_ignore_ascii_case("bearer") {
+        return Some(Presented { text: rest.trim().to_owned(), is_from_browser: false });
+    }
+    if !scheme.eq_ignore_ascii_case("basic") {
+        return None;
+    }
+    let decoded = String::from_utf8(STANDARD.decode(rest.trim()).ok()?).ok()?;
+    let (_, password) = decoded.split_once(':')?;
+    Some(Presented { text: password.to_owned(), is_from_browser: true })
+}
+
+const SEC_FETCH_SITE: HeaderName = HeaderName::from_static("sec-fetch-site");
+
+/// Whether a browser sent this for a page.
+fn comes_from_page(headers: &HeaderMap) -> bool {
+    headers.contains_key(SEC_FETCH_SITE) || headers.contains_key(header::ORIGIN)
+}
+
+/// Refuses what a foreign page could have made a signed-in browser send.
+pub(super) fn require_same_origin(headers: &HeaderMap) -> Result<(), ApiError> {
+    let text = |name| headers.get(name).and_then(|value: &http::HeaderValue| value.to_str().ok());
+    let is_same = match (text(SEC_FETCH_SITE), text(header::ORIGIN)) {
+        (Some(site), _) => site == "same-origin",
+        (None, Some(origin)) => origin.split_once("://").map(|(_, host)| host) == text(header::HOST),
+        (None, None) => false,
+    };
+    if is_same { Ok(()) } else { Err(ApiError::forbidden("Origin: a page may only call its own server")) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tokens_come_as_bearer_or_as_a_password() {
+        let token = |text: &str, is_from_browser| Some(Presented { text: text.to_owned(), is_from_browser });
+        assert_eq!(presented_token("Bearer abc"), token("abc", false));
+        assert_eq!(presented_token("bearer  abc "), token("abc", false));
+        let basic = format!("Basic {}", STANDARD.encode("anyone:a:b"));
+        assert_eq!(presented_token(&basic), token("a:b", true));
+        for bad in ["", "Bearer", "Basic !", "Digest abc", &format!("Basic {}", STANDARD.encode("abc"))] {
+            assert_eq!(presented_token(bad), None, "{bad:?}");
+        }
+    }
+
+    #[test]
+    fn only_the_page_itself_may_change_things() {
+        let check = |pairs: &[(&'static str, &'static str)]| {
+            let headers: HeaderMap = pairs
+                .iter()
+                .map(|(name, value)| (http::HeaderName::from_static(name), http::HeaderValue::from_static(value)))
+                .collect();
+            require_same_origin(&headers).is_ok()
+        };
+        let host = ("host", "fleet.example:8080");
+        assert!(check(&[host, ("origin", "http://fleet.example:8080")]));
+        assert!(check(&[host, ("sec-fetch-site", "same-origin")]));
+        assert!(!check(&[host]));
+        assert!(!check(&[host, ("origin", "null")]));
+        assert!(!check(&[host, ("origin", "http://evil.example")]));
+        assert!(!check(&[host, ("origin", "http://fleet.example:9090")]));
+        assert!(!check(&[host, ("origin", "http://fleet.example:8080"), ("sec-fetch-site", "cross-site")]));
+    }
+}

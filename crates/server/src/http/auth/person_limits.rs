@@ -1,0 +1,189 @@
+//! How much one person may ask of the server at a time, with all of their tokens and sessions together, so that nobody's
+//! requests wait long behind those of another: requests per second, and requests under way. Orders are counted apart from
+//! everything else, so that a person's own reads never keep them from stopping a robot.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use http::Method;
+use task_proto::UserName;
+use task_proto::person::Permission;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::time::{Instant, sleep_until, timeout};
+
+use super::Access;
+use crate::config::PersonRates;
+use crate::http::error::ApiError;
+use crate::limits::rate_limit::{RateLimiter, Turn};
+
+/// Requests of one kind that one person may have under way. A browser has six.
+const UNDER_WAY: usize = 8;
+/// The same of questions to robots, each of which may wait for long. There may be 1,024 in all.
+const QUESTIONS_UNDER_WAY: usize = 64;
+/// How long a further one waits until another has ended.
+const PATIENCE: Duration = Duration::from_secs(15);
+/// An answer counts as one request more for each of these bytes.
+const BYTES_A_REQUEST: u64 = 64 * 1024;
+/// Above this number of people and kinds those are forgotten that have nothing under way.
+const SWEEP_ABOVE: usize = 1_024;
+
+/// What a request of a person is counted with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(in crate::http) enum RequestKind {
+    /// It changes what robots do.
+    Order,
+    /// It changes something else.
+    Change,
+    /// It is answered from the database.
+    Read,
+    /// It brings a part of a package.
+    Upload,
+    /// It waits for a robot's answer.
+    Question,
+    /// It goes on for long: its number is bounded elsewhere.
+    Stream,
+}
+
+impl RequestKind {
+    /// Of a request for a route with this access. `is_stream`: the route has no deadline.
+    pub(in crate::http) fn of(access: Access, method: &Method, is_stream: bool) -> Self {
+        match access {
+            Access::Person(Permission::Operate | Permission::Maintain) if !method.is_safe() => Self::Order,
+            Access::PersonOrRobot if !method.is_safe() => Self::Upload,
+            _ if is_stream => Self::Stream,
+            _ if method.is_safe() => Self::Read,
+            _ => Self::Change,
+        }
+    }
+
+    /// How many of them one person may have under way.
+    fn limit(self) -> usize {
+        match self {
+            Self::Order | Self::Change | Self::Read | Self::Upload => UNDER_WAY,
+            Self::Question => QUESTIONS_UNDER_WAY,
+            Self::Stream => Semaphore::MAX_PERMITS,
+        }
+    }
+}
+
+/// What all people have asked for.
+#[derive(Debug)]
+pub struct PersonLimits {
+    orders: RateLimiter<UserName>,
+    others: RateLimiter<UserName>,
+    under_way: Mutex<HashMap<(UserName, RequestKind), Arc<Semaphore>>>,
+}
+
+/// A request under way; dropping it ends that.
+#[derive(Debug)]
+pub(in crate::http) struct UnderWay(#[expect(dead_code, reason = "it is held, not read")] Option<OwnedSemaphorePermit>);
+
+impl PersonLimits {
+    /// Nobody has asked for anything yet.
+    pub fn new(rates: PersonRates) -> Self {
+        let limiter = || RateLimiter::new(rates.requests_per_s);
+        Self { orders: limiter(), others: limiter(), under_way: Mutex::default() }
+    }
+
+    /// Waits for the turn of a request, for a moment.
+    pub(in crate::http) async fn begin(&self, person: &UserName, kind: RequestKind) -> Result<UnderWay, ApiError> {
+        let now = Instant::now();
+        match self.limiter(kind).ask(person.clone(), now) {
+            Turn::At(at) if at > now => sleep_until(at).await,
+            Turn::At(_) => {}
+            Turn::Refused(until) => {
+                let seconds = until.duration_since(now).as_secs() + 1;
+                let error = ApiError::too_many(format!("{person} sends too many requests: try again in {seconds} s"));
+                return Err(ApiError { retry_after_s: seconds, ..error });
+            }
+        }
+        let ended = timeout(PATIENCE, self.under_way(person, kind).acquire_owned()).await;
+        // The semaphore is never closed.
+        ended.map(|permit| UnderWay(permit.ok())).map_err(|_| {
+            let message =
+                format!("{person} has {} requests under way already: try again when one has ended", kind.limit());
+            ApiError { retry_after_s: 1, ..ApiError::too_many(message) }
+        })
+    }
+
+    /// The answer to a request had this length.
+    pub(in crate::http) fn answered(&self, person: &UserName, kind: RequestKind, bytes: u64) {
+        let more = bytes / BYTES_A_REQUEST;
+        if more > 0 {
+            self.limiter(kind).charge(person.clone(), more, Instant::now());
+        }
+    }
+
+    fn limiter(&self, kind: RequestKind) -> &RateLimiter<UserName> {
+        if kind == RequestKind::Order { &self.orders } else { &self.others }
+    }
+
+    fn under_way(&self, person: &UserName, kind: RequestKind) -> Arc<Semaphore> {
+        let mut all = self.lock();
+        if all.len() >= SWEEP_ABOVE {
+            // Whoever waits for one or has one holds it too.
+            all.retain(|_, semaphore| Arc::strong_count(semaphore) > 1);
+        }
+        all.entry((person.clone(), kind)).or_insert_with(|| Arc::new(Semaphore::new(kind.limit()))).clone()
+    }
+
+    fn lock(&self) -> MutexGuard<'_, HashMap<(UserName, RequestKind), Arc<Semaphore>>> {
+        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing half-done.
+        self.under_way.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use futures_util::FutureExt as _;
+
+    use super::*;
+
+    fn person(name: &str) -> UserName {
+        name.parse().expect("a name")
+    }
+
+    fn begun(limits: &PersonLimits, name: &str, kind: RequestKind) -> Option<Result<UnderWay, ApiError>> {
+        limits.begin(&person(name), kind).now_or_never()
+    }
+
+    #[tokio::test]
+    async fn reads_that_use_up_their_rate_leave_orders_and_others_theirs() {
+        let limits = PersonLimits::new(PersonRates { requests_per_s: 1 });
+        limits.answered(&person("alice"), RequestKind::Read, 1 << 30);
+        let refused = begun(&limits, "alice", RequestKind::Change).expect("at once").expect_err("refused");
+        assert_eq!(refused.status, http::StatusCode::TOO_MANY_REQUESTS);
+        assert!((10..=11).contains(&refused.retry_after_s), "{}", refused.retry_after_s);
+        for (name, kind) in [("alice", RequestKind::Order), ("bob", RequestKind::Read)] {
+            begun(&limits, name, kind).expect("at once").expect("it has its own rate");
+        }
+    }
+
+    #[tokio::test]
+    async fn request_beyond_the_limit_waits_for_one_of_its_kind_to_end() {
+        let limits = PersonLimits::new(PersonRates::default());
+        let start = |_| begun(&limits, "alice", RequestKind::Read).expect("at once").expect("begun");
+        let mut reads: Vec<_> = (0..UNDER_WAY).map(start).collect();
+        assert!(begun(&limits, "alice", RequestKind::Read).is_none(), "it waits");
+        for (name, kind) in [("alice", RequestKind::Order), ("alice", RequestKind::Stream), ("bob", RequestKind::Read)]
+        {
+            begun(&limits, name, kind).expect("at once").expect("begun");
+        }
+        reads.pop();
+        begun(&limits, "alice", RequestKind::Read).expect("at once").expect("begun");
+        drop(reads);
+        (0..SWEEP_ABOVE).for_each(|n| drop(begun(&limits, &format!("u{n}"), RequestKind::Read)));
+        assert!(limits.lock().len() <= SWEEP_ABOVE);
+    }
+
+    #[test]
+    fn stop_and_cancel_are_orders_and_a_list_is_none() {
+        let kind = |permission, method| RequestKind::of(Access::Person(permission), &method, false);
+        assert_eq!(kind(Permission::Operate, Method::POST), RequestKind::Order);
+        assert_eq!(kind(Permission::Maintain, Method::DELETE), RequestKind::Order);
+        assert_eq!(kind(Permission::Read, Method::GET), RequestKind::Read);
+        assert_eq!(kind(Permission::Read, Method::POST), RequestKind::Change);
+        assert_eq!(RequestKind::of(Access::PersonOrRobot, &Method::PATCH, true), RequestKind::Upload);
+    }
+}

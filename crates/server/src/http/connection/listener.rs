@@ -1,0 +1,517 @@
+//! The accept loop: how many connections there are, how long a client may dawdle, also in its TLS handshake, and how they
+//! end. It knows no routes.
+
+use std::convert::Infallible;
+use std::io;
+use std::net::{IpAddr, SocketAddr};
+use std::pin::{Pin, pin};
+use std::sync::Arc;
+use std::task::{Context, Poll, ready};
+use std::time::{Duration, Instant};
+
+use axum::Router;
+use axum::body::Body;
+use axum::extract::ConnectInfo;
+use bytes::Bytes;
+use futures_util::FutureExt as _;
+use http::Request;
+use http_body::{Frame, SizeHint};
+use hyper::body::Incoming;
+use hyper::server::conn::http1;
+use hyper_util::rt::{TokioIo, TokioTimer};
+use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
+use tokio::time::{Sleep, timeout};
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
+use tower::ServiceExt as _;
+
+use super::traffic::HttpTotals;
+use crate::net::anteroom::{Anteroom, Place};
+use crate::net::http_connections::{Connection, HttpConnections};
+use crate::net::tls::{ClientProof, Tls};
+
+/// How long a connection on which no good token was shown is left when its place is needed: enough to sign in, or to get a page.
+const GRACE: Duration = Duration::from_secs(3);
+/// How long a request's head may take, also the first one of a connection, and how long one is kept without a request.
+const HEAD_TIMEOUT: Duration = Duration::from_secs(20);
+/// How long a client may pause within a body it sends.
+const BODY_PAUSE: Duration = Duration::from_secs(30);
+/// What has to come of a body in each [`BODY_PAUSE`] that it is waited for, less than the slowest of links brings.
+const LEAST_BODY_BYTES: usize = 16 * 1024;
+/// How long a client may leave our bytes unread.
+const WRITE_PAUSE: Duration = Duration::from_secs(60);
+/// A request's head may be no larger.
+const MOST_HEAD_BYTES: usize = 64 * 1024;
+/// This share of all connections, one in so many, is kept free of holders that have more than theirs.
+const RESERVED_SHARE: usize = 16;
+/// How long the listener rests after it has cut a connection for another.
+const CUT_PAUSE: Duration = Duration::from_millis(1);
+/// How long a place is waited for before the holders are looked at again.
+const LOOK_AGAIN: Duration = Duration::from_millis(250);
+/// Pause after an accept that failed because of us, for example for want of file descriptors.
+const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+
+/// How many connections there may be.
+#[derive(Debug, Clone)]
+pub struct Limits {
+    /// At a time. When nearly all are taken, the holder with the most loses its oldest. Where none has more than its share,
+    /// those without a request end, those without a good token in any case, and more wait in the listener's backlog.
+    pub max_connections: usize,
+    /// Those of one address on which no good token was shown yet; a further one takes the place of the oldest.
+    pub max_silent_per_address: usize,
+    /// Whose connections are many clients': they count as silent until their first request, and end between requests only.
+    pub proxies: Arc<[IpAddr]>,
+    /// How long a TLS handshake may take.
+    pub handshake_timeout: Duration,
+}
+
+/// What is served, and what is kept of it.
+pub struct Service {
+    /// Answers requests.
+    pub router: Router,
+    /// What connections speak, if they are encrypted.
+    pub tls: Option<Tls>,
+    /// Whose connections they are.
+    pub connections: Arc<HttpConnections>,
+    /// What went over them.
+    pub traffic: Arc<HttpTotals>,
+}
+
+/// What all connections share.
+struct Site {
+    router: Router,
+    /// What they speak, if they are encrypted.
+    tls: Option<Tls>,
+    handshake_timeout: Duration,
+    proxies: Arc<[IpAddr]>,
+    traffic: Arc<HttpTotals>,
+    stop: CancellationToken,
+    /// Ends what `stop` did not end in time.
+    abort: CancellationToken,
+}
+
+/// A client that has just come.
+struct Guest {
+    peer: SocketAddr,
+    silent: Place,
+    /// What it has proven.
+    proof: ClientProof,
+    /// Whether its place is needed.
+    crowded: watch::Receiver<bool>,
+    handle: Connection,
+}
+
+/// Serves until `stop`, then lets requests under way end, for at most `patience`.
+pub async fn serve(
+    listener: TcpListener,
+    service: Service,
+    limits: Limits,
+    stop: CancellationToken,
+    patience: Duration,
+) {
+    let Service { router, tls, connections: registry, traffic } = service;
+    let places = Places::new(limits.max_connections, registry);
+    let anteroom = Anteroom::new(limits.max_silent_per_address);
+    let connections = TaskTracker::new();
+    let abort = CancellationToken::new();
+    let Limits { handshake_timeout, proxies, .. } = limits;
+    let site = Arc::new(Site { router, tls, handshake_timeout, proxies, traffic, stop, abort: abort.clone() });
+    loop {
+        let (stream, peer, place) = tokio::select! {
+            () = site.stop.cancelled() => break,
+            accepted = accept(&listener, &places) => accepted,
+        };
+        let silent = anteroom.enter(peer.ip(), Instant::now());
+        let proof = ClientProof::NotAsked;
+        let guest = Guest { peer, silent, proof, crowded: places.crowded.subscribe(), handle: Connection::default() };
+        let site = site.clone();
+        // Two kinds of task, so that a plain connection's does not need the room of an encrypted one's.
+        if site.tls.is_some() {
+            connections.spawn(async move {
+                site.attend_encrypted(stream, guest).await;
+                drop(place);
+            });
+        } else {
+            connections.spawn(async move {
+                site.attend(site.patient(stream, guest.handle.clone()), guest).await;
+                drop(place);
+            });
+        }
+    }
+    drop(listener);
+    connections.close();
+    if timeout(patience, connections.wait()).await.is_err() {
+        tracing::warn!("requests did not end in time and are cut off");
+    }
+    abort.cancel();
+}
+
+impl Site {
+    fn patient(&self, stream: TcpStream, handle: Connection) -> PatientStream {
+        // Answers are small and wanted at once; a failure here costs only latency.
+        let _ = stream.set_nodelay(true);
+        self.traffic.connection();
+        PatientStream { stream, stalled: None, traffic: self.traffic.clone(), handle }
+    }
+
+    /// Shakes hands, then serves the connection to its end.
+    async fn attend_encrypted(&self, stream: TcpStream, guest: Guest) {
+        let Some(tls) = &self.tls else { return };
+        let shaken = tokio::select! {
+            shaken = timeout(self.handshake_timeout, tls.accept(self.patient(stream, guest.handle.clone()))) => shaken,
+            () = gives_way(&guest.silent, guest.crowded.clone()) => return,
+            () = self.stop.cancelled() => return,
+        };
+        // Whoever speaks no TLS, or none that counts, is no event worth a line in the log.
+        if let Ok(Ok((stream, proof))) = shaken {
+            self.attend(stream, Guest { proof, ..guest }).await;
+        }
+    }
+
+    /// Serves one connection to its end.
+    async fn attend<S>(&self, stream: S, guest: Guest)
+    where
+        S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
+    {
+        let Guest { peer, silent, proof, crowded, handle } = guest;
+        let (spoken, is_proxy) = (CancellationToken::new(), self.proxies.contains(&peer.ip().to_canonical()));
+        let (router, traffic) = (self.router.clone(), self.traffic.clone());
+        let origin = Origin { peer, is_encrypted: self.tls.is_some(), proof, handle: handle.clone() };
+        let mut connection = pin!(connection(stream, origin, spoken.clone(), router, traffic));
+        let stranger = async {
+            tokio::select! {
+                () = handle.authenticated() => {}
+                () = spoken.cancelled(), if is_proxy => {}
+                () = gives_way(&silent, crowded.clone()) => {
+                    // What is being looked up by us is no reason to be cut.
+                    if !handle.is_authenticated_after_lookup().await {
+                        return;
+                    }
+                }
+            }
+            drop(silent);
+            std::future::pending().await
+        };
+        let ended = async {
+            tokio::select! {
+                _ = connection.as_mut() => return,
+                () = asked_to_end(&self.stop, &spoken, crowded.clone()) => connection.as_mut().graceful_shutdown(),
+            }
+            // A client that breaks off or dawdles is no event worth a line in the log.
+            let _ = connection.await;
+        };
+        tokio::select! {
+            () = ended => {}
+            () = stranger => {}
+            () = handle.cut() => {}
+            () = self.abort.cancelled() => {}
+        }
+    }
+}
+
+/// The connections there may be.
+struct Places {
+    free: Arc<Semaphore>,
+    most: usize,
+    /// Whether all are taken, or nearly all were since they last were.
+    crowded: watch::Sender<bool>,
+    /// Who has them.
+    registry: Arc<HttpConnections>,
+}
+
+impl Places {
+    fn new(most: usize, registry: Arc<HttpConnections>) -> Self {
+        Self { free: Arc::new(Semaphore::new(most)), most, crowded: watch::Sender::new(false), registry }
+    }
+
+    /// Takes one. The last ones are not for a holder that has more than its share: it loses its oldest connection for each
+    /// newcomer. Where no holder has more and none is left, connections without a request have to end.
+    async fn take(&self) -> Option<OwnedSemaphorePermit> {
+        if let Ok(place) = self.free.clone().try_acquire_owned() {
+            let left = self.free.available_permits();
+            self.crowded.send_if_modified(|crowded| left > self.most / 8 && std::mem::take(crowded));
+            if left < self.most / RESERVED_SHARE {
+                self.cut_one().await;
+            }
+            return Some(place);
+        }
+        loop {
+            if !self.cut_one().await {
+                self.crowded.send_replace(true);
+            }
+            // By the next look strangers may have shown whose they are. The semaphore is never closed, so there is always a
+            // permit; without one the connection would only be uncounted.
+            if let Ok(place) = timeout(LOOK_AGAIN, self.free.clone().acquire_owned()).await {
+                return place.ok();
+            }
+        }
+    }
+
+    /// Cuts the oldest connection of the holder with the most, if that is more than its share. A holder that comes again as
+    /// soon as it is cut would otherwise keep the whole server busy with it.
+    async fn cut_one(&self) -> bool {
+        let is_cut = self.registry.cut_oldest_of_largest(self.most);
+        if is_cut {
+            tokio::time::sleep(CUT_PAUSE).await;
+        }
+        is_cut
+    }
+}
+
+/// Resolves when a connection has to end as soon as it has no request: the server stops, or the places are needed and this
+/// one has had its turn.
+async fn asked_to_end(stop: &CancellationToken, spoken: &CancellationToken, crowded: watch::Receiver<bool>) {
+    let needed = async {
+        spoken.cancelled().await;
+        needed(crowded).await;
+    };
+    tokio::select! {
+        () = stop.cancelled() => {}
+        () = needed => {}
+    }
+}
+
+/// Resolves when a connection on which no good token was shown has to go, whatever it does: a neighbour needs its place, or
+/// anybody does. What it could do would otherwise take as long as whoever is behind it likes.
+async fn gives_way(silent: &Place, crowded: watch::Receiver<bool>) {
+    let needed = async {
+        needed(crowded).await;
+        tokio::time::sleep(GRACE).await;
+    };
+    tokio::select! {
+        () = silent.leave().cancelled() => {}
+        () = needed => {}
+    }
+}
+
+/// Resolves when the places are needed.
+async fn needed(mut crowded: watch::Receiver<bool>) {
+    if crowded.wait_for(|crowded| *crowded).await.is_err() {
+        // Nobody takes places any more.
+        std::future::pending().await
+    }
+}
+
+async fn accept(listener: &TcpListener, places: &Places) -> (TcpStream, SocketAddr, Option<OwnedSemaphorePermit>) {
+    let place = places.take().await;
+    loop {
+        match listener.accept().await {
+            Ok((stream, peer)) => return (stream, peer, place),
+            Err(error) if is_the_clients_fault(&error) => {}
+            Err(error) => {
+                tracing::warn!(%error, "a connection could not be accepted");
+                tokio::time::sleep(ACCEPT_PAUSE).await;
+            }
+        }
+    }
+}
+
+fn is_the_clients_fault(error: &io::Error) -> bool {
+    use io::ErrorKind::{ConnectionAborted, ConnectionRefused, ConnectionReset};
+    matches!(error.kind(), ConnectionAborted | ConnectionRefused | ConnectionReset)
+}
+
+/// Marks a request whose connection is not encrypted: only the kernel reads the bytes of its answer.
+#[derive(Debug, Clone, Copy)]
+pub(in crate::http) struct Unencrypted;
+
+/// What is known of every request of a connection.
+struct Origin {
+    peer: SocketAddr,
+    is_encrypted: bool,
+    proof: ClientProof,
+    handle: Connection,
+}
+
+impl Origin {
+    fn mark<B>(&self, request: &mut Request<B>) {
+        request.extensions_mut().insert(ConnectInfo(self.peer));
+        request.extensions_mut().insert(self.proof.clone());
+        request.extensions_mut().insert(self.handle.clone());
+        if !self.is_encrypted {
+            request.extensions_mut().insert(Unencrypted);
+        }
+    }
+}
+
+fn connection<S>(
+    stream: S,
+    origin: Origin,
+    spoken: CancellationToken,
+    router: Router,
+    traffic: Arc<HttpTotals>,
+) -> http1::UpgradeableConnection<
+    TokioIo<S>,
+    impl hyper::service::Service<Request<Incoming>, Response = http::Response<Body>, Error = Infallible, Future: Send>,
+>
+where
+    S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
+{
+    let service = hyper::service::service_fn(move |request: Request<Incoming>| {
+        spoken.cancel();
+        traffic.request();
+        let mut request = request.map(|body| Body::new(PatientBody::new(body)));
+        origin.mark(&mut request);
+        router.clone().oneshot(request)
+    });
+    http1::Builder::new()
+        .timer(TokioTimer::new())
+        .header_read_timeout(HEAD_TIMEOUT)
+        .max_buf_size(MOST_HEAD_BYTES)
+        .serve_connection(TokioIo::new(stream), service)
+        .with_upgrades()
+}
+
+/// A socket whose writes fail once the other side has read nothing for [`WRITE_PAUSE`], and whose bytes are counted.
+struct PatientStream {
+    stream: TcpStream,
+    stalled: Option<Pin<Box<Sleep>>>,
+    traffic: Arc<HttpTotals>,
+    handle: Connection,
+}
+
+impl PatientStream {
+    fn watch_write(&mut self, context: &mut Context<'_>, polled: Poll<io::Result<usize>>) -> Poll<io::Result<usize>> {
+        if let Poll::Ready(written) = &polled {
+            let bytes = *written.as_ref().unwrap_or(&0);
+            self.traffic.bytes_out(bytes);
+            self.handle.wrote(bytes);
+            self.stalled = None;
+            return polled;
+        }
+        let timer = self.stalled.get_or_insert_with(|| Box::pin(tokio::time::sleep(WRITE_PAUSE)));
+        timer.poll_unpin(context).map(|()| Err(io::ErrorKind::TimedOut.into()))
+    }
+}
+
+impl AsyncRead for PatientStream {
+    fn poll_read(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        buffer: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
+        let before = buffer.filled().len();
+        let polled = Pin::new(&mut self.stream).poll_read(context, buffer);
+        self.traffic.bytes_in(buffer.filled().len() - before);
+        polled
+    }
+}
+
+impl AsyncWrite for PatientStream {
+    fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        let polled = Pin::new(&mut self.stream).poll_write(context, bytes);
+        self.watch_write(context, polled)
+    }
+
+    fn poll_write_vectored(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        slices: &[io::IoSlice<'_>],
+    ) -> Poll<io::Result<usize>> {
+        let polled = Pin::new(&mut self.stream).poll_write_vectored(context, slices);
+        self.watch_write(context, polled)
+    }
+
+    fn is_write_vectored(&self) -> bool {
+        self.stream.is_write_vectored()
+    }
+
+    fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_flush(context)
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_shutdown(context)
+    }
+}
+
+/// A request's body that fails once the client has sent nothing for [`BODY_PAUSE`] while it was waited for, or too little
+/// in all the time that it was waited for.
+struct PatientBody {
+    body: Incoming,
+    waiting: Option<Wait>,
+    pace: BodyPace,
+}
+
+/// That more of a body is waited for.
+struct Wait {
+    since: Instant,
+    timer: Pin<Box<Sleep>>,
+}
+
+/// How fast a body comes. Only the time in which it is waited for counts: a slow server is not the client's fault.
+#[derive(Default)]
+struct BodyPace {
+    waited: Duration,
+    bytes: usize,
+}
+
+impl BodyPace {
+    /// Counts a piece that was waited for. False if the client sends too slowly.
+    fn count(&mut self, waited: Duration, bytes: usize) -> bool {
+        self.waited += waited;
+        self.bytes = self.bytes.saturating_add(bytes);
+        if self.waited < BODY_PAUSE {
+            return true;
+        }
+        std::mem::take(self).bytes >= LEAST_BODY_BYTES
+    }
+}
+
+impl PatientBody {
+    fn new(body: Incoming) -> Self {
+        Self { body, waiting: None, pace: BodyPace::default() }
+    }
+}
+
+impl http_body::Body for PatientBody {
+    type Data = Bytes;
+    type Error = axum::BoxError;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, axum::BoxError>>> {
+        let too_slow = || Poll::Ready(Some(Err(io::Error::from(io::ErrorKind::TimedOut).into())));
+        if let Poll::Ready(frame) = Pin::new(&mut self.body).poll_frame(context) {
+            let waited = self.waiting.take().map_or(Duration::ZERO, |wait| wait.since.elapsed());
+            let bytes = frame.as_ref().and_then(|frame| frame.as_ref().ok()?.data_ref()).map(Bytes::len);
+            return match bytes {
+                Some(bytes) if !self.pace.count(waited, bytes) => too_slow(),
+                _ => Poll::Ready(frame.map(|frame| frame.map_err(Into::into))),
+            };
+        }
+        let new = || Wait { since: Instant::now(), timer: Box::pin(tokio::time::sleep(BODY_PAUSE)) };
+        ready!(self.waiting.get_or_insert_with(new).timer.poll_unpin(context));
+        too_slow()
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn body_that_trickles_is_refused_and_a_slow_link_is_not() {
+        const SECOND: Duration = Duration::from_secs(1);
+        let refused_after = |bytes_per_s: usize| {
+            let mut pace = BodyPace::default();
+            (1..=300).find(|_| !pace.count(SECOND, bytes_per_s))
+        };
+        assert_eq!(refused_after(1), Some(30));
+        assert_eq!(refused_after(LEAST_BODY_BYTES / 30 - 1), Some(30));
+        assert_eq!(refused_after(1024), None);
+        let mut pace = BodyPace::default();
+        assert!((0..300).all(|_| pace.count(Duration::ZERO, 1)), "it is the server that is slow");
+    }
+}

@@ -1,0 +1,56 @@
+//! What became of everything that was ordered for a robot.
+
+use axum::Json;
+use axum::extract::State;
+use serde::Deserialize;
+use task_proto::api::TaskHistory;
+use task_proto::{DeploymentId, RobotName, TaskName};
+use utoipa::IntoParams;
+
+use super::robots::find;
+use crate::domain::person::Person;
+use crate::http::App;
+use crate::http::error::ApiError;
+use crate::http::extract::{PathParam, QueryParams};
+use crate::store::HistoryQuery;
+
+/// How many assignments are listed where nobody says how many, and at most.
+const LISTED: u32 = 50;
+const MOST_LISTED: u32 = 200;
+
+/// The query of `GET /robots/{robot}/tasks`.
+#[derive(Deserialize, IntoParams)]
+#[serde(deny_unknown_fields)]
+pub(in crate::http) struct Query {
+    /// At most so many; absent: 50.
+    #[param(minimum = 1, maximum = 200)]
+    limit: Option<u32>,
+    /// Only what was ordered before this.
+    #[param(inline)]
+    before: Option<DeploymentId>,
+    /// Only of this task.
+    #[param(inline)]
+    task: Option<TaskName>,
+}
+
+/// Lists what was ordered for a robot and what became of it, the newest first.
+#[utoipa::path(get, path = "/api/v1/robots/{robot}/tasks", tag = "robots",
+    responses((status = 404, description = "There is no such robot, or no deployment `before`.")))]
+pub(in crate::http) async fn tasks(
+    State(app): State<App>,
+    by: Person,
+    PathParam(robot): PathParam<RobotName>,
+    QueryParams(query): QueryParams<Query>,
+) -> Result<Json<TaskHistory>, ApiError> {
+    let id = find(&app, &by, &robot).await?;
+    let limit = query.limit.unwrap_or(LISTED);
+    if !(1..=MOST_LISTED).contains(&limit) {
+        return Err(ApiError::invalid(format!("limit: {limit} is not between 1 and {MOST_LISTED}")));
+    }
+    let asked = HistoryQuery { task: query.task.as_ref(), before: query.before.as_ref(), limit };
+    let page = app.store.task_history(&id, asked).await?.ok_or_else(|| {
+        let before = query.before.as_ref().map(DeploymentId::as_str).unwrap_or_default();
+        ApiError::not_found(format!("before: there is no deployment {before}"))
+    })?;
+    Ok(Json(TaskHistory { assignments: page.assignments, next: page.next }))
+}

@@ -1,0 +1,14 @@
+//! Owns the routes about robots, and those that robots call themselves; it never decides what a
+//! robot should run.
+
+pub(super) mod ask;
+pub(super) mod broker;
+pub(super) mod bulk;
+pub(super) mod enroll;
+pub(super) mod feed;
+pub(super) mod history;
+pub(super) mod logs;
+pub(super) mod mqtt;
+pub(super) mod outputs;
+pub(super) mod robots;
+pub(super) mod vitals;

@@ -1,0 +1,42 @@
+//! What tasks brought back, as the operator's commands and the page list it. The bytes are the registry's.
+
+use axum::Json;
+use axum::extract::State;
+use serde::Deserialize;
+use task_proto::api::OutputList;
+use task_proto::{RobotName, TaskName};
+use utoipa::IntoParams;
+
+use super::robots::find;
+use crate::domain::person::{Person, Scope};
+use crate::http::App;
+use crate::http::error::ApiError;
+use crate::http::extract::QueryParams;
+
+/// The query of `GET /outputs`.
+#[derive(Deserialize, IntoParams)]
+#[serde(deny_unknown_fields)]
+pub(in crate::http) struct ListQuery {
+    /// Only of this robot, by id or name.
+    #[param(inline)]
+    robot: Option<RobotName>,
+    /// Only of this task.
+    #[param(inline)]
+    task: Option<TaskName>,
+}
+
+/// Lists what came back, of one robot or of all.
+#[utoipa::path(get, path = "/api/v1/outputs", tag = "outputs",
+    responses((status = 404, description = "There is no such robot.")))]
+pub(in crate::http) async fn list(
+    State(app): State<App>,
+    by: Person,
+    QueryParams(query): QueryParams<ListQuery>,
+) -> Result<Json<OutputList>, ApiError> {
+    let robot = match &query.robot {
+        Some(robot) => Some(find(&app, &by, robot).await?),
+        None => None,
+    };
+    let scope = if robot.is_some() { &Scope::everything() } else { &by.scope };
+    Ok(Json(OutputList { outputs: app.store.outputs(robot.as_ref(), query.task.as_ref(), scope).await? }))
+}

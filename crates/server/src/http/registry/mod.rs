@@ -1,0 +1,6 @@
+//! Owns the routes about packages and their bytes; it never decides where a package runs.
+
+pub mod archives;
+pub mod oci;
+pub(super) mod packages;
+pub mod upload;

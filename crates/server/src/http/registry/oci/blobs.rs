@@ -1,0 +1,232 @@
+//! Reading and deleting blobs: whole, in ranges, or not at all if the client has them already.
+
+use std::ops::Range;
+
+use axum::body::Body;
+use axum::response::Response;
+use bytes::Bytes;
+use http::header::{
+    ACCEPT_RANGES, AUTHORIZATION, CACHE_CONTROL, CONTENT_LENGTH, CONTENT_RANGE, CONTENT_TYPE, ETAG, IF_NONE_MATCH,
+    IF_RANGE, RANGE,
+};
+use http::request::Parts;
+use http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode};
+use task_proto::{Digest, RepositoryName, RobotId};
+
+use super::manifests::deleted;
+use super::{Answer, OciError, Registry};
+use crate::blobs::{Blob, BytesFor};
+use crate::domain::person::Person;
+use crate::http::connection::listener::Unencrypted;
+use crate::link::transfers::Claim;
+use crate::store::{Act, Deed};
+
+/// It may be kept, but not be used before the server was asked.
+pub(super) const REVALIDATED: &str = "private, no-cache";
+
+/// `GET /v2/<name>/blobs/<digest>` by a person, and `HEAD` by one who only reads.
+pub(super) async fn get(registry: &Registry, repository: &RepositoryName, digest: Digest, request: &Parts) -> Answer {
+    if !registry.store.has_blob(Some(repository), &digest).await? {
+        return Err(OciError::blob_unknown());
+    }
+    read(registry, digest, request).await
+}
+
+/// `HEAD` of the same by who may push there: asked before a push, so from now on the answer must hold for a while.
+pub(super) async fn head_before_push(
+    registry: &Registry,
+    repository: &RepositoryName,
+    digest: Digest,
+    request: &Parts,
+) -> Answer {
+    let _hold = registry.blobs.hold_collection().await;
+    if !registry.store.has_blob(Some(repository), &digest).await? {
+        return Err(OciError::blob_unknown());
+    }
+    registry.blobs.touch(digest, registry.clock.now_ms()).await?;
+    read(registry, digest, request).await
+}
+
+/// `GET` or `HEAD` by a robot. Its packages count, whatever repository they came from and whether it still has them. It may
+/// have to wait for its turn to get bytes, not to ask for their size.
+pub(super) async fn get_for_robot(registry: &Registry, robot: &RobotId, digest: Digest, request: &Parts) -> Answer {
+    let Some(order) = registry.store.fetched_by(robot, &digest).await? else {
+        // These are small, and all else waits for them.
+        if registry.store.is_evidence_for(robot, &digest).await? {
+            return read(registry, digest, request).await;
+        }
+        return Err(OciError::denied("the blob is not part of a package this robot should have"));
+    };
+    if request.method == Method::HEAD {
+        return read(registry, digest, request).await;
+    }
+    let site = registry.transfers.site_of(&order.labels);
+    let claim = Claim { priority: order.priority, deployment: order.number, site };
+    let transfer = registry.transfers.admit(robot, digest, &claim).await?;
+    let transfer = transfer.by(request.extensions.get());
+    Ok(read(registry, digest, request).await?.map(|body| Body::new(transfer.carry(body))))
+}
+
+/// `DELETE /v2/<name>/blobs/<digest>`: out of this repository; the bytes go when nothing needs them.
+pub(super) async fn delete(registry: &Registry, by: &Person, repository: &RepositoryName, digest: Digest) -> Answer {
+    let deed = Deed::by(by, Act::BlobDelete, repository).with("digest", digest);
+    let deletion = registry.store.unlink_blob(repository, &digest, &deed, registry.clock.now_ms()).await?;
+    deleted(by, deletion, &format!("{repository}@{digest}"), OciError::blob_unknown)
+}
+
+async fn read(registry: &Registry, digest: Digest, request: &Parts) -> Answer {
+    let blob = registry.blobs.get(digest).await?.ok_or_else(OciError::blob_unknown)?;
+    let content_type = HeaderValue::from_static("application/octet-stream");
+    serve(&blob, request, content_type, caching(request))
+}
+
+/// How long what never changes may be kept. Whoever came by a cookie shares the browser with whoever signs in next, so it asks
+/// each time, and is told that nothing has changed.
+pub(super) fn caching(request: &Parts) -> HeaderValue {
+    let is_by_cookie = !request.headers.contains_key(AUTHORIZATION);
+    HeaderValue::from_static(if is_by_cookie { REVALIDATED } else { "private, max-age=31536000, immutable" })
+}
+
+/// Answers with the part of a blob that the request's headers ask for.
+pub(super) fn serve(blob: &Blob, request: &Parts, content_type: HeaderValue, cache: HeaderValue) -> Answer {
+    let quoted = blob.quoted_digest();
+    let digest = header_value(quoted.slice(1..quoted.len() - 1))?;
+    let etag = header_value(quoted.clone())?;
+    let common = [
+        (ETAG, etag.clone()),
+        (HeaderName::from_static("docker-content-digest"), digest),
+        (CACHE_CONTROL, cache),
+        (ACCEPT_RANGES, HeaderValue::from_static("bytes")),
+    ];
+    let headers = &request.headers;
+    let mut response = if has_it(headers, &etag) {
+        let mut response = with_room(Body::empty());
+        *response.status_mut() = StatusCode::NOT_MODIFIED;
+        response
+    } else {
+        let (status, range) = match wanted(headers, &etag, blob.size()) {
+            Wanted::All => (StatusCode::OK, 0..blob.size()),
+            Wanted::Part(range) => (StatusCode::PARTIAL_CONTENT, range),
+            Wanted::Nothing => return unsatisfiable(blob),
+        };
+        let length = range.end - range.start;
+        let is_head = request.method == Method::HEAD;
+        let reader =
+            if request.extensions.get::<Unencrypted>().is_some() { BytesFor::Socket } else { BytesFor::Process };
+        let content_range = (status == StatusCode::PARTIAL_CONTENT)
+            .then(|| format!("bytes {}-{}/{}", range.start, range.end.saturating_sub(1), blob.size()));
+        let mut response = with_room(if is_head { Body::empty() } else { Body::new(blob.body(range, reader)) });
+        *response.status_mut() = status;
+        if let Some(content_range) = content_range {
+            response.headers_mut().insert(CONTENT_RANGE, header_value(content_range)?);
+        }
+        response.headers_mut().insert(CONTENT_LENGTH, HeaderValue::from(length));
+        response.headers_mut().insert(CONTENT_TYPE, content_type);
+        response
+    };
+    response.headers_mut().extend(common);
+    Ok(response)
+}
+
+/// An answer with room for all the headers it will get, those for browsers included.
+fn with_room(body: Body) -> Response {
+    const HEADERS: usize = 24;
+    let mut response = Response::new(body);
+    response.headers_mut().reserve(HEADERS);
+    response
+}
+
+fn header_value(text: impl Into<Bytes>) -> Result<HeaderValue, OciError> {
+    HeaderValue::from_maybe_shared(text.into()).map_err(|_| OciError::blob_unknown())
+}
+
+fn unsatisfiable(blob: &Blob) -> Answer {
+    use axum::response::IntoResponse as _;
+    let message = format!("the content has {} bytes", blob.size());
+    let mut response = OciError::range_invalid(message).into_response();
+    response.headers_mut().insert(CONTENT_RANGE, header_value(format!("bytes */{}", blob.size()))?);
+    Ok(response)
+}
+
+/// Whether `If-None-Match` names the content.
+fn has_it(headers: &HeaderMap, etag: &HeaderValue) -> bool {
+    let tags = headers.get_all(IF_NONE_MATCH).iter().flat_map(|value| value.as_bytes().split(|&b| b == b','));
+    tags.map(<[u8]>::trim_ascii).any(|tag| tag == b"*" || tag.strip_prefix(b"W/").unwrap_or(tag) == etag.as_bytes())
+}
+
+/// What a request's `Range` comes to.
+#[derive(Debug, PartialEq, Eq)]
+enum Wanted {
+    All,
+    Part(Range<u64>),
+    Nothing,
+}
+
+/// RFC 9110, section 14. Several ranges, another unit and what can't be read are answered with everything, as it allows; one
+/// that ends before it begins has no bytes, as registries say.
+fn wanted(headers: &HeaderMap, etag: &HeaderValue, size: u64) -> Wanted {
+    if headers.get(IF_RANGE).is_some_and(|tag| tag != etag) {
+        return Wanted::All;
+    }
+    let text = headers.get(RANGE).and_then(|value| value.to_str().ok());
+    let Some((first, last)) = text.and_then(|text| text.strip_prefix("bytes=")).and_then(|set| set.split_once('-'))
+    else {
+        return Wanted::All;
+    };
+    let range = match (decimal(first), decimal(last)) {
+        (Some(first), Some(last)) => first..size.min(last.saturating_add(1)),
+        (Some(first), None) if last.is_empty() => first..size,
+        (None, Some(length)) if first.is_empty() => size.saturating_sub(length)..size,
+        _ => return Wanted::All,
+    };
+    if range.is_empty() { Wanted::Nothing } else { Wanted::Part(range) }
+}
+
+/// A number of digits only: `parse` alone would take a plus sign.
+pub(super) fn decimal(text: &str) -> Option<u64> {
+    text.bytes().all(|b| b.is_ascii_digit()).then(|| text.parse().ok())?
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn headers(pairs: &[(HeaderName, &'static str)]) -> HeaderMap {
+        pairs.iter().map(|(name, value)| (name.clone(), HeaderValue::from_static(value))).collect()
+    }
+
+    #[test]
+    fn ranges_follow_the_http_rules() {
+        let etag = HeaderValue::from_static("\"x\"");
+        let cases = [
+            ("bytes=0-0", Wanted::Part(0..1)),
+            ("bytes=2-", Wanted::Part(2..10)),
+            ("bytes=-3", Wanted::Part(7..10)),
+            ("bytes=-30", Wanted::Part(0..10)),
+            ("bytes=5-99", Wanted::Part(5..10)),
+            ("bytes=10-", Wanted::Nothing),
+            ("bytes=-0", Wanted::Nothing),
+            ("bytes=18446744073709551615-", Wanted::Nothing),
+            ("bytes=5-4", Wanted::Nothing),
+            ("bytes=500-0", Wanted::Nothing),
+            ("bytes=-", Wanted::All),
+            ("bytes=0-1,3-4", Wanted::All),
+            ("bytes=+1-2", Wanted::All),
+            ("lines=0-1", Wanted::All),
+        ];
+        for (range, expected) in cases {
+            assert_eq!(wanted(&headers(&[(RANGE, range)]), &etag, 10), expected, "{range}");
+        }
+        let part = |if_range| wanted(&headers(&[(RANGE, "bytes=1-"), (IF_RANGE, if_range)]), &etag, 10);
+        assert_eq!(part("\"x\""), Wanted::Part(1..10));
+        assert_eq!(part("\"y\""), Wanted::All);
+    }
+
+    #[test]
+    fn an_etag_in_a_list_is_found() {
+        let etag = HeaderValue::from_static("\"x\"");
+        for (value, expected) in [("\"y\", \"x\"", true), ("W/\"x\"", true), ("*", true), ("\"y\"", false)] {
+            assert_eq!(has_it(&headers(&[(IF_NONE_MATCH, value)]), &etag), expected, "{value}");
+        }
+    }
+}

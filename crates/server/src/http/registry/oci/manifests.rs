@@ -1,0 +1,390 @@
+//! Reading, pushing and deleting manifests. One that calls itself a task package must be one: that is checked here, so
+//! that whatever can be ordered can be run.
+
+use std::time::Duration;
+
+use axum::body::Body;
+use bytes::Bytes;
+use http::header::CONTENT_TYPE;
+use http::request::Parts;
+use http::{HeaderMap, HeaderValue, StatusCode};
+use task_archive::{Limits, UnpackError};
+use task_proto::desired::{BlobRef, PackageRef};
+use task_proto::manifest::{ContentFacts, TaskManifest};
+use task_proto::oci::{ImageManifest, PACKAGE_TYPE};
+use task_proto::output::{MAX_FILES, OutputSet};
+use task_proto::{Digest, RepositoryName, Tag};
+
+use super::super::archives::READING;
+use super::blobs::{REVALIDATED, caching, serve};
+use super::parsed::{Parsed, is_json};
+use super::uploads::kept_bytes;
+use super::{Answer, OciError, Registry, empty, is_reserved, signed};
+use crate::blobs::Blob;
+use crate::domain::person::Person;
+use crate::http::registry::packages::in_use;
+use crate::orders::changes::Change;
+use crate::store::{Act, Deed, Deletion, NewManifest, NewOutput, PutManifest, Reference, StoredManifest, bytes_taken};
+
+/// The largest manifest; the specification asks for at least this.
+const MAX_MANIFEST_BYTES: usize = 4 * 1024 * 1024;
+/// The largest task manifest.
+const MAX_CONFIG_BYTES: u64 = 1024 * 1024;
+/// How long a manifest may take to arrive.
+const PATIENCE: Duration = Duration::from_secs(60);
+/// The most tags one request sets.
+const MAX_TAGS: usize = 64;
+
+/// `GET` and `HEAD /v2/<name>/manifests/<reference>`. What can't be a reference names nothing.
+pub(super) async fn get(
+    registry: &Registry,
+    repository: &RepositoryName,
+    reference: Result<Reference, OciError>,
+    request: &Parts,
+) -> Answer {
+    let Ok(reference) = reference else { return Err(OciError::manifest_unknown()) };
+    let stored = registry.store.manifest(repository, &reference).await?.ok_or_else(OciError::manifest_unknown)?;
+    let blob = registry.blobs.get(stored.digest).await?.ok_or_else(OciError::manifest_unknown)?;
+    let content_type = match is_json(&stored.media_type) {
+        true => HeaderValue::try_from(stored.media_type).map_err(|_| OciError::manifest_unknown())?,
+        // Once any type was taken, also one that makes it a page.
+        false => HeaderValue::from_static("application/octet-stream"),
+    };
+    let cache = match reference {
+        Reference::Digest(_) => caching(request),
+        Reference::Tag(_) => HeaderValue::from_static(REVALIDATED),
+    };
+    serve(&blob, request, content_type, cache)
+}
+
+/// What is pushed where, and by whom.
+pub(super) struct Push<'a> {
+    pub(super) repository: &'a RepositoryName,
+    pub(super) reference: Reference,
+    /// `None`: by a robot.
+    pub(super) by: Option<&'a Person>,
+    /// The only type of artifact that is taken.
+    pub(super) only: Option<&'static str>,
+    /// Whether a package may take its version from another.
+    pub(super) takes_version: bool,
+}
+
+impl<'a> Push<'a> {
+    /// What a request pushes. `?force=true` says that a package may take its version from another.
+    pub(super) fn of(
+        parts: &Parts,
+        repository: &'a RepositoryName,
+        reference: Reference,
+        by: Option<&'a Person>,
+        only: Option<&'static str>,
+    ) -> Result<Self, OciError> {
+        let pairs: Vec<(String, String)> = super::query(&parts.uri)?;
+        let takes_version = pairs.iter().any(|(key, value)| key == "force" && value == "true");
+        Ok(Self { repository, reference, by, only, takes_version })
+    }
+}
+
+/// `PUT`: stores the exact bytes, if all they refer to is in the repository.
+pub(super) async fn put(registry: &Registry, as_said: Push<'_>, parts: &Parts, body: Body) -> Answer {
+    let bytes = read_body(body).await?;
+    let tags = tags_to_set(parts, &as_said.reference)?;
+    let repository = as_said.repository;
+    let stored = push(registry, as_said, tags, &parts.headers, bytes).await?;
+    created(repository, &stored.manifest.digest, stored.subject, parts, &stored.tags)
+}
+
+/// Stores a manifest's bytes, and says what was stored.
+pub(super) async fn push(
+    registry: &Registry,
+    push: Push<'_>,
+    tags: Vec<Tag>,
+    headers: &HeaderMap,
+    bytes: Bytes,
+) -> Result<NewManifest, OciError> {
+    let Push { repository, reference, by, only, takes_version } = push;
+    let digest = digest_of(&bytes, &reference)?;
+    let content_type = headers.get(CONTENT_TYPE).and_then(|value| value.to_str().ok());
+    let parsed = Parsed::new(content_type, &bytes)?;
+    parsed.check_for_robots(digest)?;
+    if only.is_some_and(|only| parsed.artifact_type.as_deref() != Some(only)) {
+        return Err(OciError::denied("a robot may only push outputs"));
+    }
+
+    let manifest = BlobRef { digest, size: bytes.len() as u64 };
+    // Before the hold: an archive may take minutes to read. What is gone afterwards is missed when the manifest is stored.
+    let package = match &parsed.package {
+        Some(image) => check_package(registry, repository, manifest, image).await?,
+        None => None,
+    };
+    // From here until the manifest is stored, nothing it is made of may be collected.
+    let _hold = registry.blobs.hold_collection().await;
+    let output = match &parsed.output {
+        Some(image) => {
+            let max_bytes = registry.blobs.settings().max_robot_bytes;
+            Some(NewOutput { set: check_output(registry, repository, image, max_bytes).await?, max_bytes })
+        }
+        None => None,
+    };
+    let document = signed::check(registry, repository, &parsed, &tags).await?;
+    if only.is_some() && output.is_none() {
+        return Err(OciError::denied("a robot may only push outputs"));
+    }
+    if only.is_some()
+        && output.as_ref().is_some_and(|output| tags.iter().any(|tag| output.set.tag().as_ref() != Some(tag)))
+    {
+        return Err(OciError::denied("a robot may only tag an output with its own run"));
+    }
+    let now_ms = registry.clock.now_ms();
+    // A robot's manifest is counted with what it lists.
+    let more = if by.is_some() { manifest.size } else { 0 };
+    registry.blobs.check_room(repository, more, kept_bytes(registry, repository).await?)?;
+    // First, for whoever hangs up in the middle has it counted as well.
+    registry.store.count_blob(repository, &manifest).await?;
+    registry.blobs.put(digest.algorithm(), bytes).await?;
+    registry.blobs.touch(digest, now_ms).await?;
+    let new = NewManifest {
+        manifest: StoredManifest { digest, size: manifest.size, media_type: parsed.media_type },
+        artifact_type: parsed.artifact_type,
+        annotations: parsed.annotations,
+        subject: parsed.subject,
+        parts: parsed.parts,
+        tags,
+        takes_version,
+        package,
+        output,
+        document,
+    };
+    let deed = by.map(|by| pushed(by, repository, &new));
+    match registry.store.put_manifest(repository, &new, deed.as_ref(), now_ms).await? {
+        PutManifest::VersionTaken(other) => Err(version_taken(&new, &other)),
+        PutManifest::PartsMissing(missing) => Err(OciError::parts_unknown(&missing)),
+        PutManifest::Outdated => Err(OciError::manifest_invalid("there is a list of publishers as new as this one")),
+        PutManifest::TagInUse(tag, users) => {
+            let message = by.map(|by| in_use(by, &format!("{repository}:{tag}"), &users)).unwrap_or_default();
+            Err(OciError::conflict(message))
+        }
+        PutManifest::Stored => {
+            signed::tell(registry, repository, new.document.as_ref()).await;
+            if let Some((package, _)) = &new.package {
+                registry.changes.announce(Change::Package(package.name.clone()));
+            }
+            Ok(new)
+        }
+    }
+}
+
+/// Why a version does not move to another package without being told to.
+fn version_taken(new: &NewManifest, other: &Digest) -> OciError {
+    let (name, version) = match &new.package {
+        Some((package, _)) => (package.name.as_str(), package.version.as_str()),
+        None => ("", ""),
+    };
+    OciError::conflict(format!(
+        "{name} {version} is there with other content, manifest {other}: robots that have it would show this version for \
+         two contents. Raise the version, or push with --force (?force=true)"
+    ))
+}
+
+/// What a manifest hashes to, which must be what it is pushed as.
+fn digest_of(bytes: &[u8], reference: &Reference) -> Result<Digest, OciError> {
+    let Reference::Digest(expected) = reference else { return Ok(Digest::of(bytes)) };
+    let digest = expected.algorithm().digest(bytes);
+    if digest != *expected {
+        return Err(OciError::digest_invalid(format!("the manifest hashes to {digest}, not to {expected}")));
+    }
+    Ok(digest)
+}
+
+/// The push of a manifest, as the audit tells of it.
+fn pushed(by: &Person, repository: &RepositoryName, new: &NewManifest) -> Deed {
+    let tags: Vec<&str> = new.tags.iter().map(Tag::as_str).collect();
+    let deed = Deed::by(by, Act::ManifestPush, repository).with("manifest", new.manifest.digest);
+    deed.with("tags", tags.join(",")).with_some("type", new.artifact_type.as_ref())
+}
+
+/// `DELETE`: a tag alone, or a manifest with all its tags.
+pub(super) async fn delete(
+    registry: &Registry,
+    by: &Person,
+    repository: &RepositoryName,
+    reference: Reference,
+) -> Answer {
+    let now_ms = registry.clock.now_ms();
+    let (deletion, named) = match reference {
+        Reference::Tag(tag) => {
+            let deed = Deed::by(by, Act::TagDelete, repository).with("tag", &tag);
+            let deletion = registry.store.delete_tag(repository, &tag, &deed, now_ms).await?;
+            (deletion, format!("{repository}:{tag}"))
+        }
+        Reference::Digest(digest) => {
+            let _hold = registry.blobs.hold_collection().await;
+            let deed = Deed::by(by, Act::ManifestDelete, repository).with("manifest", digest);
+            let deletion = registry.store.delete_manifest(repository, &digest, &deed, now_ms).await?;
+            if let Deletion::Deleted(parts) = &deletion {
+                if let Ok(name) = repository.as_str().parse() {
+                    registry.changes.announce(Change::Package(name));
+                }
+                // An order that looked the package up a moment ago still finds its bytes: they stay for a while.
+                for &blob in parts.iter().chain([&digest]) {
+                    registry.blobs.touch(blob, now_ms).await?;
+                }
+            }
+            (deletion, format!("{repository}@{digest}"))
+        }
+    };
+    deleted(by, deletion, &named, OciError::manifest_unknown)
+}
+
+/// The answer to a deletion of what is `named` so.
+pub(super) fn deleted(by: &Person, deletion: Deletion, named: &str, unknown: fn() -> OciError) -> Answer {
+    match deletion {
+        Deletion::Deleted(_) => empty(StatusCode::ACCEPTED, []),
+        Deletion::InUse(users) => Err(OciError::conflict(in_use(by, named, &users))),
+        Deletion::Unknown => Err(unknown()),
+    }
+}
+
+async fn read_body(body: Body) -> Result<Bytes, OciError> {
+    let too_large = || OciError::too_large(format!("a manifest may have {MAX_MANIFEST_BYTES} bytes"));
+    match tokio::time::timeout(PATIENCE, axum::body::to_bytes(body, MAX_MANIFEST_BYTES)).await {
+        Ok(Ok(bytes)) => Ok(bytes),
+        Ok(Err(error)) => {
+            let is_limit =
+                std::error::Error::source(&error).is_some_and(|source| source.is::<http_body_util::LengthLimitError>());
+            Err(if is_limit { too_large() } else { OciError::manifest_invalid("the manifest broke off") })
+        }
+        Err(_) => Err(OciError::manifest_invalid("the manifest took too long to arrive")),
+    }
+}
+
+/// The tag of the path, or those in the query of a push by digest.
+fn tags_to_set(parts: &Parts, reference: &Reference) -> Result<Vec<Tag>, OciError> {
+    if let Reference::Tag(tag) = reference {
+        return Ok(vec![tag.clone()]);
+    }
+    let pairs: Vec<(String, String)> = super::query(&parts.uri)?;
+    let tags = pairs.iter().filter(|(key, _)| key == "tag").take(MAX_TAGS);
+    tags.map(|(_, tag)| tag.parse().map_err(|error| OciError::tag_invalid(&error))).collect()
+}
+
+/// Reads what an output's config blob says of it, which must be true.
+async fn check_output(
+    registry: &Registry,
+    repository: &RepositoryName,
+    image: &ImageManifest,
+    max_bytes: u64,
+) -> Result<OutputSet, OciError> {
+    let config = image.config.blob();
+    let output: OutputSet = serde_json::from_slice(&read_config(registry, repository, config).await?)
+        .map_err(|error| OciError::manifest_invalid(format!("the config does not describe an output: {error}")))?;
+    if output.repository().as_ref() != Some(repository) {
+        let message = format!("the output of {} on {} belongs into its own repository", output.task, output.robot_id);
+        return Err(OciError::manifest_invalid(message));
+    }
+    if output.files.len() > MAX_FILES || output.manifest(config) != *image {
+        let message =
+            format!("the manifest is not that of the output in its config, or it has more than {MAX_FILES} files");
+        return Err(OciError::manifest_invalid(message));
+    }
+    let bytes = bytes_taken(&output);
+    if bytes > max_bytes {
+        let message =
+            format!("the output takes {bytes} bytes, and {max_bytes} are kept of one robot (robots.output_bytes)");
+        return Err(OciError::too_large(message));
+    }
+    for file in &output.files {
+        check_blob(registry, repository, file.blob).await?;
+    }
+    Ok(output)
+}
+
+/// Whether a blob is in the repository and as large as it is said to be.
+pub(super) async fn check_blob(
+    registry: &Registry,
+    repository: &RepositoryName,
+    part: BlobRef,
+) -> Result<Blob, OciError> {
+    let is_here = registry.store.has_blob(Some(repository), &part.digest).await?;
+    let blob = if is_here { registry.blobs.get(part.digest).await? } else { None };
+    let blob = blob.ok_or_else(|| OciError::parts_unknown(&[part.digest]))?;
+    if blob.size() != part.size {
+        let message = format!("the blob {} has {} bytes, its descriptor says {}", part.digest, blob.size(), part.size);
+        return Err(OciError::manifest_invalid(message));
+    }
+    Ok(blob)
+}
+
+async fn read_config(registry: &Registry, repository: &RepositoryName, config: BlobRef) -> Result<Bytes, OciError> {
+    let blob = check_blob(registry, repository, config).await?;
+    if config.size > MAX_CONFIG_BYTES {
+        return Err(OciError::manifest_invalid(format!("the config has more than {MAX_CONFIG_BYTES} bytes")));
+    }
+    Ok(blob.read().await?)
+}
+
+/// Reads the task manifest out of a package's config blob and holds it and the archive to their rules. A package can be
+/// ordered from the repository of its own name; one in another repository is a copy, checked likewise: `None`.
+async fn check_package(
+    registry: &Registry,
+    repository: &RepositoryName,
+    manifest: BlobRef,
+    image: &ImageManifest,
+) -> Result<Option<(PackageRef, TaskManifest)>, OciError> {
+    let Some((config, content)) = image.package_blobs() else {
+        let message =
+            format!("a manifest of artifactType {PACKAGE_TYPE} needs its config and one layer of its own types");
+        return Err(OciError::manifest_invalid(message));
+    };
+    let archive = check_blob(registry, repository, content).await?;
+    let task: TaskManifest = serde_json::from_slice(&read_config(registry, repository, config).await?)
+        .map_err(|error| OciError::manifest_invalid(format!("the config is not a task manifest: {error}")))?;
+    let problems: Vec<String> = task.problems().iter().map(ToString::to_string).collect();
+    if !problems.is_empty() {
+        return Err(OciError::manifest_invalid(problems.join("; ")));
+    }
+    if is_reserved(repository) {
+        let message = format!("the package {} can't be stored in {repository}, which is for other things", task.name);
+        return Err(OciError::manifest_invalid(message));
+    }
+    // What is stored was checked when it was pushed first.
+    if registry.store.package(&task.name, &manifest.digest).await?.is_none() {
+        check_archive(registry, &archive, content.size, task.content).await?;
+    }
+    let package = PackageRef { name: task.name.clone(), version: task.version.clone(), manifest, config, content };
+    Ok((RepositoryName::of_package(&task.name) == *repository).then_some((package, task)))
+}
+
+/// Reads the package's archive by the rules that a robot unpacks it by.
+async fn check_archive(registry: &Registry, blob: &Blob, size: u64, facts: ContentFacts) -> Result<(), OciError> {
+    let check = registry.readers.read(blob, move |bytes| task_archive::check(bytes, size, &facts, &Limits::default()));
+    let checked = tokio::time::timeout(READING, check).await;
+    match checked.map_err(|_| OciError::manifest_invalid("the package's archive took too long to read"))? {
+        Ok(()) => Ok(()),
+        Err(UnpackError::Refused(refusal)) => {
+            Err(OciError::manifest_invalid(format!("robots would refuse the package's archive: {refusal}")))
+        }
+        Err(error @ (UnpackError::Source(_) | UnpackError::Disk { .. })) => Err(OciError::internal(&error)),
+    }
+}
+
+fn created(
+    repository: &RepositoryName,
+    digest: &Digest,
+    subject: Option<String>,
+    request: &Parts,
+    tags: &[Tag],
+) -> Answer {
+    let location = format!("/v2/{repository}/manifests/{digest}");
+    let headers = [("location", location), ("docker-content-digest", digest.to_string())];
+    let mut response = empty(StatusCode::CREATED, headers)?;
+    if let Some(subject) = subject.and_then(|subject| HeaderValue::try_from(subject).ok()) {
+        response.headers_mut().insert("oci-subject", subject);
+    }
+    if request.uri.query().is_some() {
+        for tag in tags {
+            let tag = HeaderValue::try_from(tag.as_str()).map_err(|_| OciError::manifest_unknown())?;
+            response.headers_mut().append("oci-tag", tag);
+        }
+    }
+    Ok(response)
+}

@@ -1,0 +1,198 @@
+//! Packages, as the operator's commands and the page show them: versions, what is in them, what differs, where they run.
+//! Their bytes are the registry's.
+
+use std::collections::HashSet;
+use std::fmt;
+use std::str::FromStr;
+
+use axum::Json;
+use axum::extract::State;
+use axum::response::NoContent;
+use http::StatusCode;
+use serde::Deserialize;
+use task_archive::UnpackError;
+use task_proto::api::{PackageDiff, PackageFile, PackageFiles, PackageList, PackageVersions, PackageView};
+use task_proto::{Digest, RepositoryName, RobotId, TaskName};
+use utoipa::{IntoParams, ToSchema};
+
+use crate::domain::person::Person;
+use crate::http::App;
+use crate::http::error::ApiError;
+use crate::http::extract::{PathParam, PathParams, QueryParams};
+use crate::orders::changes::Change;
+use crate::package::contents;
+use crate::store::{Act, Deed, Deletion, PackageUsers, Reference};
+
+/// The most robots and deployments that are named where a package is in use.
+const MOST_NAMED: usize = 5;
+
+/// A version, or a manifest's digest.
+#[derive(Debug, Clone, ToSchema)]
+#[schema(value_type = String, example = "1.2.0")]
+pub(in crate::http) struct PackageReference(Reference);
+
+/// A text that is neither.
+#[derive(Debug, thiserror::Error)]
+#[error("{0:?} is neither a version nor a manifest's digest")]
+pub(in crate::http) struct InvalidReference(String);
+
+impl FromStr for PackageReference {
+    type Err = InvalidReference;
+    fn from_str(text: &str) -> Result<Self, InvalidReference> {
+        let reference = match text.parse::<Digest>() {
+            Ok(digest) => Ok(Reference::Digest(digest)),
+            Err(_) => text.parse().map(Reference::Tag),
+        };
+        reference.map(Self).map_err(|_| InvalidReference(text.chars().take(80).collect()))
+    }
+}
+
+impl fmt::Display for PackageReference {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match &self.0 {
+            Reference::Tag(tag) => tag.fmt(f),
+            Reference::Digest(digest) => digest.fmt(f),
+        }
+    }
+}
+
+/// Every package version.
+#[utoipa::path(get, path = "/api/v1/packages", tag = "packages")]
+pub(in crate::http) async fn list(State(app): State<App>) -> Result<Json<PackageList>, ApiError> {
+    Ok(Json(PackageList { packages: app.store.packages().await? }))
+}
+
+/// The versions of a package, and how many robots should have which.
+#[utoipa::path(get, path = "/api/v1/packages/{package}", tag = "packages")]
+pub(in crate::http) async fn show(
+    State(app): State<App>,
+    by: Person,
+    PathParam(name): PathParam<TaskName>,
+) -> Result<Json<PackageVersions>, ApiError> {
+    let versions = app.store.package_versions(&name).await?;
+    let robots = match by.scope.is_everything() {
+        true => None,
+        false => Some(app.store.robots_in(&by.scope).await?.into_iter().collect::<HashSet<_>>()),
+    };
+    let running = app.store.package_uses(&name, robots.as_ref()).await?;
+    if versions.is_empty() && running.is_empty() {
+        return Err(ApiError::not_found(format!("there is no package {name}")));
+    }
+    Ok(Json(PackageVersions { name, versions, running }))
+}
+
+/// What is in a package.
+#[utoipa::path(get, path = "/api/v1/packages/{package}/{version}/files", tag = "packages",
+    responses((status = 422, description = "`archive_refused`: its content is nothing that a robot would unpack.")))]
+pub(in crate::http) async fn files(
+    State(app): State<App>,
+    PathParams(name, version): PathParams<TaskName, PackageReference>,
+) -> Result<Json<PackageFiles>, ApiError> {
+    let package = find(&app, &name, &version).await?;
+    Ok(Json(PackageFiles { files: listed(&app, &package).await? }))
+}
+
+/// The query of `GET /packages/{package}/diff`.
+#[derive(Deserialize, IntoParams)]
+#[serde(deny_unknown_fields)]
+pub(in crate::http) struct DiffQuery {
+    /// A version, or a manifest's digest.
+    from: String,
+    /// Another one.
+    to: String,
+}
+
+/// What differs between two versions of a package.
+#[utoipa::path(get, path = "/api/v1/packages/{package}/diff", tag = "packages",
+    responses((status = 422, description = "`archive_refused`: the content of one is nothing that a robot would unpack.")))]
+pub(in crate::http) async fn diff(
+    State(app): State<App>,
+    PathParam(name): PathParam<TaskName>,
+    QueryParams(query): QueryParams<DiffQuery>,
+) -> Result<Json<PackageDiff>, ApiError> {
+    let named = |key: &str, text: &str| {
+        text.parse::<PackageReference>().map_err(|error| ApiError::invalid(format!("{key}: {error}")))
+    };
+    let (from, to) = (named("from", &query.from)?, named("to", &query.to)?);
+    let (from, to) = (find(&app, &name, &from).await?, find(&app, &name, &to).await?);
+    let manifest_changed = !contents::says_the_same(&from.manifest, &to.manifest);
+    if from.package.content == to.package.content {
+        return Ok(Json(PackageDiff { manifest_changed, ..PackageDiff::default() }));
+    }
+    let diff = contents::diff(listed(&app, &from).await?, listed(&app, &to).await?);
+    Ok(Json(PackageDiff { manifest_changed, ..diff }))
+}
+
+/// Deletes a version of a package that no robot should have.
+#[utoipa::path(delete, path = "/api/v1/packages/{package}/{version}", tag = "packages",
+    responses((status = 409, description = "`package_in_use`: robots should have it, or are to get it.")))]
+pub(in crate::http) async fn remove(
+    State(app): State<App>,
+    by: Person,
+    PathParams(name, version): PathParams<TaskName, PackageReference>,
+) -> Result<NoContent, ApiError> {
+    let _hold = app.blobs.hold_collection().await;
+    let package = find(&app, &name, &version).await?.package;
+    let (digest, now_ms) = (package.manifest.digest, app.clock.now_ms());
+    let deed = Deed::by(&by, Act::ManifestDelete, &name).with("manifest", digest).with("version", &package.version);
+    match app.store.delete_manifest(&RepositoryName::of_package(&name), &digest, &deed, now_ms).await? {
+        Deletion::Unknown => return Err(unknown(&name, &version)),
+        Deletion::InUse(users) => {
+            let message = in_use(&by, &format!("{name} {}", package.version), &users);
+            return Err(ApiError::conflict("package_in_use", message));
+        }
+        Deletion::Deleted(parts) => {
+            app.changes.announce(Change::Package(name));
+            // An order that looked the package up a moment ago still finds its bytes: they stay for a while.
+            for blob in parts.into_iter().chain([digest]) {
+                app.blobs.touch(blob, now_ms).await?;
+            }
+        }
+    }
+    Ok(NoContent)
+}
+
+async fn find(app: &App, name: &TaskName, version: &PackageReference) -> Result<PackageView, ApiError> {
+    app.store.find_package(name, &version.0).await?.ok_or_else(|| unknown(name, version))
+}
+
+fn unknown(name: &TaskName, version: &PackageReference) -> ApiError {
+    ApiError::new(StatusCode::NOT_FOUND, "package_not_found", format!("there is no package {name} {version}"))
+}
+
+/// Says who keeps a package in use; of robots that are none of the person's, and deployments for none of theirs, only how many.
+pub(in crate::http) fn in_use(by: &Person, package: &str, users: &PackageUsers) -> String {
+    let own = users.robots.iter().filter(|robot| by.scope.covers(&robot.id, &robot.name, &robot.labels));
+    let (ids, names): (HashSet<&RobotId>, Vec<&str>) = own.map(|robot| (&robot.id, robot.name.as_str())).unzip();
+    let is_own = |robots: &[RobotId]| by.scope.is_everything() || robots.iter().any(|robot| ids.contains(robot));
+    let deployments = users.deployments.iter().filter(|(_, robots)| is_own(robots));
+    let deployments: Vec<&str> = deployments.map(|(id, _)| id.as_str()).take(MOST_NAMED).collect();
+    let robots: Vec<&str> = names.into_iter().take(MOST_NAMED).collect();
+    let named = |names: Vec<&str>, of: usize| match of > names.len() {
+        true if names.is_empty() => String::new(),
+        true => format!(": {}, …", names.join(", ")),
+        false => format!(": {}", names.join(", ")),
+    };
+    format!(
+        "{package} is what {} robots should have{}, by {} deployments{}; bring them another version or remove the task first",
+        users.robots.len(),
+        named(robots, users.robots.len()),
+        users.deployments.len(),
+        named(deployments, users.deployments.len()),
+    )
+}
+
+/// The entries of a package, read from its archive.
+async fn listed(app: &App, view: &PackageView) -> Result<Vec<PackageFile>, ApiError> {
+    let content = view.package.content;
+    let gone = || ApiError::not_found(format!("the content of {} is gone", view.package.name));
+    let blob = app.blobs.get(content.digest).await?.ok_or_else(gone)?;
+    let facts = view.manifest.content;
+    let listed = app.uploads.readers.read(&blob, move |bytes| contents::list(bytes, content.size, &facts)).await;
+    listed.map_err(|error| match error {
+        UnpackError::Refused(refusal) => {
+            ApiError::new(StatusCode::UNPROCESSABLE_ENTITY, "archive_refused", refusal.to_string())
+        }
+        UnpackError::Source(_) | UnpackError::Disk { .. } => ApiError::internal(&error),
+    })
+}

@@ -1,0 +1,321 @@
+//! A package's directory that the page brings as an archive: unpacked beside the blobs, packed like `taskd push` does, and put
+//! into the registry. The archive is by a browser, and believed in nothing.
+
+use std::collections::HashSet;
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use axum::body::Body;
+use axum::extract::{FromRef as _, Request, State};
+use bytes::Bytes;
+use futures_util::StreamExt as _;
+use http::{HeaderMap, StatusCode, header};
+use serde::Deserialize;
+use task_archive::{Compression, Limits, Refusal, UnpackError, unpack_unannounced};
+use task_proto::UserName;
+use task_proto::api::PackageView;
+use tempfile::TempDir;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio::time::timeout;
+use utoipa::IntoParams;
+
+use super::archives::ArchiveReaders;
+use super::oci::{self, OciError, Registry};
+use crate::blobs::BlobError;
+use crate::domain::person::Person;
+use crate::http::App;
+use crate::http::error::ApiError;
+use crate::http::extract::QueryParams;
+use crate::http::openapi::Created;
+use crate::package::{PackageError, Packed, pack_into};
+
+/// Archives that are unpacked and packed at the same time.
+const AT_ONCE: usize = 2;
+/// With whoever has a place.
+const PATIENCE: Patience = Patience { silence: Duration::from_secs(60), whole: Duration::from_secs(60 * 60) };
+/// Pieces of a body that wait to be unpacked.
+const WAITING: usize = 16;
+/// What an archive may have beside what is in it.
+const OVERHEAD_BYTES: u64 = 1 << 20;
+
+/// How long a sender may take.
+#[derive(Debug, Clone, Copy)]
+struct Patience {
+    /// For the next piece.
+    silence: Duration,
+    /// For all of it.
+    whole: Duration,
+}
+
+/// Where archives are unpacked, and who may read some.
+pub struct UploadSpace {
+    directory: PathBuf,
+    limits: Limits,
+    places: Arc<Semaphore>,
+    /// Those whose archive is being unpacked.
+    uploading: Arc<Mutex<HashSet<UserName>>>,
+    /// Those who read whole archives.
+    pub(in crate::http) readers: ArchiveReaders,
+}
+
+impl UploadSpace {
+    /// In a directory that is empty; of an archive at most `most_bytes` are unpacked.
+    pub fn new(directory: PathBuf, most_bytes: u64) -> Self {
+        let limits = Limits::default();
+        let limits = Limits { bytes: limits.bytes.min(most_bytes), ..limits };
+        let places = Arc::new(Semaphore::new(AT_ONCE));
+        Self { directory, limits, places, uploading: Arc::default(), readers: ArchiveReaders::default() }
+    }
+
+    /// A place for one archive of this person, who may have one at a time.
+    fn place(&self, person: &UserName) -> Result<UploadPlace, ApiError> {
+        if !locked(&self.uploading).insert(person.clone()) {
+            return Err(ApiError::too_many(format!("{person} uploads a package already; wait until it is there")));
+        }
+        let own = OwnUpload { uploading: self.uploading.clone(), person: person.clone() };
+        let place = self.places.clone().try_acquire_owned().map_err(|_| {
+            ApiError::too_many(format!("{AT_ONCE} packages are being uploaded already; try again in a moment"))
+        })?;
+        Ok(UploadPlace { _own: own, _place: place })
+    }
+}
+
+/// The place of an archive that is unpacked and packed; given back by dropping it.
+struct UploadPlace {
+    _own: OwnUpload,
+    _place: OwnedSemaphorePermit,
+}
+
+/// That a person uploads something.
+struct OwnUpload {
+    uploading: Arc<Mutex<HashSet<UserName>>>,
+    person: UserName,
+}
+
+impl Drop for OwnUpload {
+    fn drop(&mut self) {
+        locked(&self.uploading).remove(&self.person);
+    }
+}
+
+fn locked(uploading: &Mutex<HashSet<UserName>>) -> MutexGuard<'_, HashSet<UserName>> {
+    // A set of names is sound whatever a panic left.
+    uploading.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Why an archive did not become a package.
+#[derive(Debug, thiserror::Error)]
+enum UploadError {
+    #[error(transparent)]
+    Unpack(#[from] UnpackError),
+    #[error(transparent)]
+    Package(#[from] PackageError),
+    #[error("the directory for uploads can't be used")]
+    Disk(#[from] io::Error),
+}
+
+/// The query of `POST /packages`.
+#[derive(Deserialize, IntoParams)]
+#[serde(deny_unknown_fields)]
+pub(in crate::http) struct UploadQuery {
+    /// Whether the package may take its version from one with other content, which is outdated by that.
+    #[serde(default)]
+    #[param(required = false)]
+    force: bool,
+}
+
+/// Takes a package's directory as a tar archive, compressed with zstd or not, and packs it as `taskd push` would.
+#[utoipa::path(post, path = "/api/v1/packages", tag = "packages",
+    request_body(description = "The directory: its files, directories and links, or that one directory with all that is in it.",
+        content((String = "application/x-tar"), (String = "application/zstd"))),
+    responses((status = 400, description = "The body broke off."),
+        (status = 409, description = "`version_taken`: the version is there with other content; the message says which."),
+        (status = 413, description = "`too_large`: it is more than the server unpacks."),
+        (status = 415, description = "The body is neither `application/x-tar` nor `application/zstd`."),
+        (status = 422, description = "`archive_refused`: there is something in it that a package can't have. \
+            `package_invalid`: it can't be run; the message says all that is wrong."),
+        (status = 408, description = "It took too long to arrive."),
+        (status = 429, description = "The person uploads a package already, or others do."),
+        (status = 507, description = "`disk_full`: the server's disk is.")))]
+pub(in crate::http) async fn package(
+    State(app): State<App>,
+    by: Person,
+    QueryParams(query): QueryParams<UploadQuery>,
+    request: Request,
+) -> Result<Created<PackageView>, ApiError> {
+    let compression = compression(request.headers())?;
+    let place = app.uploads.place(&by.name)?;
+    let (packed, _place) = receive(&app, place, compression, request.into_body()).await?;
+    Ok(Created(oci::publish(&Registry::from_ref(&app), &by, &packed, query.force).await?))
+}
+
+fn too_slow(message: &str) -> ApiError {
+    ApiError::new(StatusCode::REQUEST_TIMEOUT, "timeout", message)
+}
+
+fn compression(headers: &HeaderMap) -> Result<Compression, ApiError> {
+    let content_type = headers.get(header::CONTENT_TYPE).and_then(|value| value.to_str().ok()).unwrap_or_default();
+    match content_type.split(';').next().unwrap_or_default().trim().to_ascii_lowercase().as_str() {
+        "application/x-tar" => Ok(Compression::None),
+        "application/zstd" => Ok(Compression::Zstd),
+        _ => {
+            let message = "Content-Type: expected application/x-tar or application/zstd";
+            Err(ApiError::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "unsupported_media_type", message))
+        }
+    }
+}
+
+/// Unpacks the body as it comes, and packs what was in it. The work goes on if the caller goes away, so its place must as well.
+async fn receive(
+    app: &App,
+    place: UploadPlace,
+    compression: Compression,
+    body: Body,
+) -> Result<(Packed, UploadPlace), ApiError> {
+    let (sender, receiver) = mpsc::channel(WAITING);
+    let (directory, limits) = (app.uploads.directory.clone(), app.uploads.limits);
+    // What is unpacked is packed again beside it.
+    let room = app.blobs.room_for_people() / 2;
+    let (limits, is_short) = (Limits { bytes: limits.bytes.min(room), ..limits }, room < limits.bytes);
+    let most = limits.bytes.saturating_add(OVERHEAD_BYTES);
+    let work = tokio::task::spawn_blocking(move || {
+        packed(Arriving { receiver, current: Bytes::new() }, compression, &limits, &directory).map(|it| (it, place))
+    });
+    let (fed, worked) = tokio::join!(feed(body, sender, most, PATIENCE), work);
+    let of_disk = |error: ApiError| match error.status {
+        StatusCode::PAYLOAD_TOO_LARGE if is_short => {
+            OciError::from(BlobError::DiskReserved { reserve: app.blobs.settings().reserve_bytes }).into()
+        }
+        _ => error,
+    };
+    // Where the body did not come whole, the archive in it was not whole either.
+    fed.map_err(of_disk)?;
+    match worked {
+        Ok(worked) => worked.map_err(|error| of_disk(refused(error))),
+        Err(panic) => std::panic::resume_unwind(panic.into_panic()),
+    }
+}
+
+/// Hands the body on, until it ends or nobody takes any more of it.
+async fn feed(body: Body, sender: mpsc::Sender<Bytes>, most: u64, patience: Patience) -> Result<(), ApiError> {
+    let (mut chunks, mut taken) = (body.into_data_stream(), 0);
+    let handing_on = async {
+        loop {
+            let chunk = match timeout(patience.silence, chunks.next()).await {
+                Ok(Some(Ok(chunk))) => chunk,
+                Ok(Some(Err(_))) => return Err(ApiError::invalid("the body broke off")),
+                Ok(None) => return Ok(()),
+                Err(_) => return Err(too_slow("the upload stopped for a minute")),
+            };
+            taken += chunk.len() as u64;
+            if taken > most {
+                let message = format!("the archive has more than {most} bytes, the most that this server takes");
+                return Err(too_large(message));
+            }
+            if sender.send(chunk).await.is_err() {
+                return Ok(());
+            }
+        }
+    };
+    timeout(patience.whole, handing_on).await.unwrap_or_else(|_| Err(too_slow("the upload took longer than an hour")))
+}
+
+/// A body as a thread reads it. It ends where the sender is gone.
+struct Arriving {
+    receiver: mpsc::Receiver<Bytes>,
+    current: Bytes,
+}
+
+impl Read for Arriving {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        while self.current.is_empty() {
+            match self.receiver.blocking_recv() {
+                Some(chunk) => self.current = chunk,
+                None => return Ok(0),
+            }
+        }
+        let piece = self.current.split_to(buffer.len().min(self.current.len()));
+        buffer[..piece.len()].copy_from_slice(&piece);
+        Ok(piece.len())
+    }
+}
+
+fn packed(body: Arriving, compression: Compression, limits: &Limits, directory: &Path) -> Result<Packed, UploadError> {
+    let temporary = TempDir::new_in(directory)?;
+    let unpacked = temporary.path().join("package");
+    unpack_unannounced(body, compression, limits, &unpacked)?;
+    let package = only_directory(&unpacked)?.unwrap_or(unpacked);
+    Ok(pack_into(&package, directory)?)
+}
+
+/// The directory in `unpacked`, if there is nothing else: whoever archives a directory mostly has its name in the archive.
+fn only_directory(unpacked: &Path) -> io::Result<Option<PathBuf>> {
+    let mut entries = std::fs::read_dir(unpacked)?;
+    match (entries.next().transpose()?, entries.next()) {
+        (Some(only), None) if only.file_type()?.is_dir() => Ok(Some(only.path())),
+        _ => Ok(None),
+    }
+}
+
+fn refused(error: UploadError) -> ApiError {
+    let unprocessable = |code, message| ApiError::new(StatusCode::UNPROCESSABLE_ENTITY, code, message);
+    let source = match &error {
+        UploadError::Unpack(UnpackError::Refused(refusal @ Refusal::Limit { .. })) => {
+            return too_large(refusal.to_string());
+        }
+        UploadError::Unpack(UnpackError::Refused(refusal)) => {
+            return unprocessable("archive_refused", refusal.to_string());
+        }
+        // Its own text has the path of a directory that nobody else knows.
+        UploadError::Package(PackageError::Invalid { problems, .. }) => {
+            let lines: Vec<String> = problems.iter().map(ToString::to_string).collect();
+            return unprocessable("package_invalid", lines.join("\n"));
+        }
+        UploadError::Unpack(UnpackError::Source(source) | UnpackError::Disk { source, .. })
+        | UploadError::Package(PackageError::Io { source, .. })
+        | UploadError::Disk(source) => source,
+    };
+    ApiError::disk(&error, source)
+}
+
+fn too_large(message: String) -> ApiError {
+    ApiError::new(StatusCode::PAYLOAD_TOO_LARGE, "too_large", message)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::convert::Infallible;
+
+    use futures_util::stream;
+
+    use super::*;
+
+    const LONG: Duration = Duration::from_secs(60);
+    const SHORT: Duration = Duration::from_millis(20);
+
+    /// What a sender is told whose body is taken as it comes.
+    async fn told(body: Body, patience: Patience) -> String {
+        let (sender, mut receiver) = mpsc::channel(WAITING);
+        let fed = async {
+            tokio::join!(feed(body, sender, 1 << 20, patience), async { while receiver.recv().await.is_some() {} }).0
+        };
+        let error = timeout(LONG, fed).await.expect("an end").expect_err("let go");
+        assert_eq!(error.status, StatusCode::REQUEST_TIMEOUT);
+        error.message
+    }
+
+    #[tokio::test]
+    async fn who_is_silent_or_never_ends_is_let_go() {
+        let silent = Body::from_stream(stream::pending::<Result<Bytes, Infallible>>());
+        let said = told(silent, Patience { silence: SHORT, whole: 2 * LONG }).await;
+        assert!(said.contains("stopped for a minute"), "{said}");
+        let endless = stream::unfold((), |()| async {
+            tokio::task::yield_now().await;
+            Some((Ok::<_, Infallible>(Bytes::new()), ()))
+        });
+        let said = told(Body::from_stream(endless), Patience { silence: 2 * LONG, whole: SHORT }).await;
+        assert!(said.contains("longer than an hour"), "{said}");
+    }
+}

@@ -8,7 +8,6 @@ use task_proto::person::Roles;
 use task_proto::selector::Selector;
 
 use super::ConfigError;
-use super::tables::Wrong;
 
 /// The most rules.
 const MAX_RULES: usize = 256;
@@ -88,6 +87,12 @@ impl OidcSettings {
         }
         Ok(())
     }
+}
+
+/// What is wrong, and with which key below the table.
+pub(super) struct Wrong {
+    pub(super) key: String,
+    pub(super) reason: String,
 }
 
 /// A URL where nobody reads along: `https`, or on this machine.

@@ -8,6 +8,7 @@ use std::path::Path;
 use task_proto::desired::Delivery;
 use task_proto::id::LabelValue;
 
+use super::oidc::Wrong;
 use super::settings::{Setting, size};
 use super::{Config, ConfigError, Origin, nearest, oidc, parse_duration};
 use crate::domain::delivery::{Condition, ConditionKey, MAX_RULES, Quantity, Rule, Rules, Unit};
@@ -59,12 +60,6 @@ impl SiteLimits {
         let with_share = self.bytes_per_s.map(|bytes| (bytes / LEAST_SHARE_BYTES_PER_S).max(1));
         [self.max, with_share].into_iter().flatten().min()
     }
-}
-
-/// What is wrong, and with which key below the table.
-pub(super) struct Wrong {
-    pub(super) key: String,
-    pub(super) reason: String,
 }
 
 /// Whether the file may have a table of this name.

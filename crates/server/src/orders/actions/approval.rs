@@ -9,8 +9,6 @@ use crate::domain::person::Person;
 use crate::orders::changes::Change;
 use crate::store::{Act, Deed, KnownRobot, StoreError, Write};
 
-/// The most robots that may wait.
-const MOST_PENDING: u64 = 1_000;
 /// How long one may wait.
 const PENDING_LIFETIME_MS: u64 = 7 * DAY_MS;
 
@@ -49,11 +47,6 @@ impl Actions {
         self.changes.announce(Change::RobotRemoved(Box::new(known)));
         Ok(())
     }
-}
-
-/// An error if so many wait that no other may.
-pub(super) async fn check_room(write: &mut Write) -> Result<(), ActionError> {
-    if write.count_pending().await? < MOST_PENDING { Ok(()) } else { Err(ActionError::TooManyPending(MOST_PENDING)) }
 }
 
 /// Turns away whoever has waited for too long, and says who that was.

@@ -4,7 +4,7 @@ use task_proto::api::{BulkLabels, MatchedRobot};
 use task_proto::id::Labels;
 use task_proto::selector::Selector;
 
-use super::robots::{check_labels, matched, shown_labels};
+use super::robots::{check_labels, matched, removal, shown_labels};
 use super::{ActionError, Actions, IdempotencyKey, all_known, check_scope, quoted};
 use crate::domain::person::Person;
 use crate::orders::advance::advance;
@@ -118,11 +118,6 @@ impl Actions {
         }
         self.changes.publish(consequences);
     }
-}
-
-/// What is written down of a robot's removal: it is all that is left of it.
-pub(super) fn removal(by: &Person, robot: &KnownRobot) -> Deed {
-    Deed::by(by, Act::RobotRemove, &robot.id).with("name", &robot.name).with("mac", robot.mac)
 }
 
 /// The robots that a selector means; an error if nobody, or if one of them is not the person's.

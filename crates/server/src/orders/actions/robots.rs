@@ -14,8 +14,6 @@ use task_proto::settings::RobotSettings;
 use task_proto::token::{Token, TokenKind};
 use task_proto::{MacAddress, RobotId, RobotName, TokenId};
 
-use super::approval::check_room;
-use super::bulk::removal;
 use super::{ActionError, Actions, MAX_LIFETIME_MS, all_known, check_scope, quoted};
 use crate::domain::person::Person;
 use crate::limits::pace::seconds;
@@ -25,6 +23,8 @@ use crate::store::{Act, Deed, EnrolmentTerms, KnownRobot, StoreError, Write};
 
 /// The most labels a robot may have.
 const MAX_LABELS: usize = 64;
+/// The most robots that may wait to be approved.
+const MOST_PENDING: u64 = 1_000;
 
 /// A robot that has just registered.
 #[derive(Debug)]
@@ -366,4 +366,14 @@ fn shown_settings(settings: Option<&RobotSettings>) -> String {
     settings.map_or("none".to_owned(), |settings| {
         serde_json::to_string(settings).expect("a wire type always has a JSON form")
     })
+}
+
+/// An error if so many wait that no other may.
+async fn check_room(write: &mut Write) -> Result<(), ActionError> {
+    if write.count_pending().await? < MOST_PENDING { Ok(()) } else { Err(ActionError::TooManyPending(MOST_PENDING)) }
+}
+
+/// What is written down of a robot's removal: it is all that is left of it.
+pub(super) fn removal(by: &Person, robot: &KnownRobot) -> Deed {
+    Deed::by(by, Act::RobotRemove, &robot.id).with("name", &robot.name).with("mac", robot.mac)
 }

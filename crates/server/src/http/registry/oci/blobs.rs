@@ -11,15 +11,16 @@ use http::header::{
 };
 use http::request::Parts;
 use http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode};
+use task_proto::desired::BlobRef;
 use task_proto::{Digest, RepositoryName, RobotId};
 
-use super::manifests::deleted;
-use super::{Answer, OciError, Registry};
+use super::{Answer, OciError, Registry, empty};
 use crate::blobs::{Blob, BytesFor};
 use crate::domain::person::Person;
 use crate::http::connection::listener::Unencrypted;
+use crate::http::registry::packages::in_use;
 use crate::link::transfers::Claim;
-use crate::store::{Act, Deed};
+use crate::store::{Act, Deed, Deletion};
 
 /// It may be kept, but not be used before the server was asked.
 pub(super) const REVALIDATED: &str = "private, no-cache";
@@ -185,6 +186,31 @@ fn wanted(headers: &HeaderMap, etag: &HeaderValue, size: u64) -> Wanted {
 /// A number of digits only: `parse` alone would take a plus sign.
 pub(super) fn decimal(text: &str) -> Option<u64> {
     text.bytes().all(|b| b.is_ascii_digit()).then(|| text.parse().ok())?
+}
+
+/// The answer to a deletion of what is `named` so.
+pub(super) fn deleted(by: &Person, deletion: Deletion, named: &str, unknown: fn() -> OciError) -> Answer {
+    match deletion {
+        Deletion::Deleted(_) => empty(StatusCode::ACCEPTED, []),
+        Deletion::InUse(users) => Err(OciError::conflict(in_use(by, named, &users))),
+        Deletion::Unknown => Err(unknown()),
+    }
+}
+
+/// Whether a blob is in the repository and as large as it is said to be.
+pub(super) async fn check_blob(
+    registry: &Registry,
+    repository: &RepositoryName,
+    part: BlobRef,
+) -> Result<Blob, OciError> {
+    let is_here = registry.store.has_blob(Some(repository), &part.digest).await?;
+    let blob = if is_here { registry.blobs.get(part.digest).await? } else { None };
+    let blob = blob.ok_or_else(|| OciError::parts_unknown(&[part.digest]))?;
+    if blob.size() != part.size {
+        let message = format!("the blob {} has {} bytes, its descriptor says {}", part.digest, blob.size(), part.size);
+        return Err(OciError::manifest_invalid(message));
+    }
+    Ok(blob)
 }
 
 #[cfg(test)]

@@ -16,7 +16,7 @@ use task_proto::output::{MAX_FILES, OutputSet};
 use task_proto::{Digest, RepositoryName, Tag};
 
 use super::super::archives::READING;
-use super::blobs::{REVALIDATED, caching, serve};
+use super::blobs::{REVALIDATED, caching, check_blob, deleted, serve};
 use super::parsed::{Parsed, is_json};
 use super::uploads::kept_bytes;
 use super::{Answer, OciError, Registry, empty, is_reserved, signed};
@@ -235,15 +235,6 @@ pub(super) async fn delete(
     deleted(by, deletion, &named, OciError::manifest_unknown)
 }
 
-/// The answer to a deletion of what is `named` so.
-pub(super) fn deleted(by: &Person, deletion: Deletion, named: &str, unknown: fn() -> OciError) -> Answer {
-    match deletion {
-        Deletion::Deleted(_) => empty(StatusCode::ACCEPTED, []),
-        Deletion::InUse(users) => Err(OciError::conflict(in_use(by, named, &users))),
-        Deletion::Unknown => Err(unknown()),
-    }
-}
-
 async fn read_body(body: Body) -> Result<Bytes, OciError> {
     let too_large = || OciError::too_large(format!("a manifest may have {MAX_MANIFEST_BYTES} bytes"));
     match tokio::time::timeout(PATIENCE, axum::body::to_bytes(body, MAX_MANIFEST_BYTES)).await {
@@ -296,22 +287,6 @@ async fn check_output(
         check_blob(registry, repository, file.blob).await?;
     }
     Ok(output)
-}
-
-/// Whether a blob is in the repository and as large as it is said to be.
-pub(super) async fn check_blob(
-    registry: &Registry,
-    repository: &RepositoryName,
-    part: BlobRef,
-) -> Result<Blob, OciError> {
-    let is_here = registry.store.has_blob(Some(repository), &part.digest).await?;
-    let blob = if is_here { registry.blobs.get(part.digest).await? } else { None };
-    let blob = blob.ok_or_else(|| OciError::parts_unknown(&[part.digest]))?;
-    if blob.size() != part.size {
-        let message = format!("the blob {} has {} bytes, its descriptor says {}", part.digest, blob.size(), part.size);
-        return Err(OciError::manifest_invalid(message));
-    }
-    Ok(blob)
 }
 
 async fn read_config(registry: &Registry, repository: &RepositoryName, config: BlobRef) -> Result<Bytes, OciError> {

@@ -7,7 +7,7 @@ use task_proto::oci::ImageManifest;
 use task_proto::publisher::{LIST_REPOSITORY, MAX_LIST_BYTES, MAX_SIGNATURE_BYTES, PackageStatement, PublisherList};
 use task_proto::{RepositoryName, Tag};
 
-use super::manifests::check_blob;
+use super::blobs::check_blob;
 use super::parsed::Parsed;
 use super::{OciError, Registry};
 use crate::store::{Reference, SignedDocument};

@@ -6,8 +6,8 @@ use std::path::PathBuf;
 use clap::{Args, ValueEnum};
 use clap_complete::env::Shells;
 
-use super::complete::VARIABLE;
-use super::output::{say, stream_text};
+use super::api::complete::VARIABLE;
+use super::display::output::{say, stream_text};
 use super::{CommandError, Outcome};
 
 /// Which shell.

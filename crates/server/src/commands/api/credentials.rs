@@ -1,0 +1,73 @@
+//! Credentials of `taskd login`, in a file that only its owner may read, by server. They are made and ended elsewhere.
+
+use std::collections::BTreeMap;
+use std::fs::{DirBuilder, OpenOptions};
+use std::io::{self, Write as _};
+use std::os::unix::fs::{DirBuilderExt as _, OpenOptionsExt as _};
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use task_proto::CaPin;
+use task_proto::token::Token;
+
+use crate::commands::CommandError;
+
+/// The token that is kept for the server at `base`.
+pub(in crate::commands) fn kept_token(base: &str) -> Option<Token> {
+    Kept::read(&path()?).ok()?.servers.remove(base)?.parse().ok()
+}
+
+/// The pin that was given when somebody signed in to the server at `base`.
+pub(in crate::commands) fn kept_pin(base: &str) -> Option<CaPin> {
+    Kept::read(&path()?).ok()?.pins.remove(base)
+}
+
+/// The server that was signed in to last, unless it was signed out of.
+pub(in crate::commands) fn last_server() -> Option<String> {
+    Kept::read(&path()?).ok()?.last
+}
+
+/// `credentials.json`: tokens by the server's URL.
+#[derive(Default, Serialize, Deserialize)]
+pub(in crate::commands) struct Kept {
+    pub(in crate::commands) servers: BTreeMap<String, String>,
+    /// The pins that were given with them.
+    #[serde(default)]
+    pub(in crate::commands) pins: BTreeMap<String, CaPin>,
+    /// The server that is meant where none is named.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(in crate::commands) last: Option<String>,
+}
+
+/// Where the credentials are kept, if there is a place for them.
+pub(in crate::commands) fn path() -> Option<PathBuf> {
+    let set = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
+    let base = set("XDG_CONFIG_HOME").or_else(|| set("HOME").map(|home| home.join(".config")))?;
+    Some(base.join("taskd/credentials.json"))
+}
+
+impl Kept {
+    /// What is kept; nothing where there is no file yet.
+    pub(in crate::commands) fn read(path: &Path) -> Result<Self, CommandError> {
+        let failed = |source| CommandError::Io { what: format!("can't read {}", path.display()), source };
+        match std::fs::read(path) {
+            Ok(bytes) => serde_json::from_slice(&bytes).map_err(|error| failed(error.into())),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(Self::default()),
+            Err(error) => Err(failed(error)),
+        }
+    }
+
+    /// Only its owner may read it; it is there whole or not at all.
+    pub(in crate::commands) fn write(&self, path: &Path) -> Result<(), CommandError> {
+        let written = || {
+            let directory = path.parent().unwrap_or(Path::new("."));
+            DirBuilder::new().recursive(true).mode(0o700).create(directory)?;
+            let partial = path.with_extension(format!("{:08x}", rand::random::<u32>()));
+            let mut file = OpenOptions::new().create_new(true).write(true).mode(0o600).open(&partial)?;
+            file.write_all(&serde_json::to_vec_pretty(self)?)?;
+            file.sync_all()?;
+            std::fs::rename(&partial, path)
+        };
+        written().map_err(|source| CommandError::Io { what: format!("can't write {}", path.display()), source })
+    }
+}

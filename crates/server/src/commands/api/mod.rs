@@ -1,0 +1,10 @@
+//! Owns how commands ask the server, from credentials to uploads and waiting; it never decides what
+//! to ask for.
+
+pub(super) mod client;
+pub(super) mod complete;
+pub(super) mod credentials;
+pub(super) mod download;
+pub(super) mod sse;
+pub(super) mod upload;
+pub(super) mod wait;

@@ -1,0 +1,303 @@
+//! Brings a package's blobs and manifest to the server's OCI store. What is there already is not sent again, and a blob
+//! streams from its file.
+
+use std::path::Path;
+
+use futures_util::TryStreamExt as _;
+use reqwest::header::{CONTENT_LENGTH, CONTENT_TYPE, LOCATION};
+use reqwest::{Body, Method, Response, StatusCode};
+use task_proto::desired::{BlobRef, PackageRef};
+use task_proto::envelope::Envelope;
+use task_proto::oci::{EMPTY, ImageManifest, MANIFEST_TYPE};
+use task_proto::{Digest, RepositoryName};
+use tokio_util::io::ReaderStream;
+
+use super::client::{Client, ClientError};
+use crate::commands::CommandError;
+use crate::commands::display::output::{bytes, say};
+use crate::commands::display::progress;
+use crate::package::Packed;
+
+/// How often a blob's upload is begun.
+const UPLOAD_TRIES: u32 = 4;
+/// How long a manifest's answer may take: the server reads a package's whole archive before it.
+const MANIFEST_TIMEOUT: std::time::Duration = std::time::Duration::from_secs(11 * 60);
+/// An upload slower than this is given up.
+const MIN_BYTES_PER_SECOND: u64 = 16 * 1024;
+/// How much is read from the file at once.
+const CHUNK_BYTES: usize = 256 * 1024;
+
+/// A blob's bytes, in memory or in a file.
+enum Source<'a> {
+    Bytes(&'a [u8]),
+    File(&'a Path),
+}
+
+/// What is uploaded of a package.
+pub(in crate::commands) struct Upload<'a> {
+    pub(in crate::commands) package: &'a PackageRef,
+    pub(in crate::commands) config: &'a [u8],
+    pub(in crate::commands) manifest: &'a [u8],
+    /// Absent: the server has it.
+    pub(in crate::commands) content: Option<&'a Path>,
+    /// Whether its version means it from now on; else it goes by its digest alone.
+    pub(in crate::commands) tagged: bool,
+    /// Whether it may take its version from a package with other content.
+    pub(in crate::commands) force: bool,
+}
+
+impl<'a> Upload<'a> {
+    /// A directory's package, under its version or by its digest alone.
+    pub(in crate::commands) fn of(packed: &'a Packed, tagged: bool) -> Self {
+        let (config, manifest) = (&packed.config_bytes, &packed.manifest_bytes);
+        Self { package: &packed.package, config, manifest, content: Some(packed.content.path()), tagged, force: false }
+    }
+}
+
+/// Uploads what the server lacks, and says how much that was.
+pub(in crate::commands) async fn upload(client: &Client, upload: &Upload<'_>) -> Result<(), CommandError> {
+    let package = upload.package;
+    let name = package.name.as_str();
+    check_version(client, upload).await?;
+    let mut sent = 0;
+    let content = upload.content.map(|path| (package.content, Source::File(path)));
+    for (blob, source) in [Some((package.config, Source::Bytes(upload.config))), content].into_iter().flatten() {
+        if !exists(client, &format!("/v2/{name}/blobs/{}", blob.digest)).await? {
+            upload_blob(client, name, blob, &source).await?;
+            sent += 1;
+        }
+    }
+    put_manifest(client, upload).await?;
+    match sent {
+        0 => say(&format!("{} {}: nothing to upload, the server has it already", package.name, package.version)),
+        _ => say(&format!(
+            "{} {}: {sent} blobs transferred ({})",
+            package.name,
+            package.version,
+            bytes(package.content.size)
+        )),
+    }
+    Ok(())
+}
+
+/// Uploads a signed document, about `subject` or on its own. The same twice is the same.
+pub(in crate::commands) async fn upload_signed(
+    client: &Client,
+    repository: &RepositoryName,
+    artifact_type: &str,
+    envelope: &Envelope,
+    (subject, tag): (Option<BlobRef>, Option<String>),
+) -> Result<(), CommandError> {
+    let bytes = serde_json::to_vec(envelope).expect("an envelope always has a JSON form");
+    let blob = BlobRef::of(&bytes);
+    for (blob, bytes) in [(BlobRef::of(EMPTY), EMPTY), (blob, &bytes)] {
+        if !exists(client, &format!("/v2/{repository}/blobs/{}", blob.digest)).await? {
+            upload_blob(client, repository.as_str(), blob, &Source::Bytes(bytes)).await?;
+        }
+    }
+    let manifest = ImageManifest::signed_document(artifact_type, blob, subject);
+    let manifest = serde_json::to_vec(&manifest).expect("a manifest always has a JSON form");
+    let reference = tag.unwrap_or_else(|| Digest::of(&manifest).to_string());
+    let path = format!("/v2/{repository}/manifests/{reference}");
+    client
+        .send(|| {
+            let request = client.request(Method::PUT, &path).timeout(MANIFEST_TIMEOUT);
+            request.header(CONTENT_TYPE, MANIFEST_TYPE).body(manifest.clone())
+        })
+        .await?;
+    Ok(())
+}
+
+async fn exists(client: &Client, path: &str) -> Result<bool, ClientError> {
+    match client.send(|| client.request(Method::HEAD, path)).await {
+        Ok(_) => Ok(true),
+        Err(error) if status_of(&error) == Some(StatusCode::NOT_FOUND) => Ok(false),
+        Err(error) => Err(error),
+    }
+}
+
+/// The status of an answer without a readable body, as a HEAD has.
+fn status_of(error: &ClientError) -> Option<StatusCode> {
+    match error {
+        ClientError::Refused { status, .. } | ClientError::NotTheServer { status, .. } => Some(*status),
+        _ => None,
+    }
+}
+
+async fn upload_blob(client: &Client, name: &str, blob: BlobRef, source: &Source<'_>) -> Result<(), CommandError> {
+    let mut tried = 0;
+    loop {
+        tried += 1;
+        // Each try is an upload of its own: the server collects what a broken one left, and forgets all when it restarts.
+        let session = client.send(|| client.request(Method::POST, &format!("/v2/{name}/blobs/uploads/"))).await?;
+        let target = target(client, &session, blob)?;
+        let request = client
+            .request(Method::PUT, &target)
+            .timeout(std::time::Duration::from_secs(60 + blob.size / MIN_BYTES_PER_SECOND))
+            .header(CONTENT_TYPE, "application/octet-stream")
+            .header(CONTENT_LENGTH, blob.size)
+            .body(body(source, blob.size).await?);
+        let error = match request.send().await {
+            Ok(response) if response.status().is_success() => return Ok(()),
+            Ok(response) => {
+                let status = response.status();
+                let error = client.refusal(response).await;
+                if is_final(status) {
+                    return Err(error.into());
+                }
+                error
+            }
+            Err(source) => client.unreachable(source),
+        };
+        // Perhaps only the answer was lost.
+        if exists(client, &format!("/v2/{name}/blobs/{}", blob.digest)).await? {
+            return Ok(());
+        }
+        if tried >= UPLOAD_TRIES {
+            return Err(error.into());
+        }
+    }
+}
+
+/// Whether another upload of the same bytes would be refused as well.
+fn is_final(status: StatusCode) -> bool {
+    matches!(
+        status,
+        StatusCode::UNAUTHORIZED
+            | StatusCode::FORBIDDEN
+            | StatusCode::PAYLOAD_TOO_LARGE
+            | StatusCode::INSUFFICIENT_STORAGE
+    )
+}
+
+/// Where the server wants the bytes: its `Location`, relative or absolute, with the digest added.
+fn target(client: &Client, session: &Response, blob: BlobRef) -> Result<String, ClientError> {
+    let location = session.headers().get(LOCATION).and_then(|value| value.to_str().ok());
+    let location = location
+        .and_then(|location| session.url().join(location).ok())
+        // The token goes nowhere but to the server it is for.
+        .filter(|url| url.origin() == session.url().origin());
+    let mut url = location.ok_or_else(|| client.not_the_server(session.status()))?;
+    url.query_pairs_mut().append_pair("digest", &blob.digest.to_string());
+    Ok(url.into())
+}
+
+async fn body(source: &Source<'_>, size: u64) -> Result<Body, CommandError> {
+    match source {
+        Source::Bytes(bytes) => Ok(Body::from(bytes.to_vec())),
+        Source::File(path) => {
+            let file = tokio::fs::File::open(path)
+                .await
+                .map_err(|source| CommandError::Io { what: "can't read the packed content".to_owned(), source })?;
+            let bar = progress::upload_bar(size);
+            let chunks = ReaderStream::with_capacity(file, CHUNK_BYTES);
+            Ok(Body::wrap_stream(chunks.inspect_ok(move |chunk| bar.inc(chunk.len() as u64))))
+        }
+    }
+}
+
+/// A version that is there with other content is refused before anything travels; the server has the last word.
+async fn check_version(client: &Client, upload: &Upload<'_>) -> Result<(), CommandError> {
+    let package = upload.package;
+    if !upload.tagged {
+        return Ok(());
+    }
+    let path = format!("/v2/{}/manifests/{}", package.name, package.version);
+    let known = match client.send(|| client.request(Method::HEAD, &path)).await {
+        Ok(response) => digest_of(&response),
+        Err(error) if status_of(&error) == Some(StatusCode::NOT_FOUND) => None,
+        Err(error) => return Err(error.into()),
+    };
+    match known.filter(|known| *known != package.manifest.digest.to_string()) {
+        None => Ok(()),
+        Some(other) if upload.force => {
+            say(&format!("{} {} takes its version from {other}", package.name, package.version));
+            Ok(())
+        }
+        Some(other) => Err(CommandError::Usage(format!(
+            "{name} {version} is on the server with other content, {other}; this is {new}. Raise the version in task.toml or \
+             package.xml, or --force: robots that have the other one are marked as outdated",
+            name = package.name,
+            version = package.version,
+            new = package.manifest.digest
+        ))),
+    }
+}
+
+fn digest_of(response: &Response) -> Option<String> {
+    response.headers().get("docker-content-digest").and_then(|value| value.to_str().ok()).map(ToOwned::to_owned)
+}
+
+/// Puts the manifest, under the version as its tag unless it is to go by its digest, if it is not there already.
+async fn put_manifest(client: &Client, upload: &Upload<'_>) -> Result<(), CommandError> {
+    let Upload { package, manifest, tagged, force, .. } = upload;
+    let reference = if *tagged { package.version.to_string() } else { package.manifest.digest.to_string() };
+    let path = format!("/v2/{}/manifests/{reference}", package.name);
+    match client.send(|| client.request(Method::HEAD, &path)).await {
+        Ok(response) if digest_of(&response) == Some(package.manifest.digest.to_string()) => return Ok(()),
+        Ok(_) => {}
+        Err(error) if status_of(&error) == Some(StatusCode::NOT_FOUND) => {}
+        Err(error) => return Err(error.into()),
+    }
+    let path = if *force { format!("{path}?force=true") } else { path };
+    let put = || client.request(Method::PUT, &path).header(CONTENT_TYPE, MANIFEST_TYPE).body(manifest.to_vec());
+    client.send(put).await?;
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicU32, Ordering};
+
+    use axum::Router;
+    use axum::routing::{head, post, put};
+    use task_proto::token::{Token, TokenKind};
+
+    use super::*;
+    use crate::commands::Connection;
+    use crate::commands::display::output::Format;
+
+    /// A server that forgets the first upload, as one that restarts does, and refuses all of the package `refused`.
+    async fn forgetful_server(puts: Arc<AtomicU32>) -> std::net::SocketAddr {
+        let begin = |axum::extract::Path(name): axum::extract::Path<String>| async move {
+            (StatusCode::ACCEPTED, [(LOCATION, format!("/upload/{name}"))])
+        };
+        let finish = move |axum::extract::Path(name): axum::extract::Path<String>| async move {
+            match (puts.fetch_add(1, Ordering::SeqCst), name.as_str()) {
+                (_, "refused") => StatusCode::INSUFFICIENT_STORAGE,
+                (0, _) => StatusCode::NOT_FOUND,
+                _ => StatusCode::CREATED,
+            }
+        };
+        let router = Router::new()
+            .route("/v2/{name}/blobs/uploads/", post(begin))
+            .route("/v2/{name}/blobs/{digest}", head(|| async { StatusCode::NOT_FOUND }))
+            .route("/upload/{name}", put(finish));
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = listener.local_addr().unwrap();
+        tokio::spawn(async move { axum::serve(listener, router).await });
+        address
+    }
+
+    #[tokio::test]
+    async fn a_forgotten_upload_is_begun_again_and_a_refused_one_is_not() {
+        let puts = Arc::new(AtomicU32::new(0));
+        let address = forgetful_server(puts.clone()).await;
+        let connection = Connection {
+            server: Some(format!("http://{address}")),
+            token: Some(Token::random(TokenKind::Operator).reveal()),
+            pin: None,
+            token_file: None,
+            data: None,
+            output: Format::Json,
+        };
+        let client = Client::connect(&connection).unwrap();
+        let blob = BlobRef { digest: Digest::of(b"content"), size: 7 };
+        let source = Source::Bytes(b"content");
+        upload_blob(&client, "talker", blob, &source).await.unwrap();
+        assert_eq!(puts.load(Ordering::SeqCst), 2);
+        assert!(upload_blob(&client, "refused", blob, &source).await.is_err());
+        assert_eq!(puts.load(Ordering::SeqCst), 3);
+    }
+}

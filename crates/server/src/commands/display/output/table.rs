@@ -1,0 +1,185 @@
+//! A table without lines, its columns two spaces apart: as wide as what is in it, or as the terminal that shows it. Text
+//! only; what a state means is said by its word, and colour only repeats it.
+
+use unicode_width::{UnicodeWidthChar as _, UnicodeWidthStr as _};
+
+use super::printable;
+
+/// What stands between two columns.
+const GAP: usize = 2;
+/// A column is not cut below this, however narrow the terminal.
+const MIN_CUT: usize = 8;
+/// Columns that are typed or copied from the screen, and so are never cut.
+const WHOLE: [&str; 6] = ["id", "name", "robot", "deployment", "task", "version"];
+/// Columns whose first word has a colour.
+const COLOURED: [&str; 2] = ["state", "phase"];
+
+/// What a list shows of each of its things.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Columns {
+    /// The title of the column that says what a thing goes by: all that `-o name` prints.
+    pub(crate) name: &'static str,
+    /// What every table shows.
+    pub(crate) narrow: &'static [&'static str],
+    /// What a wide one shows as well.
+    pub(crate) wide: &'static [&'static str],
+}
+
+impl Columns {
+    /// Those that every table shows, by the first of which a thing goes.
+    pub(crate) const fn of(narrow: &'static [&'static str]) -> Self {
+        Self { name: narrow[0], narrow, wide: &[] }
+    }
+
+    fn titles(&self) -> impl Iterator<Item = &'static str> {
+        self.narrow.iter().chain(self.wide).copied()
+    }
+
+    /// The names in `rows`, each once.
+    pub(crate) fn names(&self, rows: &[Vec<String>]) -> Vec<String> {
+        let at = self.titles().position(|title| title == self.name).unwrap_or_default();
+        let mut seen = std::collections::HashSet::new();
+        let cells = rows.iter().filter_map(|row| row.get(at)).map(|cell| printable(cell));
+        cells.filter(|name| seen.insert(name.clone())).collect()
+    }
+}
+
+/// How a table is to look.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Look {
+    /// Whether it has the further columns.
+    pub(crate) wide: bool,
+    /// How many characters a line may have; absent: any number.
+    pub(crate) width: Option<usize>,
+    /// Whether states have colours.
+    pub(crate) colours: bool,
+}
+
+/// The table as lines.
+pub(crate) fn table(columns: &Columns, rows: &[Vec<String>], look: Look) -> String {
+    let count = if look.wide { columns.narrow.len() + columns.wide.len() } else { columns.narrow.len() };
+    let titles: Vec<&str> = columns.titles().take(count).collect();
+    let cells = |row: &Vec<String>| row.iter().take(count).map(|cell| printable(cell)).collect();
+    let mut lines: Vec<Vec<String>> = vec![titles.iter().map(|title| title.to_uppercase()).collect()];
+    lines.extend(rows.iter().map(cells));
+    let widths = fitted(&titles, widths(&lines, count), look.width);
+    let mut text = String::new();
+    for (number, line) in lines.iter().enumerate() {
+        for (at, cell) in line.iter().enumerate() {
+            let cell = cut(cell, widths[at]);
+            let padding = if at + 1 == line.len() { 0 } else { widths[at] - cell.width() + GAP };
+            let colour =
+                (look.colours && number > 0 && COLOURED.contains(&titles[at])).then(|| colour(&cell)).flatten();
+            match colour {
+                Some(colour) => text.push_str(&format!("\x1b[{colour}m{cell}\x1b[0m")),
+                None => text.push_str(&cell),
+            }
+            text.push_str(&" ".repeat(padding));
+        }
+        // The last cells of a row may be empty.
+        text.truncate(text.trim_end_matches(' ').len());
+        text.push('\n');
+    }
+    text
+}
+
+fn widths(lines: &[Vec<String>], count: usize) -> Vec<usize> {
+    (0..count)
+        .map(|at| lines.iter().filter_map(|line| line.get(at)).map(|cell| cell.width()).max().unwrap_or(0))
+        .collect()
+}
+
+/// Widths that fit a line of `limit` characters as far as columns may be cut, the widest cut first.
+fn fitted(titles: &[&str], mut widths: Vec<usize>, limit: Option<usize>) -> Vec<usize> {
+    let Some(limit) = limit else { return widths };
+    let room = limit.saturating_sub(GAP * widths.len().saturating_sub(1));
+    let mut over = widths.iter().sum::<usize>().saturating_sub(room);
+    while over > 0 {
+        let can_be_cut = |at: &usize| !WHOLE.contains(&titles[*at]) && widths[*at] > MIN_CUT.max(titles[*at].len());
+        let Some(widest) = (0..widths.len()).filter(can_be_cut).max_by_key(|at| widths[*at]) else { break };
+        widths[widest] -= 1;
+        over -= 1;
+    }
+    widths
+}
+
+/// `cell` in at most `width` characters; an ellipsis stands for what is missing.
+fn cut(cell: &str, width: usize) -> String {
+    if cell.width() <= width {
+        return cell.to_owned();
+    }
+    let (mut text, mut room) = (String::new(), width.saturating_sub(1));
+    for c in cell.chars() {
+        let Some(left) = room.checked_sub(c.width().unwrap_or(0)) else { break };
+        room = left;
+        text.push(c);
+    }
+    text.push('…');
+    text
+}
+
+fn colour(cell: &str) -> Option<&'static str> {
+    match cell.split([' ', ',']).next().unwrap_or_default() {
+        "online" | "running" | "succeeded" | "settled" | "ready" => Some("32"),
+        "failed" | "rolled_back" | "unmet" | "expired" => Some("31"),
+        "paused" | "deferred" | "pending" | "waiting" => Some("33"),
+        "offline" | "stopped" | "cancelled" | "superseded" => Some("2"),
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const COLUMNS: Columns = Columns { name: "name", narrow: &["id", "name", "problem"], wide: &["arch"] };
+
+    fn rows() -> Vec<Vec<String>> {
+        let row = |cells: [&str; 4]| cells.map(str::to_owned).to_vec();
+        vec![
+            row(["r1", "a\u{1b}[31mb\nc", "exit code 3: the lidar does not answer", "x86_64"]),
+            row(["r22", "größe", "-", "aarch64"]),
+        ]
+    }
+
+    #[test]
+    fn a_table_has_a_header_and_no_lines() {
+        let text = table(&COLUMNS, &rows(), Look::default());
+        assert_eq!(
+            text,
+            "ID   NAME       PROBLEM\n\
+             r1   a [31mb c  exit code 3: the lidar does not answer\n\
+             r22  größe      -\n"
+        );
+        let wide = table(&COLUMNS, &rows(), Look { wide: true, ..Look::default() });
+        assert!(wide.lines().all(|line| line.ends_with("ARCH") || line.ends_with("64")), "{wide}");
+        assert_eq!(COLUMNS.names(&rows()), ["a [31mb c", "größe"]);
+    }
+
+    #[test]
+    fn lines_fit_the_terminal_and_names_stay_whole() {
+        let fit = |width| table(&COLUMNS, &rows(), Look { width: Some(width), ..Look::default() });
+        for width in [24, 30, 45] {
+            let text = fit(width);
+            assert!(text.lines().all(|line| line.width() <= width), "{text}");
+            assert!(text.contains("…") && text.contains("a [31mb c") && text.contains("größe"), "{text}");
+        }
+        assert!(!fit(80).contains('…'));
+        // Narrower than what must not be cut.
+        assert!(fit(5).contains("a [31mb c"));
+    }
+
+    #[test]
+    fn characters_that_take_two_places_are_counted_so() {
+        assert_eq!(cut("機械機械", 8), "機械機械");
+        assert_eq!(cut("機械機械", 6), "機械…");
+    }
+
+    #[test]
+    fn a_colour_repeats_a_word() {
+        let columns = Columns::of(&["name", "state"]);
+        let rows = [vec!["failed".to_owned(), "offline diverged".to_owned()]];
+        let text = table(&columns, &rows, Look { colours: true, ..Look::default() });
+        assert_eq!(text, "NAME    STATE\nfailed  \x1b[2moffline diverged\x1b[0m\n");
+    }
+}

@@ -1,0 +1,128 @@
+//! Which log lines were printed, so that the past and the stream, which overlap, show each line once. The robot names no
+//! line by a number: a line is its time and its words, and two alike are two.
+
+use std::collections::hash_map::DefaultHasher;
+use std::collections::{HashMap, VecDeque};
+use std::hash::{Hash as _, Hasher as _};
+
+use task_proto::log::LogLine;
+
+/// Printed lines that are remembered.
+const MEMORY: usize = 20_000;
+
+/// The lines printed lately.
+#[derive(Default)]
+pub(in crate::commands) struct Shown {
+    counts: HashMap<u64, Counts>,
+    order: VecDeque<u64>,
+    newest_ms: u64,
+}
+
+#[derive(Default)]
+struct Counts {
+    /// How many like this were printed.
+    printed: u32,
+    /// How many came by the stream.
+    streamed: u32,
+}
+
+impl Shown {
+    /// Whether a line that came by the stream is to be printed: the past has not had it.
+    pub(in crate::commands) fn streamed(&mut self, line: &LogLine) -> bool {
+        let counts = self.counts(line);
+        counts.streamed += 1;
+        let is_new = counts.streamed > counts.printed;
+        counts.printed = counts.printed.max(counts.streamed);
+        if is_new {
+            self.newest_ms = self.newest_ms.max(line.at_ms);
+        }
+        is_new
+    }
+
+    /// Those lines of the past that were not printed and come after what was.
+    pub(in crate::commands) fn missing(&mut self, past: &[LogLine]) -> Vec<LogLine> {
+        let is_known = |line: &LogLine| self.counts.get(&key(line)).is_some_and(|counts| counts.printed > 0);
+        let newest_ms = self.newest_ms;
+        // Before the first that was printed lies what nobody asked for.
+        let begin = past.iter().position(is_known);
+        let begin = begin.or_else(|| past.iter().position(|line| line.at_ms > newest_ms)).unwrap_or(past.len());
+        let mut met: HashMap<u64, u32> = HashMap::new();
+        let mut missing = Vec::new();
+        for line in &past[begin..] {
+            let nth = met.entry(key(line)).or_default();
+            *nth += 1;
+            let nth = *nth;
+            let counts = self.counts(line);
+            if nth > counts.printed {
+                counts.printed = nth;
+                self.newest_ms = self.newest_ms.max(line.at_ms);
+                missing.push(line.clone());
+            }
+        }
+        missing
+    }
+
+    fn counts(&mut self, line: &LogLine) -> &mut Counts {
+        let key = key(line);
+        if !self.counts.contains_key(&key) {
+            self.order.push_back(key);
+            if self.order.len() > MEMORY
+                && let Some(oldest) = self.order.pop_front()
+            {
+                self.counts.remove(&oldest);
+            }
+        }
+        self.counts.entry(key).or_default()
+    }
+}
+
+/// What a node says both on its topic and on its standard error is one line, whichever comes.
+fn key(line: &LogLine) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    (line.at_ms, line.level, &line.task, &line.node, &line.text).hash(&mut hasher);
+    hasher.finish()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use task_proto::log::{LogLevel, LogSource};
+
+    fn line(at_ms: u64, text: &str) -> LogLine {
+        let (level, source) = (LogLevel::Info, LogSource::Stdout);
+        LogLine { at_ms, level, source, task: None, node: None, text: text.to_owned() }
+    }
+
+    fn texts(lines: &[LogLine]) -> Vec<&str> {
+        lines.iter().map(|line| line.text.as_str()).collect()
+    }
+
+    #[test]
+    fn the_past_and_the_stream_overlap_without_gap_or_double() {
+        let mut shown = Shown::default();
+        assert_eq!(texts(&shown.missing(&[line(1, "a"), line(2, "b"), line(2, "b")])), ["a", "b", "b"]);
+        let stream = [line(2, "b"), line(2, "b"), line(2, "b"), line(3, "c")].map(|line| shown.streamed(&line));
+        assert_eq!(stream, [false, false, true, true], "three alike are three");
+    }
+
+    #[test]
+    fn after_a_break_only_what_was_missed_is_printed() {
+        let mut shown = Shown::default();
+        shown.missing(&[line(10, "a"), line(11, "b")]);
+        assert!(shown.streamed(&line(12, "c")));
+        let past = [line(8, "older"), line(10, "a"), line(11, "b"), line(12, "c"), line(13, "d"), line(14, "e")];
+        assert_eq!(texts(&shown.missing(&past)), ["d", "e"]);
+        assert!(!shown.streamed(&line(14, "e")), "it came late");
+        assert_eq!(texts(&shown.missing(&[line(9, "x"), line(30, "f")])), ["f"], "nothing of it is known any more");
+        assert_eq!(texts(&shown.missing(&[])), Vec::<&str>::new());
+    }
+
+    #[test]
+    fn memory_is_bounded() {
+        let mut shown = Shown::default();
+        for at_ms in 0..2 * MEMORY as u64 {
+            assert!(shown.streamed(&line(at_ms, "x")));
+        }
+        assert_eq!((shown.counts.len(), shown.order.len()), (MEMORY, MEMORY));
+    }
+}

@@ -1,0 +1,252 @@
+//! How deployments and robots look to a person at the terminal. Text only; what is shown was asked for elsewhere.
+
+use std::collections::BTreeMap;
+
+use task_proto::api::{
+    AssignmentView, DeliveryDecision, DeploymentState, DeploymentView, MatchedRobot, MatchedRobots, names,
+};
+use task_proto::desired::Delivery;
+use task_proto::report::Phase;
+
+use super::output::table::Columns;
+use super::output::{self, robots, time};
+use crate::commands::{CommandError, Session};
+use crate::domain::delivery::{FELL_BEHIND, ORDERED};
+
+/// Reasons for waiting that are shown; a gate may give each robot one of its own.
+const MAX_REASONS: usize = 5;
+/// Robots that are named in one fact.
+const MAX_NAMES: usize = 20;
+
+/// A deployment's state, in a word.
+pub(in crate::commands) fn state(state: DeploymentState) -> &'static str {
+    match state {
+        DeploymentState::Active => "active",
+        DeploymentState::Paused => "paused",
+        DeploymentState::Settled => "settled",
+        DeploymentState::Cancelled => "cancelled",
+    }
+}
+
+/// How many robots stand in which phase, on one line.
+pub(in crate::commands) fn phases(view: &DeploymentView) -> String {
+    let phases: Vec<_> = view.counts.iter().map(|count| format!("{}:{}", count.phase, count.count)).collect();
+    phases.join(" ")
+}
+
+/// Prints a deployment: its facts, then a line per robot.
+pub(in crate::commands) fn print(session: &Session, view: &DeploymentView) -> Result<(), CommandError> {
+    print_with(session, view, &COLUMNS)
+}
+
+/// The same; it also says of each robot how its bytes travel.
+pub(in crate::commands) fn print_deliveries(session: &Session, view: &DeploymentView) -> Result<(), CommandError> {
+    print_with(session, view, &COLUMNS_WITH_DELIVERIES)
+}
+
+fn print_with(session: &Session, view: &DeploymentView, columns: &Columns) -> Result<(), CommandError> {
+    let name = |view: &DeploymentView| view.id.to_string();
+    session.output.described(view, name, |view| {
+        let mut text = describe(view);
+        if let Some(assignments) = &view.assignments {
+            let rows: Vec<_> = assignments.iter().map(assignment_row).collect();
+            text.push('\n');
+            text.push_str(&session.output.table(columns, &rows));
+        }
+        text
+    })
+}
+
+const COLUMNS: Columns =
+    Columns { name: "robot", narrow: &["robot", "state", "phase", "progress", "detail"], wide: &["delivery"] };
+const COLUMNS_WITH_DELIVERIES: Columns =
+    Columns { name: "robot", narrow: &["robot", "state", "phase", "progress", "detail", "delivery"], wide: &[] };
+
+fn describe(view: &DeploymentView) -> String {
+    let supersedes: Vec<_> = view.supersedes.iter().map(ToString::to_string).collect();
+    let mut facts = vec![
+        ("deployment", view.id.to_string()),
+        ("package", format!("{} {} {}", view.package.name, view.package.version, view.package.manifest.digest)),
+        ("selector", view.selector.as_ref().map_or_else(|| "…".to_owned(), ToString::to_string)),
+        ("delivery", view.delivery.to_string()),
+        ("state", state(view.state).to_owned()),
+        ("phases", phases(view)),
+        ("created", time(view.created_at_ms)),
+        ("expires", time(view.expires_at_ms)),
+    ];
+    if view.outdated {
+        facts.push(("outdated", "a forced push gave this version to another package".to_owned()));
+    }
+    if view.priority != 0 {
+        facts.push(("priority", view.priority.to_string()));
+    }
+    if let Some(batch) = view.batch {
+        facts.push(("batch", batch.to_string()));
+    }
+    if !supersedes.is_empty() {
+        facts.push(("supersedes", supersedes.join(" ")));
+    }
+    let awaited = view.awaited();
+    for (title, robots) in [("waits for", &awaited.busy), ("next", &awaited.queued), ("offline", &awaited.offline)] {
+        if view.state != DeploymentState::Cancelled && !robots.is_empty() {
+            facts.push((title, names(robots, MAX_NAMES)));
+        }
+    }
+    let assignments = view.assignments.as_deref().unwrap_or_default();
+    facts.extend(mechanisms(assignments).into_iter().map(|line| ("travels", line)));
+    facts.extend(deferred(assignments).into_iter().map(|line| ("deferred", line)));
+    output::facts(facts)
+}
+
+/// How the bytes travel to how many robots and why, the most common way first.
+fn mechanisms(assignments: &[AssignmentView]) -> Vec<String> {
+    let mut ways: BTreeMap<(Delivery, &str), Vec<&str>> = BTreeMap::new();
+    for decision in assignments.iter().filter_map(|assignment| assignment.delivery.as_ref()) {
+        ways.entry((decision.mechanism, decision.rule.as_str())).or_default().push(&decision.because);
+    }
+    let mut ways: Vec<_> = ways.into_iter().collect();
+    ways.sort_by_key(|(_, reasons)| std::cmp::Reverse(reasons.len()));
+    let line = |((mechanism, rule), reasons): ((Delivery, &str), Vec<&str>)| {
+        let count = if assignments.len() == 1 { String::new() } else { format!("{}, ", robots(reasons.len() as u64)) };
+        let is_one = reasons.iter().all(|reason| *reason == reasons[0]);
+        let others = if is_one { "" } else { " and the like" };
+        format!("{count}{mechanism}: {}, {}{others}", rule_shown(rule), reasons[0])
+    };
+    ways.into_iter().map(line).collect()
+}
+
+fn rule_shown(rule: &str) -> String {
+    // The first two are no rules of anybody.
+    if matches!(rule, ORDERED | FELL_BEHIND) { rule.to_owned() } else { format!("rule {rule:?}") }
+}
+
+/// How the bytes travel to one robot and why.
+fn way(delivery: Option<&DeliveryDecision>) -> String {
+    let shown = |decision: &DeliveryDecision| {
+        format!("{}: {}, {}", decision.mechanism, rule_shown(&decision.rule), decision.because)
+    };
+    delivery.map_or_else(|| "-".to_owned(), shown)
+}
+
+/// How many robots wait for what, the most common reason first.
+fn deferred(assignments: &[AssignmentView]) -> Vec<String> {
+    let mut counts: BTreeMap<&str, u64> = BTreeMap::new();
+    for assignment in assignments.iter().filter(|assignment| assignment.phase == Phase::Deferred) {
+        let reason = assignment.failure.as_ref().map_or("", |failure| failure.text.trim());
+        *counts.entry(if reason.is_empty() { "no reason given" } else { reason }).or_default() += 1;
+    }
+    let mut reasons: Vec<(&str, u64)> = counts.into_iter().collect();
+    reasons.sort_by_key(|&(_, count)| std::cmp::Reverse(count));
+    let others = reasons.split_off(reasons.len().min(MAX_REASONS));
+    let mut lines: Vec<String> =
+        reasons.iter().map(|&(reason, count)| format!("{}: {reason}", robots(count))).collect();
+    if !others.is_empty() {
+        let count = others.iter().map(|(_, count)| count).sum();
+        lines.push(format!("{}: {} other reasons, see below", robots(count), others.len()));
+    }
+    lines
+}
+
+fn assignment_row(assignment: &AssignmentView) -> Vec<String> {
+    let detail = match (&assignment.failure, &assignment.superseded_by) {
+        (Some(failure), _) => failure.to_string(),
+        (None, Some(newer)) => format!("by {newer}"),
+        (None, None) if assignment.phase.is_final() => "-".to_owned(),
+        (None, None) if !assignment.released && assignment.online => "waits for its batch".to_owned(),
+        (None, None) if !assignment.released => "begins when the robot is back".to_owned(),
+        (None, None) => "-".to_owned(),
+    };
+    let progress = assignment.progress.filter(|progress| progress.total > 0);
+    vec![
+        assignment.name.to_string(),
+        if assignment.online { "online" } else { "offline" }.to_owned(),
+        assignment.phase.to_string(),
+        progress.map_or_else(|| "-".to_owned(), |p| format!("{}%", p.done.min(p.total) * 100 / p.total)),
+        detail,
+        way(assignment.delivery.as_ref()),
+    ]
+}
+
+/// Lists the robots an order means.
+pub(in crate::commands) fn print_matched(session: &Session, matched: &MatchedRobots) -> Result<(), CommandError> {
+    let columns = Columns { name: "name", narrow: &["id", "name", "state"], wide: &[] };
+    session.output.result(matched, &columns, |matched| {
+        let row = |robot: &MatchedRobot| {
+            vec![
+                robot.id.to_string(),
+                robot.name.to_string(),
+                if robot.online { "online" } else { "offline" }.to_owned(),
+            ]
+        };
+        matched.robots.iter().map(row).collect()
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use task_proto::RobotId;
+    use task_proto::report::{Failure, FailureCode};
+
+    fn assignment(phase: Phase, reason: Option<&str>) -> AssignmentView {
+        AssignmentView {
+            robot: RobotId::random(),
+            name: "atlas".parse().expect("a name"),
+            online: true,
+            released: true,
+            delivery: None,
+            phase,
+            progress: None,
+            failure: reason.map(|reason| Failure::new(FailureCode::GATE_REFUSED, reason)),
+            attempts: 1,
+            superseded_by: None,
+            updated_at_ms: 0,
+            timeline: None,
+        }
+    }
+
+    #[test]
+    fn ways_are_counted_and_explained() {
+        let travelling = |mechanism, rule: &str, because: &str| AssignmentView {
+            delivery: Some(DeliveryDecision { mechanism, rule: rule.to_owned(), because: because.to_owned() }),
+            ..assignment(Phase::Fetching, None)
+        };
+        let pull = || travelling(Delivery::PushPull, "otherwise", "size 9.7 MB > 256 KB");
+        assert_eq!(mechanisms(&[pull()]), ["push-pull: rule \"otherwise\", size 9.7 MB > 256 KB"]);
+        let assignments = [
+            travelling(Delivery::DirectPush, "slow", "rtt 120 ms > 100 ms"),
+            pull(),
+            travelling(Delivery::DirectPush, "slow", "rtt 140 ms > 100 ms"),
+            travelling(Delivery::PushPull, "fell behind", "no progress"),
+            assignment(Phase::Assigned, None),
+        ];
+        assert_eq!(
+            mechanisms(&assignments),
+            [
+                "2 robots, direct-push: rule \"slow\", rtt 120 ms > 100 ms and the like",
+                "1 robot, push-pull: fell behind, no progress",
+                "1 robot, push-pull: rule \"otherwise\", size 9.7 MB > 256 KB",
+            ]
+        );
+        assert_eq!(assignment_row(&assignments[4])[5], "-");
+        assert_eq!(assignment_row(&assignments[3])[5], "push-pull: fell behind, no progress");
+    }
+
+    #[test]
+    fn waiting_robots_are_counted_by_their_reasons() {
+        let mut assignments = vec![
+            assignment(Phase::Running, None),
+            assignment(Phase::Failed, Some("battery low")),
+            assignment(Phase::Deferred, Some("carries a load")),
+            assignment(Phase::Deferred, Some("battery low")),
+            assignment(Phase::Deferred, Some("battery low\n")),
+        ];
+        assert_eq!(deferred(&assignments[..2]), [""; 0]);
+        assert_eq!(deferred(&assignments), ["2 robots: battery low", "1 robot: carries a load"]);
+        assignments.extend((0..MAX_REASONS).map(|n| assignment(Phase::Deferred, Some(&format!("load {n}")))));
+        let lines = deferred(&assignments);
+        assert_eq!((lines.len(), lines[0].as_str()), (MAX_REASONS + 1, "2 robots: battery low"));
+        assert_eq!(lines[MAX_REASONS], "2 robots: 2 other reasons, see below");
+        assert!(deferred(&[assignment(Phase::Deferred, None)])[0].ends_with("no reason given"));
+    }
+}

@@ -1,0 +1,130 @@
+//! `taskd robot top`: how robots' machines do, the busiest first; once, or again and again.
+
+use std::time::Duration;
+
+use clap::Args;
+use task_proto::api::{RobotList, RobotView};
+use task_proto::selector::Selector;
+use task_proto::time::span;
+use task_proto::vitals::Vitals;
+use tokio::time::sleep;
+
+use super::selection;
+use crate::commands::api::{complete, wait};
+use crate::commands::display::output::table::Columns;
+use crate::commands::display::output::{Format, bytes, say, stderr_is_terminal, stream_text};
+use crate::commands::{CommandError, Outcome, Session};
+use crate::system::clock::Clock;
+
+/// Between two looks; robots speak once a minute.
+const PAUSE: Duration = Duration::from_secs(5);
+/// Home, and everything below is gone.
+const CLEAR: &str = "\x1b[H\x1b[J";
+
+/// Whose machines.
+#[derive(Debug, Args)]
+pub struct TopOrder {
+    /// Which robots
+    #[arg(default_value = "*", add = complete::selectors())]
+    selector: Selector,
+    /// Go on until Ctrl-C
+    #[arg(short, long)]
+    follow: bool,
+}
+
+pub(in crate::commands) async fn run(session: &Session, order: TopOrder) -> Result<Outcome, CommandError> {
+    if !order.follow {
+        let list = sorted(selection::matching(session, &order.selector).await?);
+        print(session, &list)?;
+        return Ok(Outcome::Succeeded);
+    }
+    loop {
+        match selection::matching(session, &order.selector).await {
+            Ok(list) => {
+                // Where it does not stay on a screen, each look stands below the one before.
+                let stays = session.output.has_colours() && session.output.format() == Format::Table;
+                if !stream_text(if stays { CLEAR } else { "" })? || !print(session, &sorted(list))? {
+                    return Ok(Outcome::Succeeded);
+                }
+            }
+            Err(CommandError::Client(error)) if wait::may_pass(&error) => {
+                if stderr_is_terminal() {
+                    say(&format!("{error}; trying again"));
+                }
+            }
+            Err(error) => return Err(error),
+        }
+        sleep(PAUSE).await;
+    }
+}
+
+/// The busiest first, and at the end those that say nothing.
+fn sorted(mut list: RobotList) -> RobotList {
+    let busy = |robot: &RobotView| robot.vitals.and_then(|vitals| vitals.cpu_percent).unwrap_or(-1.0);
+    list.robots.sort_by(|one, other| busy(other).total_cmp(&busy(one)).then_with(|| one.name.cmp(&other.name)));
+    list
+}
+
+const COLUMNS: Columns = Columns {
+    name: "name",
+    narrow: &["name", "state", "cpu", "memory", "disk", "in", "out", "age"],
+    wide: &["load", "battery", "temperature", "rtt", "agent"],
+};
+
+/// False when nobody reads any more.
+fn print(session: &Session, list: &RobotList) -> Result<bool, CommandError> {
+    let now_ms = Clock::system().now_ms();
+    session.output.listed(list, &COLUMNS, |list| list.robots.iter().map(|robot| row(robot, now_ms)).collect())
+}
+
+fn row(robot: &RobotView, now_ms: u64) -> Vec<String> {
+    let vitals = robot.vitals.unwrap_or_default();
+    let shown = |text: Option<String>| text.unwrap_or_else(|| "-".to_owned());
+    let Vitals { memory_used_bytes, memory_total_bytes, disk_used_bytes, disk_total_bytes, .. } = vitals;
+    let age = robot.vitals.map(|vitals| span(Duration::from_millis(now_ms.saturating_sub(vitals.at_ms))));
+    let per_s = |rate: Option<u64>| shown(rate.map(|rate| format!("{}/s", bytes(rate))));
+    vec![
+        robot.name.to_string(),
+        if robot.online { "online" } else { "offline" }.to_owned(),
+        shown(vitals.cpu_percent.map(|percent| format!("{percent:.0}%"))),
+        shown(share(memory_used_bytes, memory_total_bytes)),
+        shown(share(disk_used_bytes, disk_total_bytes)),
+        per_s(vitals.network_in_bytes_per_s),
+        per_s(vitals.network_out_bytes_per_s),
+        shown(age),
+        shown(vitals.load_1m.map(|load| format!("{load:.1}"))),
+        shown(vitals.battery_percent.map(|percent| format!("{percent}%"))),
+        shown(vitals.temperature_c.map(|degrees| format!("{degrees:.0} °C"))),
+        shown(robot.link.and_then(|link| link.rtt_ms).map(|rtt_ms| format!("{rtt_ms} ms"))),
+        shown(robot.host.as_ref().map(|host| host.agent_version.clone())),
+    ]
+}
+
+/// How a machine does, in a line.
+pub(in crate::commands) fn summary(vitals: &Vitals) -> String {
+    let parts = [
+        vitals.cpu_percent.map(|percent| format!("processors {percent:.0}%")),
+        share(vitals.memory_used_bytes, vitals.memory_total_bytes).map(|share| format!("memory {share}")),
+        share(vitals.disk_used_bytes, vitals.disk_total_bytes).map(|share| format!("disk {share}")),
+        vitals.temperature_c.map(|degrees| format!("{degrees:.0} °C")),
+    ];
+    parts.into_iter().flatten().collect::<Vec<_>>().join(", ")
+}
+
+/// `41% of 8 GiB`.
+fn share(used: Option<u64>, total: Option<u64>) -> Option<String> {
+    let (used, total) = (used?, total.filter(|total| *total > 0)?);
+    Some(format!("{}% of {}", u128::from(used.min(total)) * 100 / u128::from(total), bytes(total)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_share_is_of_what_there_is() {
+        assert_eq!(share(Some(1 << 30), Some(4 << 30)), Some("25% of 4.00 GiB".to_owned()));
+        assert_eq!(share(Some(5), Some(4)), Some("100% of 4 B".to_owned()));
+        assert_eq!((share(None, Some(4)), share(Some(1), Some(0))), (None, None));
+    }
+}

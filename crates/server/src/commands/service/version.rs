@@ -1,0 +1,37 @@
+//! `taskd version`: which version this program is, and which the server is where one answers.
+
+use std::time::Duration;
+
+use serde::Serialize;
+use task_proto::api::ServerInfo;
+
+use crate::commands::api::client::Client;
+use crate::commands::display::output::{Output, facts};
+use crate::commands::{CommandError, Connection, Outcome};
+
+/// How long the server may take to say it.
+const PATIENCE: Duration = Duration::from_secs(3);
+
+#[derive(Serialize)]
+struct Versions {
+    taskd: &'static str,
+    server: Option<String>,
+}
+
+pub(in crate::commands) async fn run(connection: &Connection) -> Result<Outcome, CommandError> {
+    let server = async {
+        let client = Client::connect(connection).ok()?;
+        let info: ServerInfo = tokio::time::timeout(PATIENCE, client.get("/server", &[])).await.ok()?.ok()?;
+        Some(info.version)
+    };
+    let versions = Versions { taskd: env!("CARGO_PKG_VERSION"), server: server.await };
+    Output::new(connection.output).described(
+        &versions,
+        |versions| versions.taskd.to_owned(),
+        |versions| {
+            let server = versions.server.clone().unwrap_or_else(|| "none answers".to_owned());
+            facts([("taskd", versions.taskd.to_owned()), ("server", server)])
+        },
+    )?;
+    Ok(Outcome::Succeeded)
+}

@@ -6,39 +6,14 @@
 
 #![expect(clippy::disallowed_methods, reason = "SQL is at home here")]
 
-mod access;
-mod adoption;
-mod assignments;
-mod audit;
-mod connections;
+mod database;
 mod deliveries;
-mod deployments;
-mod earlier;
-mod enrolments;
-mod fan_outs;
-mod fault;
-mod first_use;
-mod integrity;
-mod matching;
-mod migrate;
-mod needs;
+mod fleet;
 mod orders;
-mod outputs;
-mod package_use;
-mod packages;
-mod publishers;
-mod referrers;
-mod reports;
-mod robot_blobs;
-mod robot_pages;
-mod robots;
+mod people;
+mod registry;
 mod rows;
-mod state;
-mod still_running;
-mod taking_back;
 mod timelines;
-mod tokens;
-mod users;
 
 use std::fmt;
 use std::fs::File;
@@ -52,36 +27,36 @@ use sqlx::migrate::MigrateError;
 use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{AnyConnection, Connection as _};
 
-use access::{Access, Ending};
-pub use assignments::{Released, TaskOrder};
-use audit::everybodys_pace;
-pub use audit::{Act, Deed};
-pub use connections::with_shared_reads;
-use connections::{Connections, Lent, Statement, Terms, bounded};
+pub use database::connections::with_shared_reads;
+use database::connections::{Connections, Lent, Statement, Terms, bounded};
+pub use database::fault::Fault;
+pub use database::integrity::check_at_rest;
+use database::integrity::{Checked, check_quickly, postgres_guard};
+pub use database::state::DatabaseState;
 pub use deliveries::{Decided, DeliveryOrder, RobotFacts};
-pub use deployments::{DeploymentPage, NewDeployment, OpenRobot, OpenRollout};
-pub use earlier::{EarlierPackage, Unsuccessful};
-pub use fault::Fault;
-use first_use::FirstUses;
-pub use integrity::check_at_rest;
-use integrity::{Checked, check_quickly, postgres_guard};
-pub use matching::Matching;
-pub use orders::PastOrder;
-pub use outputs::NewOutput;
-pub use package_use::{Deletion, PackageUsers};
-pub use packages::{NewManifest, PutManifest, Reference, StoredManifest};
-pub use publishers::SignedDocument;
-pub use referrers::ReferrersPage;
-pub use reports::{OpenAssignment, ReportedBy, ReportedRobot};
-pub use robot_blobs::bytes_taken;
-pub use robot_pages::RobotPage;
-pub use robots::{BrokerCredential, DesiredTasks, FetchedBy, KnownRobot};
-pub use state::DatabaseState;
-pub use still_running::StillRunning;
-pub use taking_back::Revocable;
+pub use fleet::matching::Matching;
+pub use fleet::reports::{OpenAssignment, ReportedBy, ReportedRobot};
+pub use fleet::robot_pages::RobotPage;
+pub use fleet::robots::{BrokerCredential, DesiredTasks, FetchedBy, KnownRobot};
+pub use orders::assignments::{Released, TaskOrder};
+pub use orders::deployments::{DeploymentPage, NewDeployment, OpenRobot, OpenRollout};
+pub use orders::earlier::{EarlierPackage, Unsuccessful};
+pub use orders::idempotency::PastOrder;
+pub use orders::still_running::StillRunning;
+pub use orders::taking_back::Revocable;
+use people::access::{Access, Ending};
+use people::audit::everybodys_pace;
+pub use people::audit::{Act, Deed};
+use people::first_use::FirstUses;
+pub use people::tokens::{Admitted, EnrolmentTerms, TokenHolder};
+pub use people::users::{NewToken, User};
+pub use registry::outputs::NewOutput;
+pub use registry::package_use::{Deletion, PackageUsers};
+pub use registry::packages::{NewManifest, PutManifest, Reference, StoredManifest};
+pub use registry::publishers::SignedDocument;
+pub use registry::referrers::ReferrersPage;
+pub use registry::robot_blobs::bytes_taken;
 pub use timelines::{HistoryPage, HistoryQuery};
-pub use tokens::{Admitted, EnrolmentTerms, TokenHolder};
-pub use users::{NewToken, User};
 
 use crate::domain::person::Person;
 use crate::limits::pace::Pace;
@@ -359,7 +334,7 @@ impl Store {
                 Checked::Interrupted => tracing::info!("the database is large: the check goes on while it is served"),
             }
         }
-        migrate::run(connection).await.map_err(|source| match source {
+        database::migrate::run(connection).await.map_err(|source| match source {
             MigrateError::VersionMissing(version) => StoreError::Newer { url: url(), version },
             source => StoreError::Migrate { url: url(), source },
         })

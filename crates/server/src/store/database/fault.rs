@@ -1,0 +1,110 @@
+//! Faults of the database itself, told apart by the codes of its errors: a corrupt file, a full disk, a server that is away
+//! or busy. It decides only which fault an error shows, never what is done about it.
+
+use std::io;
+
+use sqlx::Error;
+use sqlx::migrate::MigrateError;
+
+/// A fault that an operator mends, or that passes by itself.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Fault {
+    /// Pages of the database hold something else than was written.
+    Corrupt,
+    /// There is no room for what was to be written.
+    Full,
+    /// The database server can't be reached, or takes no statements now.
+    Away,
+    /// Others hold what a statement needs, for too long.
+    Busy,
+}
+
+impl Fault {
+    /// The fault that the error shows; `None` if the statement itself is wrong or refused.
+    pub(in crate::store) fn of(error: &Error) -> Option<Self> {
+        match error {
+            Error::Io(error) if error.kind() == io::ErrorKind::StorageFull => Some(Self::Full),
+            Error::Io(_) => Some(Self::Away),
+            Error::PoolTimedOut | Error::PoolClosed => Some(Self::Busy),
+            Error::Database(error) => error.code().as_deref().and_then(Self::of_code),
+            _ => None,
+        }
+    }
+
+    /// Likewise of a migration that failed.
+    pub(in crate::store) fn of_migration(error: &MigrateError) -> Option<Self> {
+        match error {
+            MigrateError::Execute(error) | MigrateError::ExecuteMigration(error, _) => Self::of(error),
+            _ => None,
+        }
+    }
+
+    /// Postgres has codes of five characters, SQLite's are numbers below 10,000.
+    fn of_code(code: &str) -> Option<Self> {
+        match code.parse::<u16>() {
+            Ok(number) if code.len() < 5 => Self::of_sqlite(number),
+            _ => Self::of_postgres(code),
+        }
+    }
+
+    /// By SQLite's extended result code, whose low byte is the primary one.
+    fn of_sqlite(code: u16) -> Option<Self> {
+        /// A checksum of the file system, and one of the database, that does not match.
+        const DAMAGED_READS: [u16; 2] = [8458, 8202];
+        /// The index of the write-ahead log could not be extended.
+        const SHARED_MEMORY_SIZE: u16 = 4874;
+        match (code & 0xff, code) {
+            (11 | 26, _) => Some(Self::Corrupt),
+            (10, code) if DAMAGED_READS.contains(&code) => Some(Self::Corrupt),
+            (13, _) | (10, SHARED_MEMORY_SIZE) => Some(Self::Full),
+            (5 | 6, _) => Some(Self::Busy),
+            _ => None,
+        }
+    }
+
+    /// By SQLSTATE.
+    fn of_postgres(code: &str) -> Option<Self> {
+        match code {
+            "XX001" | "XX002" => Some(Self::Corrupt),
+            "53100" => Some(Self::Full),
+            // Shut down, crashed, starting up, cut off for being idle, a standby.
+            "57P01" | "57P02" | "57P03" | "57P05" | "25P03" | "25006" => Some(Self::Away),
+            // Too many connections, too little memory, a lock or a statement that took too long, a deadlock. Connections that
+            // are there go on.
+            "53000" | "53200" | "53300" | "53400" | "55P03" | "57014" | "40001" | "40P01" => Some(Self::Busy),
+            _ if code.starts_with("08") => Some(Self::Away),
+            _ => None,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn codes_of_both_databases_show_their_faults() {
+        for (code, fault) in [
+            ("11", Some(Fault::Corrupt)),
+            ("26", Some(Fault::Corrupt)),
+            ("523", Some(Fault::Corrupt)),
+            ("8458", Some(Fault::Corrupt)),
+            ("13", Some(Fault::Full)),
+            ("4874", Some(Fault::Full)),
+            ("5", Some(Fault::Busy)),
+            ("517", Some(Fault::Busy)),
+            ("2067", None),
+            ("XX001", Some(Fault::Corrupt)),
+            ("53100", Some(Fault::Full)),
+            ("57P03", Some(Fault::Away)),
+            ("53300", Some(Fault::Busy)),
+            ("08006", Some(Fault::Away)),
+            ("57014", Some(Fault::Busy)),
+            ("23505", None),
+            ("28P01", None),
+            ("3D000", None),
+        ] {
+            assert_eq!(Fault::of_code(code), fault, "{code}");
+        }
+    }
+}

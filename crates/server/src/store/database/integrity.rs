@@ -1,0 +1,187 @@
+//! Checks of a SQLite file: a quick one before it is served, a full one beside the service. Each has a connection of its own
+//! that only reads. Postgres checks its pages itself as it reads them, where they have checksums: this is asked for.
+
+use std::borrow::Cow;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use sqlx::sqlite::SqliteConnection;
+use sqlx::{AnyConnection, AssertSqlSafe, Connection as _, Error, Row as _};
+use tokio_util::sync::CancellationToken;
+
+use super::fault::Fault;
+use crate::store::{Store, StoreError, sqlite_url};
+
+/// How long the check at start may take. What it did not come to is checked beside the service.
+const QUICK_TIME: Duration = Duration::from_secs(10);
+/// How often a check looks whether it has to end: after so many pages or steps of SQLite's virtual machine.
+const STEPS_PER_LOOK: i32 = 1000;
+/// A full check works for this long, then leaves disk and processor to the service for as long.
+const TURN: Duration = Duration::from_millis(20);
+/// SQLite's code for a statement that was told to end.
+const INTERRUPTED: &str = "9";
+
+/// The outcome of a check.
+#[derive(Debug, PartialEq, Eq)]
+pub(in crate::store) enum Checked {
+    /// Nothing is wrong with what was looked at.
+    Sound,
+    /// The first finding.
+    Damaged(String),
+    /// It was told to end before it had come to everything.
+    Interrupted,
+}
+
+/// Looks for damage in the structure of the file, for at most [`QUICK_TIME`].
+pub(in crate::store) async fn check_quickly(url: &str) -> Result<Checked, Error> {
+    let mut connection = SqliteConnection::connect(url).await?;
+    let end = Instant::now() + QUICK_TIME;
+    connection.lock_handle().await?.set_progress_handler(STEPS_PER_LOOK, move || Instant::now() < end);
+    let checked = run(&mut connection, "PRAGMA quick_check(1)").await;
+    close(connection).await;
+    checked
+}
+
+/// A quick check of a SQLite file that nobody serves: the first finding, if there is one.
+pub async fn check_at_rest(path: &Path) -> Result<Option<String>, StoreError> {
+    match check_quickly(&sqlite_url(path)).await {
+        Ok(Checked::Damaged(finding)) => Ok(Some(finding)),
+        Ok(Checked::Sound | Checked::Interrupted) => Ok(None),
+        Err(error) if Fault::of(&error) == Some(Fault::Corrupt) => Ok(Some(error.to_string())),
+        Err(source) => Err(StoreError::Open { url: path.display().to_string(), source }),
+    }
+}
+
+/// Checks all tables and indices of the file against each other, a table at a time so that no read lasts for long.
+async fn check_fully(url: &str, stop: CancellationToken) -> Result<Checked, Error> {
+    let mut connection = SqliteConnection::connect(url).await?;
+    let mut turn_began = Instant::now();
+    connection.lock_handle().await?.set_progress_handler(STEPS_PER_LOOK, move || {
+        if turn_began.elapsed() >= TURN {
+            pause();
+            turn_began = Instant::now();
+        }
+        !stop.is_cancelled()
+    });
+    let checked = check_tables(&mut connection).await;
+    close(connection).await;
+    checked
+}
+
+/// In the thread of the connection, which does nothing else.
+#[expect(clippy::disallowed_methods, reason = "a statement that SQLite runs can't await")]
+fn pause() {
+    std::thread::sleep(TURN);
+}
+
+async fn check_tables(connection: &mut SqliteConnection) -> Result<Checked, Error> {
+    let list = "SELECT name FROM sqlite_schema WHERE type = 'table' ORDER BY name";
+    let tables: Vec<String> = match sqlx::query_scalar(list).fetch_all(&mut *connection).await {
+        Ok(tables) => tables,
+        Err(error) => return broken_off(error),
+    };
+    for table in tables {
+        let table = table.replace('\'', "''");
+        for check in ["integrity_check", "foreign_key_check"] {
+            let checked = run(connection, &format!("PRAGMA {check}('{table}')")).await?;
+            if checked != Checked::Sound {
+                return Ok(checked);
+            }
+        }
+    }
+    Ok(Checked::Sound)
+}
+
+/// Runs a check up to its first finding.
+async fn run(connection: &mut SqliteConnection, check: &str) -> Result<Checked, Error> {
+    let row = match sqlx::query(AssertSqlSafe(check)).fetch_optional(connection).await {
+        Ok(Some(row)) => row,
+        Ok(None) => return Ok(Checked::Sound),
+        Err(error) => return broken_off(error),
+    };
+    let text: String = row.try_get(0)?;
+    Ok(match text.as_str() {
+        "ok" => Checked::Sound,
+        // A row of foreign_key_check has the table, the row, the table that it refers to, and by which key.
+        table if row.len() > 1 => Checked::Damaged(format!("a row of {table} refers to one that is not there")),
+        // A line that names the database may come first.
+        _ => Checked::Damaged(text.lines().last().unwrap_or(&text).to_owned()),
+    })
+}
+
+/// A check that ends at a page which can't be understood has found something.
+fn broken_off(error: Error) -> Result<Checked, Error> {
+    let code = error.as_database_error().and_then(|error| error.code().map(Cow::into_owned));
+    match Fault::of(&error) {
+        Some(Fault::Corrupt) => Ok(Checked::Damaged(error.to_string())),
+        _ if code.as_deref() == Some(INTERRUPTED) => Ok(Checked::Interrupted),
+        _ => Err(error),
+    }
+}
+
+async fn close(connection: SqliteConnection) {
+    if let Err(error) = connection.close().await {
+        tracing::debug!(%error, "the connection that checked the database did not end well");
+    }
+}
+
+/// How Postgres guards its pages.
+pub(in crate::store) async fn postgres_guard(connection: &mut AnyConnection) -> &'static str {
+    match sqlx::query_scalar::<_, String>("SHOW data_checksums").fetch_one(connection).await.as_deref() {
+        Ok("on") => "Postgres checks its pages as it reads them (data_checksums is on)",
+        _ => "nothing checks its pages: data_checksums of this Postgres is not on",
+    }
+}
+
+impl Store {
+    /// Checks a SQLite file in full, slowly, unless `stop` comes first; [`crate::store::DatabaseState`] has the outcome.
+    pub async fn check(&self, now_ms: u64, stop: CancellationToken) -> Result<(), StoreError> {
+        if self.is_postgres || !self.state.is_there() {
+            return Ok(());
+        }
+        match check_fully(&self.url, stop).await? {
+            Checked::Damaged(finding) => self.state.is_corrupt(finding),
+            Checked::Sound => self.state.fully_checked(now_ms),
+            Checked::Interrupted => {}
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn check_ends_when_it_is_told_to_and_a_sound_file_has_no_finding() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let path = directory.path().join("taskd.sqlite");
+        let store = Store::open(&sqlite_url(&path)).await.expect("opens");
+        let fill = "CREATE TABLE filler (number BIGINT, text TEXT);
+            WITH RECURSIVE numbers (n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM numbers WHERE n < 20000)
+            INSERT INTO filler SELECT n, 'some text of number ' || n FROM numbers;
+            CREATE INDEX filler_by_text ON filler (text)";
+        let mut connection = store.writes.lend().await.expect("lent");
+        sqlx::raw_sql(fill).execute(connection.connection()).await.expect("filled");
+        drop(connection);
+        let stop = CancellationToken::new();
+        stop.cancel();
+        store.check(7, stop).await.expect("checked");
+        assert_eq!(store.state().fully_checked_at_ms(), None, "it was not checked to its end");
+        store.check(8, CancellationToken::new()).await.expect("checked");
+        assert_eq!((store.state().fully_checked_at_ms(), store.state().problem()), (Some(8), None));
+        assert_eq!(check_at_rest(&path).await.expect("checked"), None);
+
+        let orphan =
+            "INSERT INTO tokens (id, kind, digest, robot_id, created_at_ms) VALUES ('t', 'r', 'd', 'nobody', 1)";
+        let mut other = SqliteConnection::connect(&sqlite_url(&path)).await.expect("opens");
+        sqlx::raw_sql("PRAGMA foreign_keys = OFF").execute(&mut other).await.expect("set");
+        sqlx::raw_sql(orphan).execute(&mut other).await.expect("written");
+        store.check(9, CancellationToken::new()).await.expect("checked");
+        assert_eq!(store.state().corruption(), Some("a row of tokens refers to one that is not there"));
+        assert!(matches!(store.begin().await.err(), Some(StoreError::Corrupt)));
+        // A row that can't be found does not mean that nobody needs the blob.
+        let collected = store.forget_unneeded(vec![task_proto::Digest::of(b"a blob")]).await;
+        assert!(matches!(collected, Err(StoreError::Corrupt)));
+    }
+}

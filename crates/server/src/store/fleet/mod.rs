@@ -1,0 +1,9 @@
+//! Owns the robots as they are registered and as they report; it never decides what they should
+//! run.
+
+pub(super) mod adoption;
+pub(super) mod enrolments;
+pub(super) mod matching;
+pub(super) mod reports;
+pub(super) mod robot_pages;
+pub(super) mod robots;

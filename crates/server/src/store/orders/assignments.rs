@@ -1,0 +1,326 @@
+//! Assignments: each deployment's part for each robot, and which of them is desired. Every change is a few statements over
+//! sets of rows, whatever the number of robots. Whoever changes what is desired of a robot raises its generation in the
+//! same write.
+
+use std::collections::BTreeSet;
+
+use sqlx::AssertSqlSafe;
+use task_proto::report::Phase;
+use task_proto::{DeploymentId, RobotId, TaskName};
+
+use crate::store::rows::{groups, id, parts_of, stored, values};
+use crate::store::timelines::{grown_by, step};
+use crate::store::{StoreError, Write};
+
+/// What may be ordered about a task that a robot has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum TaskOrder {
+    /// Run it, if it does not.
+    Start,
+    /// Run it anew.
+    Restart,
+    /// Stop it, keep it installed.
+    Stop,
+    /// Take it off the robot.
+    Remove,
+}
+
+/// A batch that has begun.
+#[derive(Debug, Default)]
+pub struct Released {
+    /// Whose desired state is new.
+    pub robots: Vec<RobotId>,
+    /// Deployments whose place was taken on some of them.
+    pub superseded: BTreeSet<DeploymentId>,
+}
+
+impl Write {
+    /// Gives each of `robots`, in this order, its part of a new deployment. Nothing is released yet; older parts of the
+    /// same task that wait for their batch give way, and their deployments are returned.
+    pub async fn assign(
+        &mut self,
+        deployment: &DeploymentId,
+        task: &TaskName,
+        robots: &[RobotId],
+        now_ms: u64,
+    ) -> Result<BTreeSet<DeploymentId>, StoreError> {
+        let mut place = 0;
+        for group in groups(robots) {
+            let sql = format!(
+                "WITH v (robot_id, place) AS ({})
+                 INSERT INTO assignments (deployment_id, robot_id, task, place, updated_at_ms, timeline)
+                 SELECT CAST($1 AS TEXT), v.robot_id, CAST($2 AS TEXT), v.place, CAST($3 AS BIGINT), CAST($4 AS TEXT)
+                 FROM v",
+                values(5, group.len(), &["TEXT", "BIGINT"])
+            );
+            let mut query = sqlx::query(AssertSqlSafe(sql))
+                .bind(deployment.as_str())
+                .bind(task.as_str())
+                .bind(stored(now_ms))
+                .bind(step(Phase::Assigned, now_ms, 0));
+            for robot in group {
+                query = query.bind(robot.as_str()).bind(place);
+                place += 1;
+            }
+            query.execute(self.connection()).await?;
+        }
+        let superseded = sqlx::query_scalar(AssertSqlSafe(format!(
+            "UPDATE assignments SET phase = 'superseded', ended = 1, superseded_by = $1, updated_at_ms = $3,
+                 timeline = {}
+             WHERE task = $2 AND released = 0 AND ended = 0 AND deployment_id <> $1
+               AND robot_id IN (SELECT robot_id FROM assignments WHERE deployment_id = $1)
+             RETURNING deployment_id",
+            grown_by(Phase::Superseded, "$3")
+        )))
+        .bind(deployment.as_str())
+        .bind(task.as_str())
+        .bind(stored(now_ms))
+        .fetch_all(self.connection())
+        .await?;
+        deployments(superseded)
+    }
+
+    /// Settles a new deployment on the robots that run its package already, as they last said: nothing begins there. What
+    /// they should have stays the earlier deployment, so that they hear of nothing.
+    pub async fn settle_running(&mut self, deployment: &DeploymentId, now_ms: u64) -> Result<(), StoreError> {
+        // The same package has the same text.
+        sqlx::query(AssertSqlSafe(format!(
+            "UPDATE assignments SET released = 1, ended = 1, ran = 1, phase = 'running', updated_at_ms = $2, timeline = {}
+             WHERE deployment_id = $1 AND released = 0 AND ended = 0 AND robot_id IN (
+                 SELECT has.robot_id FROM deployments ordered
+                 JOIN assignments has ON has.task = ordered.task AND has.desired = 1
+                 JOIN deployments present ON present.id = has.deployment_id
+                 JOIN robots r ON r.id = has.robot_id
+                 WHERE ordered.id = $1 AND ordered.kind = 'service' AND present.package = ordered.package
+                   AND has.wanted = 'running' AND has.phase = 'running'
+                   AND r.observed_generation <= r.generation)",
+            grown_by(Phase::Running, "$2")
+        )))
+        .bind(deployment.as_str())
+        .bind(stored(now_ms))
+        .execute(self.connection())
+        .await?;
+        Ok(())
+    }
+
+    /// Moves robots that wait for their batch behind all others, in their order.
+    pub async fn postpone(&mut self, deployment: &DeploymentId, robots: &[&RobotId]) -> Result<(), StoreError> {
+        let last: Option<i64> = sqlx::query_scalar("SELECT MAX(place) FROM assignments WHERE deployment_id = $1")
+            .bind(deployment.as_str())
+            .fetch_one(self.connection())
+            .await?;
+        for group in groups(robots) {
+            let sql = format!(
+                "WITH v (id) AS ({}) UPDATE assignments SET place = place + $2 FROM v
+                 WHERE deployment_id = $1 AND robot_id = v.id AND released = 0 AND ended = 0",
+                values(3, group.len(), &["TEXT"])
+            );
+            let mut query = sqlx::query(AssertSqlSafe(sql)).bind(deployment.as_str()).bind(last.unwrap_or(0) + 1);
+            for robot in group {
+                query = query.bind(robot.as_str());
+            }
+            query.execute(self.connection()).await?;
+        }
+        Ok(())
+    }
+
+    /// Lets the time of all robots run that wait for their batch, where it does not yet: nothing but them is waited for.
+    /// Says whether there were any.
+    pub async fn await_offline(&mut self, deployment: &DeploymentId, now_ms: u64) -> Result<bool, StoreError> {
+        let begun = sqlx::query(
+            "UPDATE assignments SET expires_at_ms =
+                 CAST($2 AS BIGINT) + (SELECT expires_at_ms - created_at_ms FROM deployments WHERE id = $1)
+             WHERE deployment_id = $1 AND released = 0 AND ended = 0 AND expires_at_ms IS NULL",
+        )
+        .bind(deployment.as_str())
+        .bind(stored(now_ms))
+        .execute(self.connection())
+        .await?;
+        Ok(begun.rows_affected() > 0)
+    }
+
+    /// Begins the next batch of at most `count` robots: what they had of the task gives way. Their time begins now.
+    pub async fn release(
+        &mut self,
+        deployment: &DeploymentId,
+        count: u64,
+        now_ms: u64,
+    ) -> Result<Released, StoreError> {
+        let batch: Vec<(String, i64)> = sqlx::query_as(
+            "SELECT robot_id, place FROM assignments WHERE deployment_id = $1 AND released = 0 AND ended = 0
+             ORDER BY place LIMIT $2",
+        )
+        .bind(deployment.as_str())
+        .bind(stored(count))
+        .fetch_all(self.connection())
+        .await?;
+        let Some(&(_, last)) = batch.last() else { return Ok(Released::default()) };
+        self.changes_access();
+        let robots = batch.iter().map(|(robot, _)| id("assignments.robot_id", robot)).collect::<Result<Vec<_>, _>>()?;
+        self.adopt_diverged(&robots, now_ms).await?;
+        sqlx::query(
+            "UPDATE assignments SET previous = (
+                 SELECT old.deployment_id FROM assignments old
+                 WHERE old.robot_id = assignments.robot_id AND old.task = assignments.task AND old.desired = 1)
+             WHERE deployment_id = $1 AND released = 0 AND ended = 0 AND place <= $2",
+        )
+        .bind(deployment.as_str())
+        .bind(last)
+        .execute(self.connection())
+        .await?;
+        let superseded = sqlx::query_scalar(AssertSqlSafe(format!(
+            "UPDATE assignments SET desired = 0, superseded_by = $1, ended = 1, progress = NULL, updated_at_ms = $3,
+                 phase = CASE ended WHEN 1 THEN phase ELSE 'superseded' END,
+                 timeline = CASE ended WHEN 1 THEN timeline ELSE {} END
+             WHERE desired = 1 AND task = (SELECT task FROM deployments WHERE id = $1) AND robot_id IN (
+                 SELECT robot_id FROM assignments
+                 WHERE deployment_id = $1 AND released = 0 AND ended = 0 AND place <= $2)
+             RETURNING deployment_id",
+            grown_by(Phase::Superseded, "$3")
+        )))
+        .bind(deployment.as_str())
+        .bind(last)
+        .bind(stored(now_ms))
+        .fetch_all(self.connection())
+        .await?;
+        // Of the first batch it was just said.
+        sqlx::query(AssertSqlSafe(format!(
+            "UPDATE assignments SET released = 1, desired = 1, updated_at_ms = $3,
+                 expires_at_ms = CAST($3 AS BIGINT) + (SELECT expires_at_ms - created_at_ms FROM deployments WHERE id = $1),
+                 timeline = CASE WHEN updated_at_ms = $3 THEN timeline ELSE {} END
+             WHERE deployment_id = $1 AND released = 0 AND ended = 0 AND place <= $2",
+            grown_by(Phase::Assigned, "$3")
+        )))
+        .bind(deployment.as_str())
+        .bind(last)
+        .bind(stored(now_ms))
+        .execute(self.connection())
+        .await?;
+        self.raise_generations(&robots).await?;
+        Ok(Released { robots, superseded: deployments(superseded)? })
+    }
+
+    /// Carries out an order on `task` where it changes anything on `robots`. Returns the assignments it changed.
+    pub async fn order_on_task(
+        &mut self,
+        order: TaskOrder,
+        task: &TaskName,
+        robots: &[RobotId],
+        expires_at_ms: u64,
+        now_ms: u64,
+    ) -> Result<Vec<(DeploymentId, RobotId)>, StoreError> {
+        let begun = grown_by(Phase::Assigned, "$3");
+        let restart = format!(
+            "SET wanted = 'running', run = CASE WHEN last_run > run THEN last_run ELSE run END + 1, phase = 'assigned', ended = 0, progress = NULL, failure = NULL,
+                 attempts = 0, expires_at_ms = $2, updated_at_ms = $3, timeline = {begun} FROM v WHERE desired = 1"
+        );
+        let start = format!("{restart} AND (wanted = 'stopped' OR ended = 1)");
+        let set = match order {
+            TaskOrder::Start => start.as_str(),
+            TaskOrder::Restart => restart.as_str(),
+            TaskOrder::Stop => {
+                "SET wanted = 'stopped', expires_at_ms = CASE WHEN expires_at_ms IS NULL THEN NULL ELSE $2 END,
+                     updated_at_ms = $3 FROM v
+                 WHERE desired = 1 AND wanted = 'running'"
+            }
+            TaskOrder::Remove => {
+                "SET desired = 0, wanted = 'stopped', updated_at_ms = $3,
+                     expires_at_ms = CASE WHEN expires_at_ms IS NULL THEN NULL ELSE $2 END,
+                     removed_generation = (SELECT generation + 1 FROM robots WHERE robots.id = assignments.robot_id)
+                 FROM v WHERE desired = 1"
+            }
+        };
+        let mut changed: Vec<(DeploymentId, RobotId)> = Vec::new();
+        for group in groups(robots) {
+            let sql = format!(
+                "WITH v (id) AS ({}) UPDATE assignments {set} AND assignments.robot_id = v.id AND task = $1
+                 RETURNING assignments.deployment_id, assignments.robot_id",
+                values(4, group.len(), &["TEXT"])
+            );
+            let mut query =
+                sqlx::query_as(AssertSqlSafe(sql)).bind(task.as_str()).bind(stored(expires_at_ms)).bind(stored(now_ms));
+            for robot in group {
+                query = query.bind(robot.as_str());
+            }
+            changed.extend(parts_of(query.fetch_all(self.connection()).await?)?);
+        }
+        let robots: Vec<RobotId> = changed.iter().map(|(_, robot)| robot.clone()).collect();
+        self.raise_generations(&robots).await?;
+        Ok(changed)
+    }
+
+    /// Ends the parts that wait for their batch on `robots`, of `task` or of all: what is stopped or removed must not come back
+    /// with a later batch. Returns their deployments.
+    pub async fn drop_waiting(
+        &mut self,
+        task: Option<&TaskName>,
+        robots: &[RobotId],
+        now_ms: u64,
+    ) -> Result<BTreeSet<DeploymentId>, StoreError> {
+        let mut dropped = Vec::new();
+        for group in groups(robots) {
+            let sql = format!(
+                "WITH v (id) AS ({}) UPDATE assignments SET phase = 'cancelled', ended = 1, wanted = 'stopped', updated_at_ms = $2,
+                     timeline = {} FROM v
+                 WHERE released = 0 AND ended = 0 AND robot_id = v.id AND (task = $1 OR $1 = '')
+                 RETURNING deployment_id",
+                values(3, group.len(), &["TEXT"]),
+                grown_by(Phase::Cancelled, "$2")
+            );
+            let mut query = sqlx::query_scalar(AssertSqlSafe(sql))
+                .bind(task.map_or("", TaskName::as_str).to_owned())
+                .bind(stored(now_ms));
+            for robot in group {
+                query = query.bind(robot.as_str());
+            }
+            dropped.append(&mut query.fetch_all(self.connection()).await?);
+        }
+        deployments(dropped)
+    }
+
+    /// Ends everything that is ordered of robots which are being removed. Returns the deployments concerned.
+    pub async fn end_all_of_robots(
+        &mut self,
+        robots: &[RobotId],
+        now_ms: u64,
+    ) -> Result<BTreeSet<DeploymentId>, StoreError> {
+        let mut ended = Vec::new();
+        for group in groups(robots) {
+            let sql = format!(
+                "WITH v (id) AS ({}) UPDATE assignments SET desired = 0, ended = 1, updated_at_ms = $1,
+                     phase = CASE ended WHEN 1 THEN phase ELSE 'cancelled' END,
+                     timeline = CASE ended WHEN 1 THEN timeline ELSE {} END FROM v
+                 WHERE robot_id = v.id AND (ended = 0 OR desired = 1)
+                 RETURNING deployment_id",
+                values(2, group.len(), &["TEXT"]),
+                grown_by(Phase::Cancelled, "$1")
+            );
+            let mut query = sqlx::query_scalar(AssertSqlSafe(sql)).bind(stored(now_ms));
+            for robot in group {
+                query = query.bind(robot.as_str());
+            }
+            ended.append(&mut query.fetch_all(self.connection()).await?);
+        }
+        deployments(ended)
+    }
+
+    pub(in crate::store) async fn raise_generations(&mut self, robots: &[RobotId]) -> Result<(), StoreError> {
+        for group in groups(robots) {
+            let sql = format!(
+                "WITH v (id) AS ({}) UPDATE robots SET generation = generation + 1 FROM v WHERE robots.id = v.id",
+                values(1, group.len(), &["TEXT"])
+            );
+            let mut query = sqlx::query(AssertSqlSafe(sql));
+            for robot in group {
+                query = query.bind(robot.as_str());
+            }
+            query.execute(self.connection()).await?;
+        }
+        Ok(())
+    }
+}
+
+fn deployments(rows: Vec<String>) -> Result<BTreeSet<DeploymentId>, StoreError> {
+    let distinct: BTreeSet<String> = rows.into_iter().collect();
+    distinct.iter().map(|row| id("assignments.deployment_id", row)).collect()
+}

@@ -1,0 +1,423 @@
+//! Deployments: the operators' orders, and how far they have come.
+
+use std::collections::{BTreeSet, HashMap, HashSet};
+
+use sqlx::{AssertSqlSafe, Row as _};
+use task_proto::api::{AssignmentView, CreateDeployment, DeploymentView, PhaseCount};
+use task_proto::desired::PackageRef;
+use task_proto::manifest::TaskKind;
+use task_proto::report::Phase;
+use task_proto::selector::Selector;
+use task_proto::{DeploymentId, RobotId};
+
+use crate::domain::deployment;
+use crate::domain::rollout::{Rollout, Standing};
+use crate::store::rows::{
+    from_json, from_optional_json, from_word, groups, id, json, number, priority, stored, values, word,
+};
+use crate::store::{Store, StoreError, Write};
+use crate::store::{deliveries, timelines};
+
+/// An order to be stored.
+#[derive(Debug)]
+pub struct NewDeployment<'a> {
+    /// Its identity.
+    pub id: &'a DeploymentId,
+    /// What it brings.
+    pub package: &'a PackageRef,
+    /// Service or job.
+    pub kind: TaskKind,
+    /// What the operator asked for.
+    pub order: &'a CreateDeployment,
+    /// When what is left of it expires.
+    pub expires_at_ms: u64,
+}
+
+/// A deployment that has robots whose batch has not begun.
+#[derive(Debug)]
+pub struct OpenRollout {
+    /// Its pace.
+    pub rollout: Rollout,
+    /// Robots on which it has failed.
+    pub failed: u64,
+    /// Those on which it has not settled, in the order of their turns.
+    pub robots: Vec<OpenRobot>,
+}
+
+/// A robot on which a deployment has not settled.
+#[derive(Debug)]
+pub struct OpenRobot {
+    /// Its identity.
+    pub robot: RobotId,
+    /// Where it stands.
+    pub standing: Standing,
+    /// Whether the deployment's service has run there before.
+    pub has_run: bool,
+    /// Whether the robot was revoked: it does nothing any more.
+    pub is_revoked: bool,
+}
+
+/// Some of the deployments, the newest first.
+#[derive(Debug)]
+pub struct DeploymentPage {
+    /// Without assignments.
+    pub deployments: Vec<DeploymentView>,
+    /// The last one that was looked at, if there are older ones.
+    pub next: Option<DeploymentId>,
+}
+
+/// What is read of each deployment. The selector may name thousands of robots, which is too much for lists and events.
+const ROWS: &str =
+    "SELECT id, number, package, kind, CASE WHEN length(selector) <= 1000 THEN selector END AS selector, delivery,
+         priority, batch, max_failures, paused, created_at_ms, expires_at_ms, cancelled_at_ms
+     FROM deployments";
+
+/// Those with numbers from $1 to $2, so that what is ordered meanwhile is not counted.
+const LISTED: &str = "(SELECT id FROM deployments WHERE number BETWEEN $1 AND $2)";
+
+impl Store {
+    /// The newest `limit` deployments, or the newest older than `before`; `None` if there is no such deployment. With `robots`
+    /// of them those that concern one of these, as far as they do.
+    pub async fn deployments(
+        &self,
+        robots: Option<&[RobotId]>,
+        before: Option<&DeploymentId>,
+        limit: u32,
+    ) -> Result<Option<DeploymentPage>, StoreError> {
+        let number = match before {
+            Some(before) => {
+                let query = sqlx::query_scalar("SELECT number FROM deployments WHERE id = $1").bind(before.as_str());
+                match query.fetch_optional(&self.reads).await? {
+                    Some(number) => number,
+                    None => return Ok(None),
+                }
+            }
+            None => i64::MAX,
+        };
+        // Those of one write have the same number.
+        let older = "number < $1 OR (number = $1 AND id < $2)";
+        let sql = format!("{ROWS} WHERE {older} ORDER BY number DESC, id DESC LIMIT $3");
+        let mut rows = sqlx::query(AssertSqlSafe(sql))
+            .bind(number)
+            .bind(before.map_or("", DeploymentId::as_str))
+            .bind(i64::from(limit) + 1)
+            .fetch_all(&self.reads)
+            .await?;
+        let has_more = rows.len() > limit as usize;
+        rows.truncate(limit as usize);
+        let next = match rows.last() {
+            Some(last) if has_more => Some(id("deployments.id", last.try_get("id")?)?),
+            _ => None,
+        };
+        let mut deployments = self.deployment_views(&rows, robots).await?;
+        deployments.retain(|view| robots.is_none() || !view.counts.is_empty());
+        Ok(Some(DeploymentPage { deployments, next }))
+    }
+
+    /// One deployment without its assignments, and without its selector if that is long.
+    pub async fn deployment_summary(&self, id: &DeploymentId) -> Result<Option<DeploymentView>, StoreError> {
+        let query = sqlx::query(AssertSqlSafe(format!("{ROWS} WHERE id = $1"))).bind(id.as_str());
+        Ok(self.deployment_views(&query.fetch_all(&self.reads).await?, None).await?.pop())
+    }
+
+    /// One deployment with its assignments, sorted by robot name; their `online` is left false, and most don't ask for their
+    /// timelines.
+    pub async fn deployment(
+        &self,
+        id: &DeploymentId,
+        with_timelines: bool,
+    ) -> Result<Option<DeploymentView>, StoreError> {
+        let Some(mut view) = self.deployment_summary(id).await? else { return Ok(None) };
+        let timeline = if with_timelines { "a.timeline" } else { "NULL" };
+        let rows = sqlx::query(AssertSqlSafe(format!(
+            "SELECT a.robot_id, r.name, a.released, a.phase, a.progress, a.failure, a.attempts, a.superseded_by,
+                 a.updated_at_ms, a.mechanism, a.rule, a.because, CAST({timeline} AS TEXT) AS timeline
+             FROM assignments a JOIN robots r ON r.id = a.robot_id WHERE a.deployment_id = $1"
+        )))
+        .bind(id.as_str())
+        .fetch_all(&self.reads)
+        .await?;
+        let mut assignments = rows.iter().map(assignment_view).collect::<Result<Vec<_>, _>>()?;
+        assignments.sort_by(|one, other| one.name.cmp(&other.name));
+        view.assignments = Some(assignments);
+        view.selector = self.deployment_selector(id).await?;
+        Ok(Some(view))
+    }
+
+    /// The selector that a deployment was ordered with.
+    pub async fn deployment_selector(&self, deployment: &DeploymentId) -> Result<Option<Selector>, StoreError> {
+        let query = sqlx::query_scalar("SELECT selector FROM deployments WHERE id = $1").bind(deployment.as_str());
+        let selector: Option<String> = query.fetch_optional(&self.reads).await?;
+        selector.map(|selector| id("deployments.selector", &selector)).transpose()
+    }
+
+    /// Batched deployments that may go on by themselves: they have robots waiting and are not paused.
+    pub async fn open_rollouts(&self) -> Result<BTreeSet<DeploymentId>, StoreError> {
+        let rows: Vec<String> = sqlx::query_scalar(
+            "SELECT id FROM deployments WHERE batch IS NOT NULL AND paused = 0 AND cancelled_at_ms IS NULL AND id IN (
+                 SELECT deployment_id FROM assignments WHERE released = 0 AND ended = 0)",
+        )
+        .fetch_all(&self.reads)
+        .await?;
+        rows.iter().map(|row| id("deployments.id", row)).collect()
+    }
+
+    /// The deployments whose package lost its version to another: mostly none.
+    pub(in crate::store) async fn outdated_deployments(&self) -> Result<HashSet<String>, StoreError> {
+        // The same package has the same text.
+        let rows: Vec<String> = sqlx::query_scalar(
+            "SELECT d.id FROM packages p JOIN deployments d ON d.task = p.name AND d.package = p.package
+             WHERE p.replaced_by IS NOT NULL",
+        )
+        .fetch_all(&self.reads)
+        .await?;
+        Ok(rows.into_iter().collect())
+    }
+
+    /// The packages some robot should have, or may get (back): what must not be collected.
+    pub async fn packages_in_use(&self) -> Result<Vec<PackageRef>, StoreError> {
+        let rows: Vec<String> = sqlx::query_scalar(
+            "SELECT DISTINCT d.package FROM deployments d WHERE d.id IN (
+                 SELECT deployment_id FROM assignments WHERE desired = 1 OR ended = 0
+                 UNION SELECT previous FROM assignments WHERE desired = 1 AND previous IS NOT NULL)",
+        )
+        .fetch_all(&self.reads)
+        .await?;
+        rows.iter().map(|row| from_json("deployments.package", row)).collect()
+    }
+
+    /// The views of these rows, which follow each other, as far as they concern `robots`, or in whole.
+    async fn deployment_views(
+        &self,
+        rows: &[sqlx::any::AnyRow],
+        robots: Option<&[RobotId]>,
+    ) -> Result<Vec<DeploymentView>, StoreError> {
+        let (Some(newest), Some(oldest)) = (rows.first(), rows.last()) else { return Ok(Vec::new()) };
+        let numbers = (oldest.try_get("number")?, newest.try_get("number")?);
+        let mut counts = self.counted(numbers, robots).await?;
+        let superseded: Vec<(String, String)> = sqlx::query_as(AssertSqlSafe(format!(
+            "SELECT DISTINCT superseded_by, deployment_id FROM assignments WHERE superseded_by IN {LISTED}
+             ORDER BY deployment_id"
+        )))
+        .bind(numbers.0)
+        .bind(numbers.1)
+        .fetch_all(&self.reads)
+        .await?;
+        let mut supersedes: HashMap<String, Vec<DeploymentId>> = HashMap::new();
+        for (newer, older) in superseded {
+            supersedes.entry(newer).or_default().push(crate::store::rows::id("assignments.deployment_id", &older)?);
+        }
+        let outdated = self.outdated_deployments().await?;
+        let view = |row: &sqlx::any::AnyRow| {
+            let id: String = row.try_get("id")?;
+            let (counts, supersedes) = (counts.remove(&id), supersedes.remove(&id));
+            let view = deployment_view(row, counts.unwrap_or_default(), supersedes.unwrap_or_default())?;
+            Ok::<_, StoreError>(DeploymentView { outdated: outdated.contains(&id), ..view })
+        };
+        rows.iter().map(view).collect()
+    }
+
+    /// How many assignments of each deployment with one of these numbers stand in which phase: of all robots or of some.
+    async fn counted(
+        &self,
+        numbers: (i64, i64),
+        robots: Option<&[RobotId]>,
+    ) -> Result<HashMap<String, Vec<PhaseCount>>, StoreError> {
+        let groups: Vec<&[RobotId]> = robots.map_or_else(|| vec![[].as_slice()], |robots| groups(robots).collect());
+        let mut counts: HashMap<String, Vec<PhaseCount>> = HashMap::new();
+        for group in groups {
+            let among = match group.len() {
+                0 => String::new(),
+                robots => format!("AND robot_id IN ({})", values(3, robots, &["TEXT"])),
+            };
+            let sql = format!(
+                "SELECT deployment_id, phase, COUNT(*) FROM assignments WHERE deployment_id IN {LISTED} {among}
+                 GROUP BY deployment_id, phase"
+            );
+            let mut query =
+                sqlx::query_as::<_, (String, String, i64)>(AssertSqlSafe(sql)).bind(numbers.0).bind(numbers.1);
+            for robot in group {
+                query = query.bind(robot.as_str());
+            }
+            for (deployment, phase, count) in query.fetch_all(&self.reads).await? {
+                let (phase, count) = (Phase::from_text(&phase), number(count));
+                let sum = counts.entry(deployment).or_default();
+                match sum.iter_mut().find(|known| known.phase == phase) {
+                    Some(known) => known.count += count,
+                    None => sum.push(PhaseCount { phase, count }),
+                }
+            }
+        }
+        Ok(counts)
+    }
+}
+
+impl Write {
+    /// Stores an order.
+    pub async fn insert_deployment(&mut self, new: &NewDeployment<'_>, now_ms: u64) -> Result<(), StoreError> {
+        let number = stored(self.turn());
+        sqlx::query(
+            "INSERT INTO deployments (id, number, task, version, package, kind, selector, delivery, batch, max_failures,
+                 created_at_ms, expires_at_ms, priority)
+             VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13)",
+        )
+        .bind(new.id.as_str())
+        .bind(number)
+        .bind(new.package.name.as_str())
+        .bind(new.package.version.as_str())
+        .bind(json(new.package))
+        .bind(word(&new.kind))
+        .bind(new.order.selector.to_string())
+        .bind(word(&new.order.delivery))
+        .bind(new.order.batch.map(stored))
+        .bind(new.order.max_failures.map(stored))
+        .bind(stored(now_ms))
+        .bind(stored(new.expires_at_ms))
+        .bind(i64::from(new.order.priority))
+        .execute(self.connection())
+        .await?;
+        Ok(())
+    }
+
+    /// Whether the operator took a deployment back; `None` if there is none.
+    pub async fn is_cancelled(&mut self, id: &DeploymentId) -> Result<Option<bool>, StoreError> {
+        let row: Option<(Option<i64>,)> = sqlx::query_as("SELECT cancelled_at_ms FROM deployments WHERE id = $1")
+            .bind(id.as_str())
+            .fetch_optional(self.connection())
+            .await?;
+        Ok(row.map(|(cancelled_at_ms,)| cancelled_at_ms.is_some()))
+    }
+
+    /// The pace and the open robots of a deployment that has robots waiting; `None` for any other.
+    pub async fn rollout(&mut self, id: &DeploymentId) -> Result<Option<OpenRollout>, StoreError> {
+        let row = sqlx::query(
+            "SELECT kind, batch, max_failures, forgiven, paused FROM deployments
+             WHERE id = $1 AND cancelled_at_ms IS NULL AND EXISTS (
+                 SELECT 1 FROM assignments WHERE deployment_id = $1 AND released = 0 AND ended = 0)",
+        )
+        .bind(id.as_str())
+        .fetch_optional(self.connection())
+        .await?;
+        let Some(row) = row else { return Ok(None) };
+        let kind: TaskKind = from_word("deployments.kind", row.try_get("kind")?)?;
+        let rollout = Rollout {
+            batch: row.try_get::<Option<i64>, _>("batch")?.map(number),
+            max_failures: row.try_get::<Option<i64>, _>("max_failures")?.map(number),
+            forgiven: number(row.try_get("forgiven")?),
+            paused: row.try_get::<i64, _>("paused")? == 1,
+        };
+        let counted: Vec<(String, i64)> =
+            sqlx::query_as("SELECT phase, COUNT(*) FROM assignments WHERE deployment_id = $1 GROUP BY phase")
+                .bind(id.as_str())
+                .fetch_all(self.connection())
+                .await?;
+        let failures = counted.iter().filter(|(phase, _)| deployment::is_failure(Phase::from_text(phase), kind));
+        let failed = failures.map(|(_, count)| number(*count)).sum();
+        Ok(Some(OpenRollout { rollout, failed, robots: self.open_robots(id, kind).await? }))
+    }
+
+    /// The robots of a deployment that have not settled, in the order of their turns.
+    async fn open_robots(&mut self, deployment: &DeploymentId, kind: TaskKind) -> Result<Vec<OpenRobot>, StoreError> {
+        let rows: Vec<(String, i64, String, i64, i64)> = sqlx::query_as(
+            "SELECT a.robot_id, a.released, a.phase, a.ran,
+                 CAST(CASE WHEN r.revoked_at_ms IS NULL THEN 0 ELSE 1 END AS BIGINT)
+             FROM assignments a JOIN robots r ON r.id = a.robot_id
+             WHERE a.deployment_id = $1 AND a.ended = 0 AND NOT (a.phase = 'running' AND $2 = 'service')
+             ORDER BY a.place",
+        )
+        .bind(deployment.as_str())
+        .bind(word(&kind))
+        .fetch_all(self.connection())
+        .await?;
+        let mut robots = Vec::with_capacity(rows.len());
+        for (robot, released, phase, ran, is_revoked) in rows {
+            let (robot, phase) = (self::id("assignments.robot_id", &robot)?, Phase::from_text(&phase));
+            let standing = match phase {
+                _ if released == 0 => Standing::Waiting,
+                Phase::Assigned | Phase::Deferred => Standing::Released,
+                _ => Standing::Begun,
+            };
+            // A service that ran has shown what its batch was to show, whatever is ordered of it since.
+            let has_run = ran == 1 && kind == TaskKind::Service;
+            robots.push(OpenRobot { robot, standing, has_run, is_revoked: is_revoked == 1 });
+        }
+        Ok(robots)
+    }
+
+    /// The deployments that have begun on `robot` and have not ended there.
+    pub async fn begun_on(&mut self, robot: &RobotId) -> Result<BTreeSet<DeploymentId>, StoreError> {
+        let rows: Vec<String> = sqlx::query_scalar(
+            "SELECT deployment_id FROM assignments WHERE robot_id = $1 AND released = 1 AND ended = 0",
+        )
+        .bind(robot.as_str())
+        .fetch_all(self.connection())
+        .await?;
+        rows.iter().map(|row| id("assignments.deployment_id", row)).collect()
+    }
+
+    /// Stops a deployment from beginning further batches.
+    pub async fn pause(&mut self, id: &DeploymentId) -> Result<(), StoreError> {
+        self.update_deployment("UPDATE deployments SET paused = $2 WHERE id = $1", id, 1).await
+    }
+
+    /// Lets a deployment begin batches again and forgives it `failures`.
+    pub async fn resume(&mut self, id: &DeploymentId, failures: u64) -> Result<(), StoreError> {
+        self.update_deployment("UPDATE deployments SET paused = 0, forgiven = $2 WHERE id = $1", id, failures).await
+    }
+
+    /// Marks a deployment as taken back by the operator.
+    pub async fn mark_cancelled(&mut self, id: &DeploymentId, now_ms: u64) -> Result<(), StoreError> {
+        self.update_deployment("UPDATE deployments SET cancelled_at_ms = $2 WHERE id = $1", id, now_ms).await
+    }
+
+    async fn update_deployment(&mut self, sql: &'static str, id: &DeploymentId, value: u64) -> Result<(), StoreError> {
+        sqlx::query(sql).bind(id.as_str()).bind(stored(value)).execute(self.connection()).await?;
+        Ok(())
+    }
+}
+
+fn deployment_view(
+    row: &sqlx::any::AnyRow,
+    mut counts: Vec<PhaseCount>,
+    supersedes: Vec<DeploymentId>,
+) -> Result<DeploymentView, StoreError> {
+    counts.sort_by_key(|count| Phase::ALL.iter().position(|phase| *phase == count.phase));
+    let kind = from_word("deployments.kind", row.try_get("kind")?)?;
+    let cancelled = row.try_get::<Option<i64>, _>("cancelled_at_ms")?.is_some();
+    let paused = row.try_get::<i64, _>("paused")? == 1;
+    Ok(DeploymentView {
+        id: id("deployments.id", row.try_get("id")?)?,
+        package: from_json("deployments.package", row.try_get("package")?)?,
+        kind,
+        selector: row.try_get::<Option<&str>, _>("selector")?.map(|it| id("deployments.selector", it)).transpose()?,
+        delivery: from_word("deployments.delivery", row.try_get("delivery")?)?,
+        priority: priority(row)?,
+        state: deployment::state(kind, cancelled, paused, &counts),
+        batch: row.try_get::<Option<i64>, _>("batch")?.map(number),
+        max_failures: row.try_get::<Option<i64>, _>("max_failures")?.map(number),
+        created_at_ms: number(row.try_get("created_at_ms")?),
+        expires_at_ms: number(row.try_get("expires_at_ms")?),
+        counts,
+        supersedes,
+        outdated: false,
+        assignments: None,
+    })
+}
+
+fn assignment_view(row: &sqlx::any::AnyRow) -> Result<AssignmentView, StoreError> {
+    let superseded_by: Option<String> = row.try_get("superseded_by")?;
+    Ok(AssignmentView {
+        robot: id("assignments.robot_id", row.try_get("robot_id")?)?,
+        name: id("robots.name", row.try_get("name")?)?,
+        online: false,
+        released: row.try_get::<i64, _>("released")? == 1,
+        delivery: deliveries::decision(row)?,
+        phase: Phase::from_text(row.try_get("phase")?),
+        progress: from_optional_json("assignments.progress", row.try_get("progress")?)?,
+        failure: from_optional_json("assignments.failure", row.try_get("failure")?)?,
+        attempts: u32::try_from(row.try_get::<i64, _>("attempts")?).unwrap_or(u32::MAX),
+        superseded_by: superseded_by.map(|newer| id("assignments.superseded_by", &newer)).transpose()?,
+        updated_at_ms: number(row.try_get("updated_at_ms")?),
+        timeline: row.try_get::<Option<&str>, _>("timeline")?.map(timelines::read),
+    })
+}

@@ -1,0 +1,94 @@
+//! What was ordered before, as far as it matters for the next order: what ended badly, and what ran before what is there now.
+
+use sqlx::{AssertSqlSafe, Row as _};
+use task_proto::desired::PackageRef;
+use task_proto::manifest::TaskKind;
+use task_proto::report::Failure;
+use task_proto::{DeploymentId, RobotId, TaskName};
+
+use crate::store::fleet::robots::known_robot;
+use crate::store::rows::{from_json, from_optional_json, from_word, groups, id, values};
+use crate::store::{KnownRobot, StoreError, Write};
+
+/// A robot for which a deployment has ended badly.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Unsuccessful {
+    /// Which robot.
+    pub robot: KnownRobot,
+    /// Why, if it failed.
+    pub failure: Option<Failure>,
+}
+
+/// What a robot had before.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct EarlierPackage {
+    /// Which robot.
+    pub robot: RobotId,
+    /// The package, which still is there.
+    pub package: PackageRef,
+    /// Service or job.
+    pub kind: TaskKind,
+}
+
+impl Write {
+    /// The robots for which `deployment` has ended badly and that nothing else was ordered of since, to stop or remove it
+    /// neither, sorted by name.
+    pub async fn unsuccessful(&mut self, deployment: &DeploymentId) -> Result<Vec<Unsuccessful>, StoreError> {
+        let rows = sqlx::query(
+            "SELECT r.id, r.name, r.mac, r.labels, a.failure
+             FROM assignments a JOIN deployments d ON d.id = a.deployment_id JOIN robots r ON r.id = a.robot_id
+             WHERE a.deployment_id = $1 AND a.superseded_by IS NULL
+               AND a.phase IN ('failed', 'rolled_back', 'unmet', 'expired', 'cancelled') AND a.wanted = 'running'
+               AND r.removed_at_ms IS NULL AND r.awaits_approval = 0
+               AND NOT EXISTS (
+                   SELECT 1 FROM assignments newer JOIN deployments ordered ON ordered.id = newer.deployment_id
+                   WHERE newer.robot_id = a.robot_id AND newer.task = a.task AND ordered.number > d.number)",
+        )
+        .bind(deployment.as_str())
+        .fetch_all(self.connection())
+        .await?;
+        let read = |row: &sqlx::any::AnyRow| {
+            let failure = from_optional_json("assignments.failure", row.try_get("failure")?)?;
+            Ok::<_, StoreError>(Unsuccessful { robot: known_robot(row)?, failure })
+        };
+        let mut found = rows.iter().map(read).collect::<Result<Vec<_>, _>>()?;
+        found.sort_by(|one, other| one.robot.name.cmp(&other.robot.name));
+        Ok(found)
+    }
+
+    /// Of each of `robots` the newest package of `task` that ran there before the one it should have now, is another, and still
+    /// is here. Those that have none are left out.
+    pub async fn earlier_packages(
+        &mut self,
+        task: &TaskName,
+        robots: &[RobotId],
+    ) -> Result<Vec<EarlierPackage>, StoreError> {
+        let mut found = Vec::new();
+        for group in groups(robots) {
+            // The same package has the same text.
+            let sql = format!(
+                "WITH v (id) AS ({})
+                 SELECT v.id AS robot, d.package, d.kind
+                 FROM v JOIN assignments now ON now.robot_id = v.id AND now.task = $1 AND now.desired = 1
+                 JOIN deployments present ON present.id = now.deployment_id
+                 JOIN deployments d ON d.id = (
+                     SELECT older.id FROM assignments a JOIN deployments older ON older.id = a.deployment_id
+                     WHERE a.robot_id = v.id AND a.task = $1 AND a.ran = 1 AND older.number < present.number
+                       AND older.package <> present.package
+                       AND EXISTS (SELECT 1 FROM packages p WHERE p.name = $1 AND p.package = older.package)
+                     ORDER BY older.number DESC LIMIT 1)",
+                values(2, group.len(), &["TEXT"])
+            );
+            let mut query = sqlx::query(AssertSqlSafe(sql)).bind(task.as_str());
+            for robot in group {
+                query = query.bind(robot.as_str());
+            }
+            for row in query.fetch_all(self.connection()).await? {
+                let package: PackageRef = from_json("deployments.package", row.try_get("package")?)?;
+                let kind = from_word("deployments.kind", row.try_get("kind")?)?;
+                found.push(EarlierPackage { robot: id("robots.id", row.try_get("robot")?)?, package, kind });
+            }
+        }
+        Ok(found)
+    }
+}

@@ -1,0 +1,9 @@
+//! Owns deployments and their assignments; it never decides when a batch begins.
+
+pub(super) mod assignments;
+pub(super) mod deployments;
+pub(super) mod earlier;
+pub(super) mod fan_outs;
+pub(super) mod idempotency;
+pub(super) mod still_running;
+pub(super) mod taking_back;

@@ -1,0 +1,273 @@
+//! Assignments that end before they were done: somebody cancels them, or their time is up. What they had replaced is desired
+//! again. Where a task has run, and only its start or restart did not come to it, nothing is replaced: it is left as it is.
+
+use std::collections::BTreeSet;
+
+use sqlx::{AssertSqlSafe, Row as _};
+use task_proto::desired::Wanted;
+use task_proto::report::{Failure, Phase, Report};
+use task_proto::{DeploymentId, RobotId};
+
+use crate::store::rows::{from_optional_json, from_word, groups, id, json, number, parts_of, stored, values, word};
+use crate::store::timelines::grown_by;
+use crate::store::{StoreError, Write};
+
+/// An assignment that is to be taken back.
+#[derive(Debug, Clone)]
+pub struct Revocable {
+    /// The deployment.
+    pub deployment: DeploymentId,
+    /// The robot.
+    pub robot: RobotId,
+    /// What it took the place of, and is desired again.
+    pub previous: Option<DeploymentId>,
+    desired: bool,
+    wanted: Wanted,
+    left: Option<Left>,
+}
+
+/// How an assignment is left whose robot keeps what it has.
+#[derive(Debug, Clone)]
+struct Left {
+    run: u64,
+    wanted: Wanted,
+    /// `None`: that in which it ends.
+    phase: Option<Phase>,
+    failure: Option<Failure>,
+    /// Whether its robot is to hear of it. A diverged one is left alone.
+    is_told: bool,
+}
+
+/// Columns of a list of assignments in a statement.
+const PAIR: &[&str] = &["TEXT", "TEXT"];
+/// Columns of [`Left`] in a statement.
+const LEFT: &[&str] = &["TEXT", "TEXT", "BIGINT", "TEXT", "TEXT", "BIGINT", "TEXT"];
+/// What [`revocable`] reads. A robot's report is only read where the task has run there.
+const COLUMNS: &str = "a.deployment_id, a.robot_id, a.desired, a.previous, a.wanted, a.run, a.ran, a.phase,
+     CASE WHEN a.ran = 1 THEN r.report END AS report,
+     CAST(CASE WHEN r.observed_generation > r.generation THEN 1 ELSE 0 END AS BIGINT) AS diverged";
+
+impl Write {
+    /// What a cancel takes back: all that has not settled, and what ended badly but is still what its robot should have.
+    /// A service that runs has settled: there is nothing left to interrupt.
+    pub async fn revocable(&mut self, deployment: &DeploymentId) -> Result<Vec<Revocable>, StoreError> {
+        let rows = sqlx::query(AssertSqlSafe(format!(
+            "SELECT {COLUMNS} FROM assignments a
+             JOIN deployments d ON d.id = a.deployment_id JOIN robots r ON r.id = a.robot_id
+             WHERE a.deployment_id = $1 AND NOT (a.phase = 'running' AND d.kind = 'service')
+               AND (a.ended = 0 OR (a.desired = 1 AND a.phase NOT IN ('succeeded', 'stopped')))
+             ORDER BY a.place"
+        )))
+        .bind(deployment.as_str())
+        .fetch_all(self.connection())
+        .await?;
+        // What is on its way to run or runs is interrupted; what was only told to run once more is not undone.
+        rows.iter().map(|row| revocable(row, |phase| phase == Phase::Assigned)).collect()
+    }
+
+    /// Whether the cancel of a later deployment would put this one back somewhere.
+    pub async fn may_be_put_back(&mut self, deployment: &DeploymentId) -> Result<bool, StoreError> {
+        let count: i64 = sqlx::query_scalar(
+            "SELECT COUNT(*) FROM assignments a JOIN deployments d ON d.id = a.deployment_id
+             WHERE a.previous = $1 AND a.desired = 1 AND NOT (a.phase = 'running' AND d.kind = 'service')
+               AND a.phase NOT IN ('succeeded', 'stopped')",
+        )
+        .bind(deployment.as_str())
+        .fetch_one(self.connection())
+        .await?;
+        Ok(count > 0)
+    }
+
+    /// What was not done in time.
+    pub async fn overdue(&mut self, now_ms: u64) -> Result<Vec<Revocable>, StoreError> {
+        let rows = sqlx::query(AssertSqlSafe(format!(
+            "SELECT {COLUMNS} FROM assignments a JOIN robots r ON r.id = a.robot_id
+             WHERE a.ended = 0 AND a.expires_at_ms <= $1"
+        )))
+        .bind(stored(now_ms))
+        .fetch_all(self.connection())
+        .await?;
+        rows.iter().map(|row| revocable(row, |_| true)).collect()
+    }
+
+    /// Takes assignments back, those that have not ended in `phase`, and makes desired again what they had replaced.
+    /// Returns the robots whose desired state is new.
+    pub async fn take_back(
+        &mut self,
+        taken: &[Revocable],
+        phase: Phase,
+        now_ms: u64,
+    ) -> Result<Vec<RobotId>, StoreError> {
+        let (left, taken): (Vec<&Revocable>, Vec<&Revocable>) = taken.iter().partition(|row| row.left.is_some());
+        self.leave(&left, phase, now_ms).await?;
+        let end = format!(
+            "SET desired = 0, ended = 1, progress = NULL, updated_at_ms = $1,
+                 phase = CASE ended WHEN 1 THEN phase ELSE CAST($2 AS TEXT) END,
+                 timeline = CASE ended WHEN 1 THEN timeline ELSE {} END",
+            grown_by(phase, "$1")
+        );
+        self.set_pairs(&end, phase.as_str(), now_ms, taken.iter().map(|row| (&row.deployment, &row.robot))).await?;
+        // What was stopped since stays so, whatever version of it comes back.
+        for (wanted, stop) in [(Wanted::Running, ""), (Wanted::Stopped, "wanted = 'stopped', ")] {
+            // Where the replaced one stands is what the robot's next report says; $2 is what it is until then.
+            let revive = format!(
+                "SET {stop}desired = 1, superseded_by = NULL, removed_generation = NULL, updated_at_ms = $1,
+                     ended = CASE phase WHEN 'superseded' THEN 0 ELSE ended END,
+                     timeline = CASE phase WHEN 'superseded' THEN {} ELSE timeline END,
+                     phase = CASE phase WHEN 'superseded' THEN CAST($2 AS TEXT) ELSE phase END",
+                grown_by(Phase::Assigned, "$1")
+            );
+            let replaced = taken.iter().filter(|row| row.desired && row.wanted == wanted);
+            let previous: Vec<_> = replaced.filter_map(|row| Some((row.previous.as_ref()?, &row.robot))).collect();
+            self.set_pairs(&revive, Phase::Assigned.as_str(), now_ms, previous.iter().copied()).await?;
+            self.pass_over_deleted(&previous).await?;
+        }
+        let is_told = |row: &&Revocable| row.left.as_ref().map_or(row.desired, |left| left.is_told);
+        let robots: BTreeSet<RobotId> =
+            left.into_iter().chain(taken).filter(is_told).map(|row| row.robot.clone()).collect();
+        let robots: Vec<RobotId> = robots.into_iter().collect();
+        self.raise_generations(&robots).await?;
+        Ok(robots)
+    }
+
+    /// Ends what was ordered of tasks that stay on their robots. A run that a robot never spoke of may have begun there, so its
+    /// number is not given out again.
+    async fn leave(&mut self, rows: &[&Revocable], phase: Phase, now_ms: u64) -> Result<(), StoreError> {
+        let rows: Vec<_> = rows.iter().filter_map(|row| Some((*row, row.left.as_ref()?))).collect();
+        for group in groups(&rows) {
+            let sql = format!(
+                "WITH v (deployment_id, robot_id, run, wanted, phase, ended, failure) AS ({})
+                 UPDATE assignments SET run = v.run,
+                     last_run = CASE WHEN assignments.run > last_run THEN assignments.run ELSE last_run END, wanted = v.wanted, phase = v.phase, ended = v.ended,
+                     failure = v.failure, progress = NULL, expires_at_ms = NULL, updated_at_ms = $1, timeline = {}
+                 FROM v WHERE assignments.deployment_id = v.deployment_id AND assignments.robot_id = v.robot_id",
+                values(2, group.len(), LEFT),
+                grown_by(phase, "$1")
+            );
+            let mut query = sqlx::query(AssertSqlSafe(sql)).bind(stored(now_ms));
+            for (row, left) in group {
+                let phase = left.phase.unwrap_or(phase);
+                query = query
+                    .bind(row.deployment.as_str())
+                    .bind(row.robot.as_str())
+                    .bind(stored(left.run))
+                    .bind(word(&left.wanted))
+                    .bind(phase.as_str())
+                    .bind(i64::from(phase.is_final()))
+                    .bind(left.failure.as_ref().map(json));
+            }
+            query.execute(self.connection()).await?;
+        }
+        Ok(())
+    }
+
+    /// After `deployment` was cancelled, no later cancel may put it back: whoever replaced it puts back what it had
+    /// replaced itself.
+    pub async fn skip_as_previous(&mut self, deployment: &DeploymentId) -> Result<(), StoreError> {
+        let changed: Vec<(String, String)> = sqlx::query_as(
+            "UPDATE assignments SET previous = (
+                 SELECT skipped.previous FROM assignments skipped
+                 WHERE skipped.deployment_id = $1 AND skipped.robot_id = assignments.robot_id)
+             WHERE previous = $1
+             RETURNING deployment_id, robot_id",
+        )
+        .bind(deployment.as_str())
+        .fetch_all(self.connection())
+        .await?;
+        let changed = parts_of(changed)?;
+        let changed: Vec<_> = changed.iter().map(|(deployment, robot)| (deployment, robot)).collect();
+        self.pass_over_deleted(&changed).await
+    }
+
+    /// Has these put back nothing that was deleted, but what that had replaced itself. A deleted package's bytes are kept while
+    /// it is desired, or what a cancel of that puts back; these become that only now, so theirs may be gone.
+    async fn pass_over_deleted(&mut self, pairs: &[(&DeploymentId, &RobotId)]) -> Result<(), StoreError> {
+        for group in groups(pairs) {
+            // The same package has the same text.
+            let sql = format!(
+                "WITH v (deployment_id, robot_id) AS ({})
+                 UPDATE assignments SET previous = (
+                     SELECT gone.previous FROM assignments gone
+                     WHERE gone.deployment_id = assignments.previous AND gone.robot_id = assignments.robot_id)
+                 FROM v
+                 WHERE assignments.deployment_id = v.deployment_id AND assignments.robot_id = v.robot_id
+                   AND EXISTS (
+                     SELECT 1 FROM deployments d WHERE d.id = assignments.previous AND NOT EXISTS (
+                         SELECT 1 FROM packages p WHERE p.name = d.task AND p.package = d.package))",
+                values(1, group.len(), PAIR)
+            );
+            // What is next may be gone as well.
+            let mut changed = 1;
+            while changed > 0 {
+                let mut query = sqlx::query(AssertSqlSafe(sql.as_str()));
+                for (deployment, robot) in group {
+                    query = query.bind(deployment.as_str()).bind(robot.as_str());
+                }
+                changed = query.execute(self.connection()).await?.rows_affected();
+            }
+        }
+        Ok(())
+    }
+
+    /// Runs `UPDATE assignments` with `set`, whose $1 is the time and $2 `word`, on the given rows.
+    pub(super) async fn set_pairs<'a>(
+        &mut self,
+        set: &str,
+        word: &str,
+        now_ms: u64,
+        pairs: impl Iterator<Item = (&'a DeploymentId, &'a RobotId)>,
+    ) -> Result<(), StoreError> {
+        let pairs: Vec<_> = pairs.collect();
+        for group in groups(&pairs) {
+            let sql = format!(
+                "WITH v (deployment_id, robot_id) AS ({}) UPDATE assignments {set} FROM v
+                 WHERE assignments.deployment_id = v.deployment_id AND assignments.robot_id = v.robot_id",
+                values(3, group.len(), PAIR)
+            );
+            let mut query = sqlx::query(AssertSqlSafe(sql)).bind(stored(now_ms)).bind(word);
+            for (deployment, robot) in group {
+                query = query.bind(deployment.as_str()).bind(robot.as_str());
+            }
+            query.execute(self.connection()).await?;
+        }
+        Ok(())
+    }
+}
+
+/// Reads [`COLUMNS`]. A task that has run where it is, in a phase that `stays` tells, is left there.
+fn revocable(row: &sqlx::any::AnyRow, stays: impl Fn(Phase) -> bool) -> Result<Revocable, StoreError> {
+    let deployment: DeploymentId = id("assignments.deployment_id", row.try_get("deployment_id")?)?;
+    let previous: Option<String> = row.try_get("previous")?;
+    let is = |column| row.try_get::<i64, _>(column).map(|value| value == 1);
+    let (desired, wanted, run) =
+        (is("desired")?, from_word("assignments.wanted", row.try_get("wanted")?)?, number(row.try_get("run")?));
+    let unchanged = Left { run, wanted, phase: None, failure: None, is_told: false };
+    let left = if is("diverged")? {
+        Some(unchanged)
+    } else if desired && is("ran")? && stays(Phase::from_text(row.try_get("phase")?)) {
+        let report: Option<Report> = from_optional_json("robots.report", row.try_get("report")?)?;
+        Some(as_reported(report, &deployment, unchanged))
+    } else {
+        None
+    };
+    Ok(Revocable {
+        robot: id("assignments.robot_id", row.try_get("robot_id")?)?,
+        previous: previous.map(|previous| id("assignments.previous", &previous)).transpose()?,
+        deployment,
+        desired,
+        wanted,
+        left,
+    })
+}
+
+/// A robot that never heard of the last order on its task keeps what it said that it has. One that has heard of it, and has not
+/// come to it in time, does not come to it later.
+fn as_reported(report: Option<Report>, deployment: &DeploymentId, ordered: Left) -> Left {
+    let tasks = report.into_iter().flat_map(|report| report.tasks);
+    match tasks.into_iter().find(|task| task.deployment == *deployment) {
+        Some(task) if task.run < ordered.run => {
+            Left { run: task.run, wanted: task.wanted, phase: Some(task.phase), failure: task.failure, is_told: true }
+        }
+        _ => Left { wanted: Wanted::Stopped, is_told: true, ..ordered },
+    }
+}

@@ -1,0 +1,332 @@
+//! The audit's entries: each is added by the write that it tells of, and none is ever changed or removed. So that it does not
+//! grow without bound, what a person does to themselves alone is done so often a day and no more.
+
+use std::collections::BTreeMap;
+use std::net::IpAddr;
+use std::time::{Duration, Instant};
+
+use sqlx::{AssertSqlSafe, Row as _};
+use task_proto::TokenId;
+use task_proto::api::{AuditPage, AuditQuery};
+use task_proto::audit::{AuditEntry, AuditRecord, Link};
+use task_proto::person::Permission;
+
+use crate::domain::person::Person;
+use crate::limits::pace::{Pace, seconds};
+use crate::store::rows::{id, json, number, stored};
+use crate::store::{KnownRobot, Store, StoreError, Write};
+
+/// The most entries in one answer.
+const MOST_RECORDS: u64 = 1_000;
+/// The most bytes of them.
+const MOST_BYTES: usize = 4 * 1024 * 1024;
+/// The longest text kept of a target or a detail: a selector may be as long as 64 KiB.
+const MOST_CHARACTERS: usize = 1_000;
+
+/// What can be done that the audit tells of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Act {
+    /// A robot came, or came back.
+    RobotEnroll,
+    /// A robot that waited was let in.
+    RobotApprove,
+    /// A robot that waited was turned away.
+    RobotReject,
+    /// A robot's name or labels were changed.
+    RobotEdit,
+    /// A robot was removed.
+    RobotRemove,
+    /// Labels of many robots were changed.
+    BulkLabels,
+    /// Many robots were removed.
+    BulkRemove,
+    /// A robot's tokens were ended.
+    RobotRevoke,
+    /// A robot was asked to change something at once, like a parameter.
+    RobotAsk,
+    /// An enrolment token was made.
+    EnrolmentCreate,
+    /// An enrolment token was revoked.
+    EnrolmentRevoke,
+    /// A package was ordered.
+    DeploymentCreate,
+    /// An order was taken back.
+    DeploymentCancel,
+    /// A paused order was let go on.
+    DeploymentResume,
+    /// What had ended badly was ordered once more.
+    DeploymentRetry,
+    /// A task was ordered to start.
+    TaskStart,
+    /// A task was ordered to run anew.
+    TaskRestart,
+    /// A task was ordered back to the package before.
+    TaskRollBack,
+    /// A task was ordered to stop.
+    TaskStop,
+    /// A task was ordered to go.
+    TaskRemove,
+    /// A manifest was pushed.
+    ManifestPush,
+    /// A manifest was deleted.
+    ManifestDelete,
+    /// A tag was deleted.
+    TagDelete,
+    /// A blob was taken out of a repository.
+    BlobDelete,
+    /// A user was added.
+    UserAdd,
+    /// A user's roles or scope were changed.
+    UserEdit,
+    /// A user was removed.
+    UserRemove,
+    /// A password was set.
+    UserPassword,
+    /// Someone signed in with a password.
+    SignIn,
+    /// Someone signed out.
+    SignOut,
+    /// So many sign-ins failed that no more are tried for a while.
+    SignInBlocked,
+    /// An access token was made.
+    TokenCreate,
+    /// An access token was revoked.
+    TokenRevoke,
+}
+
+impl Act {
+    /// Its name in the audit.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::RobotEnroll => "robot.enroll",
+            Self::RobotApprove => "robot.approve",
+            Self::RobotReject => "robot.reject",
+            Self::RobotEdit => "robot.edit",
+            Self::RobotRemove => "robot.remove",
+            Self::BulkLabels => "bulk.labels",
+            Self::BulkRemove => "bulk.remove",
+            Self::RobotRevoke => "robot.revoke",
+            Self::RobotAsk => "robot.ask",
+            Self::EnrolmentCreate => "enrolment_token.create",
+            Self::EnrolmentRevoke => "enrolment_token.revoke",
+            Self::DeploymentCreate => "deployment.create",
+            Self::DeploymentCancel => "deployment.cancel",
+            Self::DeploymentResume => "deployment.resume",
+            Self::TaskStart => "task.start",
+            Self::DeploymentRetry => "deployment.retry",
+            Self::TaskRestart => "task.restart",
+            Self::TaskRollBack => "task.rollback",
+            Self::TaskStop => "task.stop",
+            Self::TaskRemove => "task.remove",
+            Self::ManifestPush => "manifest.push",
+            Self::ManifestDelete => "manifest.delete",
+            Self::TagDelete => "tag.delete",
+            Self::BlobDelete => "blob.delete",
+            Self::UserAdd => "user.add",
+            Self::UserEdit => "user.edit",
+            Self::UserRemove => "user.remove",
+            Self::UserPassword => "user.password",
+            Self::SignIn => "sign_in",
+            Self::SignOut => "sign_out",
+            Self::SignInBlocked => "sign_in.blocked",
+            Self::TokenCreate => "token.create",
+            Self::TokenRevoke => "token.revoke",
+        }
+    }
+}
+
+impl Act {
+    /// Whether everybody may do it again and again, whatever their role, and to nobody but themselves. Of what they began by
+    /// it, signing out and revoking a token end each once. All else takes somebody who is trusted with more than the length
+    /// of the audit, and an order must not wait.
+    fn is_everybodys(self) -> bool {
+        matches!(self, Self::SignIn | Self::TokenCreate | Self::UserPassword)
+    }
+}
+
+/// How often a person may do what everybody may: so often after a rest, and then 2,000 times a day.
+pub(in crate::store) fn everybodys_pace() -> Pace {
+    Pace::new(Duration::from_secs(24 * 60 * 60) / 2_000, 200)
+}
+
+/// An act that is being done, as whoever does it tells of it. A secret never belongs in here.
+#[derive(Debug, Clone)]
+pub struct Deed {
+    who: String,
+    token: Option<TokenId>,
+    address: Option<IpAddr>,
+    /// By whose rights; `None`: by nobody's, like signing in.
+    by: Option<Person>,
+    act: Act,
+    target: String,
+    detail: BTreeMap<String, String>,
+}
+
+impl Deed {
+    /// `person` does `act` to `target`.
+    pub fn by(person: &Person, act: Act, target: impl ToString) -> Self {
+        let (who, token) = (person.name.to_string(), Some(person.token.clone()));
+        Self { by: Some(person.clone()), ..Self::new(who, token, person.address, act, target) }
+    }
+
+    /// Someone who is no user, or not yet known to be one.
+    pub fn new(who: String, token: Option<TokenId>, address: Option<IpAddr>, act: Act, target: impl ToString) -> Self {
+        Self { who, token, address, by: None, act, target: shortened(&target.to_string()), detail: BTreeMap::new() }
+    }
+
+    /// With this as well.
+    pub fn with(mut self, key: &str, value: impl ToString) -> Self {
+        self.detail.insert(key.to_owned(), shortened(&value.to_string()));
+        self
+    }
+
+    /// With this as well, if there is such a thing.
+    pub fn with_some(self, key: &str, value: Option<impl ToString>) -> Self {
+        match value {
+            Some(value) => self.with(key, value),
+            None => self,
+        }
+    }
+}
+
+impl Deed {
+    /// Whether a robot is in the scope of the person who does it.
+    pub(in crate::store) fn covers(&self, robot: &KnownRobot) -> bool {
+        self.by.as_ref().is_some_and(|by| by.scope.covers(&robot.id, &robot.name, &robot.labels))
+    }
+}
+
+/// As much of a text as an entry keeps. Neither a terminal nor Postgres takes every control character.
+fn shortened(text: &str) -> String {
+    let mut characters = text.chars().map(|c| if c.is_control() { ' ' } else { c });
+    let mut kept: String = characters.by_ref().take(MOST_CHARACTERS).collect();
+    if characters.next().is_some() {
+        kept.push('…');
+    }
+    kept
+}
+
+impl Write {
+    /// Writes down what this write does. It is there if and only if the write is; and the write is not, if whoever does it may
+    /// no longer: a request's body can come long after its head. So this comes before one's own rights are changed.
+    pub async fn audit(&mut self, deed: &Deed, now_ms: u64) -> Result<(), StoreError> {
+        if let Some(by) = &deed.by {
+            self.check_rights(by, now_ms).await?;
+        }
+        if deed.act.is_everybodys() && !deed.by.as_ref().is_some_and(|by| by.may(Permission::Administer)) {
+            let taken = self.everybodys.take(&deed.who, Instant::now());
+            taken.map_err(|wait| StoreError::TooManyActs { who: deed.who.clone(), seconds: seconds(wait) })?;
+        }
+        let last = sqlx::query("SELECT number, digest FROM audit ORDER BY number DESC LIMIT 1")
+            .fetch_optional(self.connection())
+            .await?;
+        let last = match last {
+            Some(row) => {
+                let digest = id("audit.digest", row.try_get("digest")?)?;
+                Link { number: number(row.try_get("number")?), digest }
+            }
+            None => Link::START,
+        };
+        let entry = json(&AuditEntry {
+            number: last.number + 1,
+            at_ms: now_ms,
+            who: deed.who.clone(),
+            token: deed.token.clone(),
+            address: deed.address,
+            act: deed.act.as_str().to_owned(),
+            target: deed.target.clone(),
+            detail: deed.detail.clone(),
+        });
+        let link = last.next(&entry);
+        sqlx::query("INSERT INTO audit (number, who, act, target, entry, digest) VALUES ($1, $2, $3, $4, $5, $6)")
+            .bind(stored(link.number))
+            .bind(deed.who.as_str())
+            .bind(deed.act.as_str())
+            .bind(deed.target.as_str())
+            .bind(entry)
+            .bind(link.digest.to_string())
+            .execute(self.connection())
+            .await?;
+        Ok(())
+    }
+
+    /// Writes it down, if there is something to, and makes it so.
+    pub(in crate::store) async fn commit_with(mut self, deed: Option<&Deed>, now_ms: u64) -> Result<(), StoreError> {
+        if let Some(deed) = deed {
+            self.audit(deed, now_ms).await?;
+        }
+        self.commit().await
+    }
+}
+
+impl Store {
+    /// Entries of the audit: those after a number, the oldest first, or else the newest first.
+    pub async fn audit(&self, query: &AuditQuery) -> Result<AuditPage, StoreError> {
+        let last: Option<i64> = sqlx::query_scalar("SELECT MAX(number) FROM audit").fetch_one(&self.reads).await?;
+        let order = if query.after.is_some() { "ASC" } else { "DESC" };
+        let limit = query.limit.unwrap_or(MOST_RECORDS).min(MOST_RECORDS);
+        let rows = sqlx::query(AssertSqlSafe(format!(
+            "SELECT entry, digest FROM audit
+             WHERE number > $1 AND number < $2 AND (who = $3 OR $3 = '') AND ($4 = '' OR target = $4 OR target IN (SELECT id FROM robots WHERE name = $4))
+               AND substr(act, 1, CAST($6 AS INTEGER)) = $5
+             ORDER BY number {order} LIMIT $7"
+        )))
+        .bind(stored(query.after.unwrap_or(0)))
+        .bind(stored(query.before.unwrap_or(u64::MAX)))
+        .bind(query.who.as_deref().unwrap_or_default())
+        .bind(query.target.as_deref().unwrap_or_default())
+        .bind(query.act.as_deref().unwrap_or_default())
+        .bind(stored(query.act.as_deref().map_or(0, |act| act.chars().count() as u64)))
+        .bind(stored(limit))
+        .fetch_all(&self.reads)
+        .await?;
+        let (mut records, mut bytes) = (Vec::with_capacity(rows.len()), 0);
+        for row in rows {
+            let entry: String = row.try_get("entry")?;
+            bytes += entry.len();
+            if bytes > MOST_BYTES && !records.is_empty() {
+                break;
+            }
+            let entry = serde_json::value::RawValue::from_string(entry)
+                .map_err(|_| StoreError::Unreadable { column: "audit.entry" })?;
+            records.push(AuditRecord { digest: id("audit.digest", row.try_get("digest")?)?, entry });
+        }
+        Ok(AuditPage { records, last: last.map_or(0, number) })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_statement_changes_or_removes_an_entry() {
+        let mut directories = vec![std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("src/store")];
+        let mut looked_at = 0;
+        while let Some(directory) = directories.pop() {
+            for file in std::fs::read_dir(directory).expect("a directory") {
+                let path = file.expect("a file").path();
+                if path.is_dir() {
+                    directories.push(path);
+                    continue;
+                }
+                let text = std::fs::read_to_string(path).expect("text");
+                let statements = text.split_whitespace().collect::<Vec<_>>().join(" ").to_lowercase();
+                for verb in ["update", "delete from", "drop table", "alter table", "truncate"] {
+                    assert!(!statements.contains(&format!("{verb} audit ")), "{verb}");
+                }
+                looked_at += usize::from(statements.contains("into audit ("));
+            }
+        }
+        assert_eq!(looked_at, 1, "entries are added in one place");
+    }
+
+    #[test]
+    fn a_text_is_kept_short_and_harmless() {
+        assert_eq!(shortened("site=lab"), "site=lab");
+        assert_eq!(shortened("a\u{1b}[2J\0b\n"), "a [2J b ");
+        let long = shortened(&"é".repeat(5_000));
+        assert_eq!((long.chars().count(), long.ends_with('…')), (MOST_CHARACTERS + 1, true));
+        assert_eq!(shortened(&"é".repeat(MOST_CHARACTERS)), "é".repeat(MOST_CHARACTERS));
+    }
+}

@@ -1,0 +1,130 @@
+//! The first use of a robot's token, which ends its other ones. When a fleet comes for the first time, thousands happen at
+//! once: whoever finds nobody writing writes for all who wait, so that they share one commit, and what others remember of
+//! the database is out of date once and not thousands of times.
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use sqlx::Row as _;
+use task_proto::RobotId;
+use task_proto::token::Token;
+use tokio::sync::oneshot;
+
+use crate::store::rows::{id, stored};
+use crate::store::{Store, StoreError, Write};
+
+/// The most first uses of one write: others wait for it as well.
+const MAX_BATCH: usize = 256;
+
+/// Those who wait for their first use to be written. Clones are the same.
+#[derive(Debug, Clone, Default)]
+pub(in crate::store) struct FirstUses {
+    waiting: Arc<Mutex<Vec<Waiting>>>,
+    turn: Arc<tokio::sync::Mutex<()>>,
+}
+
+#[derive(Debug)]
+struct Waiting {
+    token_id: String,
+    now_ms: u64,
+    told: oneshot::Sender<Result<bool, StoreError>>,
+}
+
+impl FirstUses {
+    fn waiting(&self) -> MutexGuard<'_, Vec<Waiting>> {
+        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing half-done.
+        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The next of them; none if nobody waits.
+    fn next_batch(&self) -> Option<Vec<Waiting>> {
+        let mut waiting = self.waiting();
+        let rest = waiting.len().min(MAX_BATCH);
+        let batch: Vec<Waiting> = waiting.drain(..rest).collect();
+        (!batch.is_empty()).then_some(batch)
+    }
+}
+
+impl Store {
+    /// Marks a robot's token as the one it uses; false if it is used or ended already. Goes on to its end even if the caller
+    /// does not wait for it.
+    pub(in crate::store) async fn use_first(&self, token: &Token, now_ms: u64) -> Result<bool, StoreError> {
+        let (told, mut hears) = oneshot::channel();
+        self.first_uses.waiting().push(Waiting { token_id: token.id(), now_ms, told });
+        let lost = |_| Err(StoreError::Statement(sqlx::Error::WorkerCrashed));
+        tokio::select! {
+            biased;
+            used = &mut hears => return used.unwrap_or_else(lost),
+            turn = self.first_uses.turn.clone().lock_owned() => {
+                let store = self.clone();
+                tokio::spawn(async move {
+                    let _turn = turn;
+                    store.use_waiting().await;
+                });
+            }
+        }
+        hears.await.unwrap_or_else(lost)
+    }
+
+    async fn use_waiting(&self) {
+        while let Some(batch) = self.first_uses.next_batch() {
+            match self.use_together(&batch).await {
+                Ok(used) => {
+                    for (waiting, used) in batch.into_iter().zip(used) {
+                        // Who has gone away does not need to know.
+                        let _ = waiting.told.send(Ok(used));
+                    }
+                }
+                Err(error) => {
+                    let error = Arc::new(error);
+                    for waiting in batch {
+                        let _ = waiting.told.send(Err(StoreError::Together(error.clone())));
+                    }
+                }
+            }
+        }
+    }
+
+    async fn use_together(&self, batch: &[Waiting]) -> Result<Vec<bool>, StoreError> {
+        let mut write = self.begin().await?;
+        let mut used = Vec::with_capacity(batch.len());
+        for waiting in batch {
+            used.push(write.use_first(&waiting.token_id, waiting.now_ms).await?);
+        }
+        write.commit().await?;
+        Ok(used)
+    }
+}
+
+impl Write {
+    async fn use_first(&mut self, token_id: &str, now_ms: u64) -> Result<bool, StoreError> {
+        let row = sqlx::query(
+            "UPDATE tokens SET used_at_ms = $2 WHERE id = $1 AND used_at_ms IS NULL AND revoked_at_ms IS NULL
+             RETURNING robot_id, made_by, number",
+        )
+        .bind(token_id)
+        .bind(stored(now_ms))
+        .fetch_optional(self.connection())
+        .await?;
+        let Some(row) = row else { return Ok(false) };
+        let robot: RobotId = id("tokens.robot_id", row.try_get("robot_id")?)?;
+        let (made_by, number): (Option<String>, i64) = (row.try_get("made_by")?, row.try_get("number")?);
+        sqlx::query(
+            "UPDATE tokens SET revoked_at_ms = $3
+             WHERE robot_id = $1 AND kind = 'robot' AND id <> $2 AND revoked_at_ms IS NULL",
+        )
+        .bind(robot.as_str())
+        .bind(token_id)
+        .bind(stored(now_ms))
+        .execute(self.connection())
+        .await?;
+        sqlx::query("UPDATE robots SET token_number = $2 WHERE id = $1")
+            .bind(robot.as_str())
+            .bind(number)
+            .execute(self.connection())
+            .await?;
+        if made_by.is_some() {
+            self.forget_report(&robot).await?;
+        }
+        Ok(true)
+    }
+}

@@ -1,0 +1,132 @@
+//! Outputs of runs: which files came back from which robot. The bytes lie in the blob store, under the robot's repository.
+
+use futures_util::TryStreamExt as _;
+use sqlx::Row as _;
+use task_proto::api::OutputView;
+use task_proto::output::OutputSet;
+use task_proto::{Digest, RepositoryName, RobotId, TaskName};
+
+use super::robot_blobs::bytes_taken;
+use crate::domain::person::Scope;
+use crate::store::{Store, StoreError, Write, rows};
+
+/// The newest runs kept of one task on one robot.
+const KEPT: usize = 10;
+/// The newest runs kept of one robot: the names of tasks are in its own hands.
+const KEPT_OF_ROBOT: usize = 200;
+/// The most outputs listed.
+const MAX_LISTED: usize = 1000;
+/// The most bytes of JSON listed: an output of many files with long names takes a lot of room.
+const MAX_LISTED_BYTES: usize = 16 * 1024 * 1024;
+
+/// An output to be stored.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct NewOutput {
+    /// What it says.
+    pub set: OutputSet,
+    /// How many bytes of its robot's outputs stay.
+    pub max_bytes: u64,
+}
+
+impl Store {
+    /// The newest outputs first, of one robot or of all in a scope, of one task or of all; at most 1,000, and fewer if they
+    /// are large.
+    pub async fn outputs(
+        &self,
+        robot: Option<&RobotId>,
+        task: Option<&TaskName>,
+        scope: &Scope,
+    ) -> Result<Vec<OutputView>, StoreError> {
+        let mut lent = self.reads.lend().await?;
+        let mut found = sqlx::query(
+            "SELECT o.manifest, o.output, o.pushed_at_ms, r.name, o.robot_id, r.labels FROM outputs o JOIN robots r ON r.id = o.robot_id
+             WHERE ($1 = '' OR o.robot_id = $1) AND ($2 = '' OR o.task = $2)
+             ORDER BY o.pushed_at_ms DESC, o.manifest LIMIT $3",
+        )
+        .bind(robot.map_or("", RobotId::as_str))
+        .bind(task.map_or("", TaskName::as_str))
+        // How many of a scope's are among the newest is not known before they are looked at.
+        .bind(if scope.is_everything() { MAX_LISTED as i64 } else { i64::MAX })
+        .fetch(lent.connection());
+        let (mut views, mut bytes) = (Vec::new(), 0);
+        while let Some(row) = found.try_next().await? {
+            let robot_name = rows::id("robots.name", row.try_get("name")?)?;
+            if !scope.is_everything() {
+                let labels = rows::from_json("robots.labels", row.try_get("labels")?)?;
+                if !scope.covers(&rows::id("outputs.robot_id", row.try_get("robot_id")?)?, &robot_name, &labels) {
+                    continue;
+                }
+            }
+            let output: &str = row.try_get("output")?;
+            bytes += output.len();
+            if bytes > MAX_LISTED_BYTES || views.len() == MAX_LISTED {
+                break;
+            }
+            views.push(OutputView {
+                robot_name,
+                manifest: rows::id("outputs.manifest", row.try_get("manifest")?)?,
+                pushed_at_ms: rows::number(row.try_get("pushed_at_ms")?),
+                output: rows::from_json("outputs.output", output)?,
+            });
+        }
+        Ok(views)
+    }
+}
+
+impl Write {
+    /// Notes an output, which takes the place of an earlier one of the same run. Gives the manifests of the robot's
+    /// repositories that are too many now, or have too many bytes.
+    pub(in crate::store) async fn insert_output(
+        &mut self,
+        repository: &RepositoryName,
+        manifest: &Digest,
+        NewOutput { set: output, max_bytes }: &NewOutput,
+        now_ms: u64,
+    ) -> Result<Vec<(RepositoryName, Digest)>, StoreError> {
+        let tag = format!("{}-{}", output.deployment, output.run);
+        sqlx::query(
+            "INSERT INTO outputs (repository, manifest, robot_id, task, tag, output, pushed_at_ms, bytes)
+             VALUES ($1, $2, $3, $4, $5, $6, $7, $8)
+             ON CONFLICT (repository, manifest)
+             DO UPDATE SET pushed_at_ms = excluded.pushed_at_ms, bytes = excluded.bytes",
+        )
+        .bind(repository.as_str())
+        .bind(manifest.to_string())
+        .bind(output.robot_id.as_str())
+        .bind(output.task.as_str())
+        .bind(&tag)
+        .bind(rows::json(output))
+        .bind(rows::stored(now_ms))
+        .bind(rows::stored(bytes_taken(output)))
+        .execute(self.connection())
+        .await?;
+        let others = sqlx::query(
+            "SELECT repository, manifest, tag, bytes FROM outputs
+             WHERE robot_id = $1 AND NOT (repository = $2 AND manifest = $3)
+             ORDER BY pushed_at_ms DESC, manifest",
+        )
+        .bind(output.robot_id.as_str())
+        .bind(repository.as_str())
+        .bind(manifest.to_string())
+        .fetch_all(self.connection())
+        .await?;
+        let (mut surplus, mut kept, mut kept_here, mut kept_bytes) = (Vec::new(), 1, 1, bytes_taken(output));
+        for row in &others {
+            let is_here = row.try_get::<&str, _>("repository")? == repository.as_str();
+            let is_replaced = is_here && row.try_get::<&str, _>("tag")? == tag;
+            let is_outlived = is_replaced || (is_here && kept_here >= KEPT);
+            if !is_outlived {
+                kept += 1;
+                kept_bytes = kept_bytes.saturating_add(rows::number(row.try_get("bytes")?));
+            }
+            // Where one has no room, no older one has.
+            if is_outlived || kept > KEPT_OF_ROBOT || kept_bytes > *max_bytes {
+                let repository = rows::id("outputs.repository", row.try_get("repository")?)?;
+                surplus.push((repository, rows::id("outputs.manifest", row.try_get("manifest")?)?));
+            } else {
+                kept_here += usize::from(is_here);
+            }
+        }
+        Ok(surplus)
+    }
+}

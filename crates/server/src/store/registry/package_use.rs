@@ -1,0 +1,258 @@
+//! Which packages there are of a name, who should have them, and that nothing of a package is deleted that someone should
+//! have: whichever way the deletion comes, it is decided here.
+
+use std::collections::{BTreeMap, HashMap, HashSet};
+
+use sqlx::AssertSqlSafe;
+use task_proto::api::{PackageUse, PackageView};
+use task_proto::desired::PackageRef;
+use task_proto::{DeploymentId, Digest, RepositoryName, RobotId, Tag, TaskName};
+
+use super::packages::{PACKAGE_ROWS, Reference, ranked};
+use crate::store::fleet::robots::{KNOWN, known_robot};
+use crate::store::rows::{from_json, id};
+use crate::store::{Deed, KnownRobot, Store, StoreError, Write};
+
+/// How deleting a manifest, a tag or a blob ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Deletion {
+    /// It is gone; these blobs were parts of it.
+    Deleted(Vec<Digest>),
+    /// Nothing is deleted: robots should have the package it belongs to, or are to get it.
+    InUse(PackageUsers),
+    /// There is no such thing.
+    Unknown,
+}
+
+/// Who keeps a package in use.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct PackageUsers {
+    /// By which orders, each with those of the robots that it is for.
+    pub deployments: Vec<(DeploymentId, Vec<RobotId>)>,
+    /// The robots, sorted by name.
+    pub robots: Vec<KnownRobot>,
+}
+
+impl PackageUsers {
+    fn is_empty(&self) -> bool {
+        self.deployments.is_empty() && self.robots.is_empty()
+    }
+
+    /// Whether some are none of the robots of the person who does this.
+    fn are_others_than_of(&self, deed: &Deed) -> bool {
+        self.robots.iter().any(|robot| !deed.covers(robot))
+    }
+}
+
+impl Store {
+    /// Every package of a name: those with a tag first, each the newest first.
+    pub async fn package_versions(&self, name: &TaskName) -> Result<Vec<PackageView>, StoreError> {
+        let rows = sqlx::query(AssertSqlSafe(format!("{PACKAGE_ROWS} WHERE p.name = $1")))
+            .bind(name.as_str())
+            .fetch_all(&self.reads)
+            .await?;
+        ranked(&rows)
+    }
+
+    /// The package that a version or a digest means: a version is what its tag points to, or the newest that says so.
+    pub async fn find_package(
+        &self,
+        name: &TaskName,
+        reference: &Reference,
+    ) -> Result<Option<PackageView>, StoreError> {
+        let tag = match reference {
+            Reference::Digest(digest) => return self.package(name, digest).await,
+            Reference::Tag(tag) => tag,
+        };
+        let tagged = self.manifest(&RepositoryName::of_package(name), reference).await?.map(|found| found.digest);
+        let mut versions = self.package_versions(name).await?;
+        let at = versions
+            .iter()
+            .position(|view| Some(view.package.manifest.digest) == tagged)
+            .or_else(|| versions.iter().position(|view| view.package.version.as_str() == tag.as_str()));
+        Ok(at.map(|at| versions.swap_remove(at)))
+    }
+
+    /// How many robots, of all or of `robots`, should have which package of a name.
+    pub async fn package_uses(
+        &self,
+        name: &TaskName,
+        robots: Option<&HashSet<RobotId>>,
+    ) -> Result<Vec<PackageUse>, StoreError> {
+        let rows: Vec<(String, String)> =
+            sqlx::query_as("SELECT deployment_id, robot_id FROM assignments WHERE task = $1 AND desired = 1")
+                .bind(name.as_str())
+                .fetch_all(&self.reads)
+                .await?;
+        let mut by_deployment: HashMap<String, u64> = HashMap::new();
+        for (deployment, robot) in rows {
+            let robot: RobotId = id("assignments.robot_id", &robot)?;
+            let counts = robots.is_none_or(|robots| robots.contains(&robot));
+            *by_deployment.entry(deployment).or_default() += u64::from(counts);
+        }
+        let rows: Vec<(String, String)> = sqlx::query_as(
+            "SELECT id, package FROM deployments
+             WHERE id IN (SELECT deployment_id FROM assignments WHERE task = $1 AND desired = 1)",
+        )
+        .bind(name.as_str())
+        .fetch_all(&self.reads)
+        .await?;
+        let mut uses: BTreeMap<Digest, u64> = BTreeMap::new();
+        for (deployment, package) in rows {
+            let package: PackageRef = from_json("deployments.package", &package)?;
+            *uses.entry(package.manifest.digest).or_default() += by_deployment.remove(&deployment).unwrap_or(0);
+        }
+        let uses = uses.into_iter().filter(|(_, robots)| *robots > 0);
+        Ok(uses.map(|(manifest, robots)| PackageUse { manifest, robots }).collect())
+    }
+
+    /// Removes a manifest with all its tags, unless robots should have a package that it is, is a part of, or signs. A
+    /// signature is also removed by a person whose robots all of those are.
+    pub async fn delete_manifest(
+        &self,
+        repository: &RepositoryName,
+        digest: &Digest,
+        deed: &Deed,
+        now_ms: u64,
+    ) -> Result<Deletion, StoreError> {
+        let mut write = self.begin().await?;
+        if let Some(users) = write.refusal_to_delete(repository, digest, deed).await? {
+            return Ok(Deletion::InUse(users));
+        }
+        let Some(parts) = write.delete_manifest(repository, digest).await? else {
+            return Ok(Deletion::Unknown);
+        };
+        write.commit_with(Some(deed), now_ms).await?;
+        Ok(Deletion::Deleted(parts))
+    }
+
+    /// Removes a tag, unless it is refused by [`Write::refusal_to_move`].
+    pub async fn delete_tag(
+        &self,
+        repository: &RepositoryName,
+        tag: &Tag,
+        deed: &Deed,
+        now_ms: u64,
+    ) -> Result<Deletion, StoreError> {
+        let mut write = self.begin().await?;
+        if let Some(users) = write.refusal_to_move(repository, tag, None, Some(deed)).await? {
+            return Ok(Deletion::InUse(users));
+        }
+        if !write.delete_tag(repository, tag).await? {
+            return Ok(Deletion::Unknown);
+        }
+        write.commit_with(Some(deed), now_ms).await?;
+        Ok(Deletion::Deleted(Vec::new()))
+    }
+
+    /// Takes a blob out of a repository, on the terms of [`Self::delete_manifest`].
+    pub async fn unlink_blob(
+        &self,
+        repository: &RepositoryName,
+        digest: &Digest,
+        deed: &Deed,
+        now_ms: u64,
+    ) -> Result<Deletion, StoreError> {
+        let mut write = self.begin().await?;
+        if let Some(users) = write.refusal_to_delete(repository, digest, deed).await? {
+            return Ok(Deletion::InUse(users));
+        }
+        if !write.unlink_blob(repository, digest).await? {
+            return Ok(Deletion::Unknown);
+        }
+        write.commit_with(Some(deed), now_ms).await?;
+        Ok(Deletion::Deleted(Vec::new()))
+    }
+}
+
+impl Write {
+    /// Who keeps this manifest or blob from being deleted out of `repository`.
+    async fn refusal_to_delete(
+        &mut self,
+        repository: &RepositoryName,
+        digest: &Digest,
+        deed: &Deed,
+    ) -> Result<Option<PackageUsers>, StoreError> {
+        let Ok(name) = repository.as_str().parse::<TaskName>() else { return Ok(None) };
+        let packages = "SELECT manifest FROM packages WHERE name = $1 AND (manifest = $2 OR manifest IN
+                 (SELECT manifest FROM manifest_parts WHERE repository = $1 AND digest = $2))";
+        for package in self.digests(packages, repository, digest).await? {
+            let users = self.package_users(&name, &package).await?;
+            if !users.is_empty() {
+                return Ok(Some(users));
+            }
+        }
+        let signed = "SELECT package FROM signatures WHERE repository = $1 AND (manifest = $2 OR envelope = $2)";
+        for package in self.digests(signed, repository, digest).await? {
+            let users = self.package_users(&name, &package).await?;
+            if users.are_others_than_of(deed) {
+                return Ok(Some(users));
+            }
+        }
+        Ok(None)
+    }
+
+    /// Who keeps a tag from being deleted, or pointed to another manifest than `to`: robots that should have the package it
+    /// points to, and are outside of the person's scope.
+    pub(in crate::store) async fn refusal_to_move(
+        &mut self,
+        repository: &RepositoryName,
+        tag: &Tag,
+        to: Option<&Digest>,
+        deed: Option<&Deed>,
+    ) -> Result<Option<PackageUsers>, StoreError> {
+        let (Some(deed), Ok(name)) = (deed, repository.as_str().parse::<TaskName>()) else { return Ok(None) };
+        let tagged: Option<String> = sqlx::query_scalar("SELECT manifest FROM tags WHERE repository = $1 AND tag = $2")
+            .bind(repository.as_str())
+            .bind(tag.as_str())
+            .fetch_optional(self.connection())
+            .await?;
+        let Some(tagged) = tagged.map(|digest| id::<Digest>("tags.manifest", &digest)).transpose()? else {
+            return Ok(None);
+        };
+        if to == Some(&tagged) {
+            return Ok(None);
+        }
+        let users = self.package_users(&name, &tagged).await?;
+        Ok(users.are_others_than_of(deed).then_some(users))
+    }
+
+    async fn digests(
+        &mut self,
+        sql: &'static str,
+        repository: &RepositoryName,
+        digest: &Digest,
+    ) -> Result<Vec<Digest>, StoreError> {
+        let query = sqlx::query_scalar(sql).bind(repository.as_str()).bind(digest.to_string());
+        let found: Vec<String> = query.fetch_all(self.connection()).await?;
+        found.iter().map(|found| id("packages.manifest", found)).collect()
+    }
+
+    async fn package_users(&mut self, name: &TaskName, manifest: &Digest) -> Result<PackageUsers, StoreError> {
+        let rows: Vec<(String, String)> = sqlx::query_as(
+            "SELECT id, package FROM deployments WHERE id IN (
+                 SELECT deployment_id FROM assignments WHERE (desired = 1 OR ended = 0) AND task = $1)
+             ORDER BY number",
+        )
+        .bind(name.as_str())
+        .fetch_all(self.connection())
+        .await?;
+        let mut users = PackageUsers::default();
+        for (deployment, package) in rows {
+            let package: PackageRef = from_json("deployments.package", &package)?;
+            if package.manifest.digest != *manifest {
+                continue;
+            }
+            let assigned = "SELECT robot_id FROM assignments WHERE deployment_id = $1 AND (desired = 1 OR ended = 0)";
+            let sql = format!("{KNOWN} AND id IN ({assigned})");
+            let rows = sqlx::query(AssertSqlSafe(sql)).bind(&deployment).fetch_all(self.connection()).await?;
+            let robots = rows.iter().map(known_robot).collect::<Result<Vec<_>, _>>()?;
+            let ids = robots.iter().map(|robot| robot.id.clone()).collect();
+            users.deployments.push((id("deployments.id", &deployment)?, ids));
+            users.robots.extend(robots);
+        }
+        users.robots.sort_by(|one, other| one.name.cmp(&other.name));
+        users.robots.dedup();
+        Ok(users)
+    }
+}

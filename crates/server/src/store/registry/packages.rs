@@ -1,0 +1,416 @@
+//! Repositories, manifests, tags and task packages: what the registry knows of the bytes in the blob store. It never
+//! touches those bytes, and never decides what is a valid manifest.
+
+use std::cmp::Reverse;
+use std::collections::BTreeMap;
+
+use sqlx::Row as _;
+use sqlx::any::AnyRow;
+use task_proto::api::PackageView;
+use task_proto::desired::{BlobRef, PackageRef};
+use task_proto::manifest::TaskManifest;
+use task_proto::{Digest, RepositoryName, Tag, TaskName};
+
+use crate::store::{Deed, NewOutput, PackageUsers, SignedDocument, Store, StoreError, Write, rows};
+
+/// A manifest's name inside its repository.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Reference {
+    /// By a tag, which may move.
+    Tag(Tag),
+    /// By what it hashes to.
+    Digest(Digest),
+}
+
+/// A manifest that is in a repository.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct StoredManifest {
+    /// What it hashes to.
+    pub digest: Digest,
+    /// Its size in bytes.
+    pub size: u64,
+    /// The content type it was pushed with.
+    pub media_type: String,
+}
+
+/// A manifest to be stored.
+#[derive(Debug, Clone)]
+pub struct NewManifest {
+    /// The manifest itself.
+    pub manifest: StoredManifest,
+    /// What a list of referrers says it is.
+    pub artifact_type: Option<String>,
+    /// What a list of referrers says of it.
+    pub annotations: BTreeMap<String, String>,
+    /// The manifest it refers to: any digest, which need not be here.
+    pub subject: Option<String>,
+    /// The blobs and manifests it is made of.
+    pub parts: Vec<Digest>,
+    /// The tags that shall point to it.
+    pub tags: Vec<Tag>,
+    /// Whether a package may take its version from another, which is outdated by that.
+    pub takes_version: bool,
+    /// What it says if it is a task package.
+    pub package: Option<(PackageRef, TaskManifest)>,
+    /// What it says if it is the output of a run.
+    pub output: Option<NewOutput>,
+    /// What it brings if it is something that publishers have signed.
+    pub document: Option<SignedDocument>,
+}
+
+/// How storing a manifest ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum PutManifest {
+    /// It is stored.
+    Stored,
+    /// Nothing is stored: it is a package, and this other one has its version.
+    VersionTaken(Digest),
+    /// Nothing is stored: these parts are not in the repository.
+    PartsMissing(Vec<Digest>),
+    /// Nothing is stored: it is a list of publishers, and another has its version or a later one.
+    Outdated,
+    /// Nothing is stored: this tag points to a package of robots that are none of the person's.
+    TagInUse(Tag, PackageUsers),
+}
+
+impl Store {
+    /// Stores a manifest and points its tags to it, if all its parts are in the repository. With a `deed` that is written
+    /// down, as below.
+    pub async fn put_manifest(
+        &self,
+        repository: &RepositoryName,
+        new: &NewManifest,
+        deed: Option<&Deed>,
+        now_ms: u64,
+    ) -> Result<PutManifest, StoreError> {
+        let mut write = self.begin().await?;
+        let mut missing = Vec::new();
+        for part in &new.parts {
+            if !write.repository_holds(repository, part).await? {
+                missing.push(*part);
+            }
+        }
+        if !missing.is_empty() {
+            return Ok(PutManifest::PartsMissing(missing));
+        }
+        if let Some(document) = &new.document
+            && !write.insert_document(repository, &new.manifest.digest, document, now_ms).await?
+        {
+            return Ok(PutManifest::Outdated);
+        }
+        // What is stored for one order alone goes by its digest, and takes no version.
+        if let Some((package, _)) = new.package.as_ref().filter(|_| !new.tags.is_empty())
+            && let Some(other) = write.other_of_version(package).await?
+        {
+            if !new.takes_version {
+                return Ok(PutManifest::VersionTaken(other));
+            }
+            if new.tags.iter().any(|tag| tag.as_str() == package.version.as_str()) {
+                write.replace_package(package, &other).await?;
+            }
+        }
+        write.insert_manifest(repository, new, now_ms).await?;
+        for tag in &new.tags {
+            if let Some(users) = write.refusal_to_move(repository, tag, Some(&new.manifest.digest), deed).await? {
+                return Ok(PutManifest::TagInUse(tag.clone(), users));
+            }
+            write.point_tag(repository, tag, &new.manifest.digest).await?;
+        }
+        if let Some((package, task_manifest)) = &new.package {
+            write.insert_package(package, task_manifest, now_ms).await?;
+        }
+        if let Some(output) = &new.output {
+            for (repository, surplus) in write.insert_output(repository, &new.manifest.digest, output, now_ms).await? {
+                write.delete_manifest(&repository, &surplus).await?;
+            }
+        }
+        write.commit_with(deed, now_ms).await?;
+        Ok(PutManifest::Stored)
+    }
+
+    /// The manifest of that name.
+    pub async fn manifest(
+        &self,
+        repository: &RepositoryName,
+        reference: &Reference,
+    ) -> Result<Option<StoredManifest>, StoreError> {
+        let query = match reference {
+            Reference::Digest(digest) => {
+                sqlx::query("SELECT digest, size, media_type FROM manifests WHERE repository = $1 AND digest = $2")
+                    .bind(repository.as_str())
+                    .bind(digest.to_string())
+            }
+            Reference::Tag(tag) => sqlx::query(
+                "SELECT m.digest, m.size, m.media_type FROM tags t
+                 JOIN manifests m ON m.repository = t.repository AND m.digest = t.manifest
+                 WHERE t.repository = $1 AND t.tag = $2",
+            )
+            .bind(repository.as_str())
+            .bind(tag.as_str()),
+        };
+        let row = query.fetch_optional(&self.reads).await?;
+        row.map(|row| {
+            Ok(StoredManifest {
+                digest: rows::id("manifests.digest", row.try_get("digest")?)?,
+                size: rows::number(row.try_get("size")?),
+                media_type: row.try_get("media_type")?,
+            })
+        })
+        .transpose()
+    }
+
+    /// A repository's tags in the order of their bytes; `None` if there is no such repository.
+    pub async fn tags(&self, repository: &RepositoryName) -> Result<Option<Vec<Tag>>, StoreError> {
+        let known: Option<i64> = sqlx::query_scalar(
+            "SELECT CAST(1 AS BIGINT) WHERE EXISTS (SELECT 1 FROM manifests WHERE repository = $1)
+             OR EXISTS (SELECT 1 FROM repository_blobs WHERE repository = $1)",
+        )
+        .bind(repository.as_str())
+        .fetch_optional(&self.reads)
+        .await?;
+        if known.is_none() {
+            return Ok(None);
+        }
+        let names: Vec<String> = sqlx::query_scalar("SELECT tag FROM tags WHERE repository = $1")
+            .bind(repository.as_str())
+            .fetch_all(&self.reads)
+            .await?;
+        let mut tags = names.iter().map(|name| rows::id("tags.tag", name)).collect::<Result<Vec<Tag>, _>>()?;
+        // Sorted here: a database sorts by its locale.
+        tags.sort();
+        Ok(Some(tags))
+    }
+
+    /// Makes a blob part of a repository.
+    pub async fn link_blob(&self, repository: &RepositoryName, blob: &BlobRef) -> Result<(), StoreError> {
+        let mut write = self.begin().await?;
+        let is_known = write.count_blob(repository, blob).await?;
+        let linked =
+            sqlx::query("INSERT INTO repository_blobs (repository, digest) VALUES ($1, $2) ON CONFLICT DO NOTHING")
+                .bind(repository.as_str())
+                .bind(blob.digest.to_string())
+                .execute(write.connection())
+                .await?;
+        if is_known && linked.rows_affected() > 0 {
+            write.count_link(repository, blob).await?;
+        }
+        write.commit().await
+    }
+
+    /// Whether a blob is in `repository`, or in any if that is `None`.
+    pub async fn has_blob(&self, repository: Option<&RepositoryName>, digest: &Digest) -> Result<bool, StoreError> {
+        let query = match repository {
+            Some(repository) => {
+                sqlx::query("SELECT digest FROM repository_blobs WHERE digest = $1 AND repository = $2")
+                    .bind(digest.to_string())
+                    .bind(repository.as_str())
+            }
+            None => {
+                sqlx::query("SELECT digest FROM repository_blobs WHERE digest = $1 LIMIT 1").bind(digest.to_string())
+            }
+        };
+        Ok(query.fetch_optional(&self.reads).await?.is_some())
+    }
+
+    /// Every package, sorted by name; of one name those with a tag first, each the newest first.
+    pub async fn packages(&self) -> Result<Vec<PackageView>, StoreError> {
+        let rows = sqlx::query(PACKAGE_ROWS).fetch_all(&self.reads).await?;
+        let mut packages = ranked(&rows)?;
+        // Stable: within a name the rank stays.
+        packages.sort_by(|one, other| one.package.name.cmp(&other.package.name));
+        Ok(packages)
+    }
+
+    /// One package.
+    pub async fn package(&self, name: &TaskName, manifest: &Digest) -> Result<Option<PackageView>, StoreError> {
+        let row =
+            sqlx::query("SELECT package, task_manifest, pushed_at_ms FROM packages WHERE name = $1 AND manifest = $2")
+                .bind(name.as_str())
+                .bind(manifest.to_string())
+                .fetch_optional(&self.reads)
+                .await?;
+        row.as_ref().map(package_view).transpose()
+    }
+}
+
+impl Write {
+    /// Removes a tag; false if it was not there.
+    pub(in crate::store) async fn delete_tag(
+        &mut self,
+        repository: &RepositoryName,
+        tag: &Tag,
+    ) -> Result<bool, StoreError> {
+        let query = sqlx::query("DELETE FROM tags WHERE repository = $1 AND tag = $2");
+        let query = query.bind(repository.as_str()).bind(tag.as_str());
+        Ok(query.execute(self.connection()).await?.rows_affected() > 0)
+    }
+
+    /// Takes a blob out of a repository; false if it was not in it.
+    pub(in crate::store) async fn unlink_blob(
+        &mut self,
+        repository: &RepositoryName,
+        digest: &Digest,
+    ) -> Result<bool, StoreError> {
+        let query = sqlx::query("DELETE FROM repository_blobs WHERE repository = $1 AND digest = $2");
+        let query = query.bind(repository.as_str()).bind(digest.to_string());
+        Ok(query.execute(self.connection()).await?.rows_affected() > 0)
+    }
+
+    /// Removes a manifest with all its tags and says what it was made of; `None` if it was not there.
+    pub(in crate::store) async fn delete_manifest(
+        &mut self,
+        repository: &RepositoryName,
+        digest: &Digest,
+    ) -> Result<Option<Vec<Digest>>, StoreError> {
+        self.drop_of_robot(repository, digest).await?;
+        let parts: Vec<String> =
+            sqlx::query_scalar("DELETE FROM manifest_parts WHERE repository = $1 AND manifest = $2 RETURNING digest")
+                .bind(repository.as_str())
+                .bind(digest.to_string())
+                .fetch_all(self.connection())
+                .await?;
+        self.delete_document(repository, digest).await?;
+        let mut deleted = 0;
+        for sql in [
+            "DELETE FROM packages WHERE name = $1 AND manifest = $2",
+            "DELETE FROM outputs WHERE repository = $1 AND manifest = $2",
+            "DELETE FROM tags WHERE repository = $1 AND manifest = $2",
+            "DELETE FROM manifests WHERE repository = $1 AND digest = $2",
+        ] {
+            let query = sqlx::query(sql).bind(repository.as_str()).bind(digest.to_string());
+            deleted = query.execute(self.connection()).await?.rows_affected();
+        }
+        if deleted == 0 {
+            return Ok(None);
+        }
+        parts.iter().map(|part| rows::id("manifest_parts.digest", part)).collect::<Result<_, _>>().map(Some)
+    }
+
+    async fn repository_holds(&mut self, repository: &RepositoryName, part: &Digest) -> Result<bool, StoreError> {
+        let found = sqlx::query(
+            "SELECT digest FROM repository_blobs WHERE repository = $1 AND digest = $2
+             UNION ALL SELECT digest FROM manifests WHERE repository = $1 AND digest = $2",
+        )
+        .bind(repository.as_str())
+        .bind(part.to_string())
+        .fetch_optional(self.connection());
+        Ok(found.await?.is_some())
+    }
+
+    async fn insert_manifest(
+        &mut self,
+        repository: &RepositoryName,
+        new: &NewManifest,
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
+        sqlx::query(
+            "INSERT INTO manifests
+                 (repository, digest, size, media_type, artifact_type, annotations, subject, pushed_at_ms)
+             VALUES ($1, $2, $3, $4, $5, $6, $7, $8)
+             ON CONFLICT (repository, digest) DO UPDATE
+             SET media_type = excluded.media_type, artifact_type = excluded.artifact_type",
+        )
+        .bind(repository.as_str())
+        .bind(new.manifest.digest.to_string())
+        .bind(rows::stored(new.manifest.size))
+        .bind(&new.manifest.media_type)
+        .bind(new.artifact_type.as_ref())
+        .bind(rows::json(&new.annotations))
+        .bind(new.subject.as_ref())
+        .bind(rows::stored(now_ms))
+        .execute(self.connection())
+        .await?;
+        for part in &new.parts {
+            sqlx::query(
+                "INSERT INTO manifest_parts (repository, manifest, digest) VALUES ($1, $2, $3) ON CONFLICT DO NOTHING",
+            )
+            .bind(repository.as_str())
+            .bind(new.manifest.digest.to_string())
+            .bind(part.to_string())
+            .execute(self.connection())
+            .await?;
+        }
+        Ok(())
+    }
+
+    async fn point_tag(&mut self, repository: &RepositoryName, tag: &Tag, manifest: &Digest) -> Result<(), StoreError> {
+        sqlx::query(
+            "INSERT INTO tags (repository, tag, manifest) VALUES ($1, $2, $3)
+             ON CONFLICT (repository, tag) DO UPDATE SET manifest = excluded.manifest",
+        )
+        .bind(repository.as_str())
+        .bind(tag.as_str())
+        .bind(manifest.to_string())
+        .execute(self.connection())
+        .await?;
+        Ok(())
+    }
+
+    /// Another package that the version of this one means.
+    async fn other_of_version(&mut self, package: &PackageRef) -> Result<Option<Digest>, StoreError> {
+        let other: Option<String> = sqlx::query_scalar(
+            "SELECT t.manifest FROM tags t JOIN packages p ON p.name = t.repository AND p.manifest = t.manifest
+             WHERE t.repository = $1 AND t.tag = $2 AND t.manifest <> $3",
+        )
+        .bind(package.name.as_str())
+        .bind(package.version.as_str())
+        .bind(package.manifest.digest.to_string())
+        .fetch_optional(self.connection())
+        .await?;
+        other.map(|digest| rows::id("tags.manifest", &digest)).transpose()
+    }
+
+    /// Marks the package `outdated` as one whose version means `package` from now on, and that one as none.
+    async fn replace_package(&mut self, package: &PackageRef, outdated: &Digest) -> Result<(), StoreError> {
+        for (manifest, replaced_by) in [(outdated, Some(&package.manifest.digest)), (&package.manifest.digest, None)] {
+            sqlx::query("UPDATE packages SET replaced_by = $3 WHERE name = $1 AND manifest = $2")
+                .bind(package.name.as_str())
+                .bind(manifest.to_string())
+                .bind(replaced_by.map(Digest::to_string))
+                .execute(self.connection())
+                .await?;
+        }
+        Ok(())
+    }
+
+    /// A package that is pushed again keeps the time of its first push.
+    async fn insert_package(
+        &mut self,
+        package: &PackageRef,
+        task_manifest: &TaskManifest,
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
+        sqlx::query(
+            "INSERT INTO packages (name, manifest, package, task_manifest, pushed_at_ms) VALUES ($1, $2, $3, $4, $5)
+             ON CONFLICT DO NOTHING",
+        )
+        .bind(package.name.as_str())
+        .bind(package.manifest.digest.to_string())
+        .bind(rows::json(package))
+        .bind(rows::json(task_manifest))
+        .bind(rows::stored(now_ms))
+        .execute(self.connection())
+        .await?;
+        Ok(())
+    }
+}
+
+/// Packages, and whether a tag points to each: what is stored for one order alone, as by `taskd run`, has none.
+pub(in crate::store) const PACKAGE_ROWS: &str = "SELECT p.package, p.task_manifest, p.pushed_at_ms,
+    (SELECT COUNT(*) FROM tags t WHERE t.repository = p.name AND t.manifest = p.manifest) AS tags FROM packages p";
+
+/// Those with a tag before the others, each the newest first: so that a name or a version means what was pushed under it.
+pub(in crate::store) fn ranked(rows: &[AnyRow]) -> Result<Vec<PackageView>, StoreError> {
+    let views = rows.iter().map(|row| Ok((row.try_get::<i64, _>("tags")? == 0, package_view(row)?)));
+    let mut views = views.collect::<Result<Vec<_>, StoreError>>()?;
+    views.sort_by_key(|(is_bare, view)| (*is_bare, Reverse(view.pushed_at_ms), view.package.manifest.digest));
+    Ok(views.into_iter().map(|(_, view)| view).collect())
+}
+
+pub(in crate::store) fn package_view(row: &AnyRow) -> Result<PackageView, StoreError> {
+    Ok(PackageView {
+        package: rows::from_json("packages.package", row.try_get("package")?)?,
+        pushed_at_ms: rows::number(row.try_get("pushed_at_ms")?),
+        manifest: rows::from_json("packages.task_manifest", row.try_get("task_manifest")?)?,
+    })
+}

@@ -1,0 +1,228 @@
+//! What publishers have signed: envelopes about packages, and their lists. The registry holds the bytes; here is which
+//! robots are told of which. Nothing is verified here.
+
+use std::collections::{BTreeSet, HashMap};
+
+use sqlx::any::AnyRow;
+use sqlx::{AssertSqlSafe, Row as _};
+use task_proto::desired::{BlobRef, Evidence, SignatureRef};
+use task_proto::publisher::{MAX_LISTS, MAX_SIGNATURES};
+use task_proto::{Digest, RepositoryName, RobotId, TaskName};
+
+use crate::store::{DesiredTasks, Store, StoreError, Write, rows};
+
+/// A signed document that a manifest brings, besides what any manifest has.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum SignedDocument {
+    /// An envelope about the package with this manifest.
+    Signature {
+        /// The package.
+        package: Digest,
+        /// The envelope.
+        envelope: BlobRef,
+    },
+    /// A list of publishers.
+    List {
+        /// Its version.
+        version: u64,
+        /// The envelope.
+        envelope: BlobRef,
+        /// Whether its keepers are others than those of the one before.
+        changes_keepers: bool,
+    },
+}
+
+impl Store {
+    /// The list of publishers with this version, or the newest.
+    pub async fn publisher_list(&self, version: Option<u64>) -> Result<Option<BlobRef>, StoreError> {
+        let sql =
+            "SELECT envelope, size FROM publisher_lists WHERE version = $1 OR $1 < 0 ORDER BY version DESC LIMIT 1";
+        let row = sqlx::query(sql).bind(version.map_or(-1, rows::stored)).fetch_optional(&self.reads).await?;
+        row.as_ref().map(|row| envelope("publisher_lists.envelope", row)).transpose()
+    }
+
+    /// Whether the blob is something signed that `robot` may have to look at: a list of publishers, or a signature of a
+    /// package it should have.
+    pub async fn is_evidence_for(&self, robot: &RobotId, blob: &Digest) -> Result<bool, StoreError> {
+        let packages: Vec<String> = sqlx::query_scalar(
+            "SELECT package FROM signatures WHERE envelope = $1
+             UNION ALL SELECT CAST('' AS TEXT) FROM publisher_lists WHERE envelope = $1",
+        )
+        .bind(blob.to_string())
+        .fetch_all(&self.reads)
+        .await?;
+        if packages.iter().any(String::is_empty) {
+            return Ok(true);
+        }
+        if packages.is_empty() {
+            return Ok(false);
+        }
+        let wanted = self.desired_tasks(std::slice::from_ref(robot)).await?;
+        let mut manifests = wanted.iter().flat_map(|wanted| &wanted.tasks).map(|task| task.package.manifest.digest);
+        Ok(manifests.any(|manifest| packages.contains(&manifest.to_string())))
+    }
+
+    /// The robots that should have this version of the package.
+    pub async fn robots_with_package(&self, name: &TaskName, manifest: &Digest) -> Result<Vec<RobotId>, StoreError> {
+        let rows: Vec<String> = sqlx::query_scalar(
+            "SELECT DISTINCT a.robot_id FROM assignments a JOIN deployments d ON d.id = a.deployment_id
+             WHERE a.desired = 1 AND d.task = $1 AND d.package LIKE $2",
+        )
+        .bind(name.as_str())
+        .bind(format!("%\"{manifest}\"%"))
+        .fetch_all(&self.reads)
+        .await?;
+        rows.iter().map(|row| rows::id("assignments.robot_id", row)).collect()
+    }
+
+    /// Adds to what robots should have who has signed it, and lets that ride along where anything does.
+    pub(in crate::store) async fn add_evidence(&self, found: &mut [DesiredTasks]) -> Result<(), StoreError> {
+        let lists = self.lists_to_follow().await?;
+        let manifests: BTreeSet<Digest> =
+            found.iter().flat_map(|found| &found.tasks).map(|task| task.package.manifest.digest).collect();
+        let signatures = self.signatures(&manifests).await?;
+        for wanted in found {
+            let mut evidence = Evidence { lists: lists.clone(), signatures: Vec::new() };
+            for task in &wanted.tasks {
+                let manifest = task.package.manifest.digest;
+                let envelopes = signatures.get(&manifest).into_iter().flatten();
+                evidence.signatures.extend(envelopes.map(|envelope| SignatureRef { manifest, envelope: *envelope }));
+            }
+            if !wanted.along.is_empty() {
+                // First: without them all else is of no use.
+                wanted.along.splice(0..0, evidence.blobs());
+            }
+            wanted.evidence = evidence;
+        }
+        Ok(())
+    }
+
+    /// The lists that a robot may need to get to the newest, from whichever it has.
+    async fn lists_to_follow(&self) -> Result<Vec<BlobRef>, StoreError> {
+        if let Some(lists) = self.access.lists() {
+            return Ok(lists);
+        }
+        let asked = self.access.ask();
+        let rows = sqlx::query(
+            "SELECT envelope, size FROM publisher_lists
+             WHERE changes_keepers = 1 OR version = (SELECT MAX(version) FROM publisher_lists)
+             ORDER BY version DESC LIMIT $1",
+        )
+        .bind(rows::stored(MAX_LISTS as u64))
+        .fetch_all(&self.reads)
+        .await?;
+        let lists = rows.iter().rev().map(|row| envelope("publisher_lists.envelope", row));
+        let lists = lists.collect::<Result<Vec<_>, _>>()?;
+        self.access.remember_lists(asked, &lists);
+        Ok(lists)
+    }
+
+    /// The first envelopes about each of these packages.
+    async fn signatures(&self, manifests: &BTreeSet<Digest>) -> Result<HashMap<Digest, Vec<BlobRef>>, StoreError> {
+        let asked = self.access.ask();
+        let mut signatures: HashMap<Digest, Vec<BlobRef>> = HashMap::new();
+        let mut unknown = Vec::new();
+        for manifest in manifests {
+            match self.access.signatures(manifest) {
+                Some(known) => drop(signatures.insert(*manifest, known)),
+                None => unknown.push(*manifest),
+            }
+        }
+        for group in rows::groups(&unknown) {
+            let mut query = sqlx::query(AssertSqlSafe(format!(
+                "SELECT package, envelope, size FROM signatures WHERE package IN ({}) ORDER BY pushed_at_ms, manifest",
+                rows::values(1, group.len(), &["TEXT"])
+            )));
+            for manifest in group {
+                query = query.bind(manifest.to_string());
+            }
+            for row in query.fetch_all(&self.reads).await? {
+                let package: Digest = rows::id("signatures.package", row.try_get("package")?)?;
+                let of_package = signatures.entry(package).or_default();
+                let found = envelope("signatures.envelope", &row)?;
+                if of_package.len() < MAX_SIGNATURES && !of_package.contains(&found) {
+                    of_package.push(found);
+                }
+            }
+        }
+        for manifest in unknown {
+            self.access.remember_signatures(asked, manifest, signatures.get(&manifest).cloned().unwrap_or_default());
+        }
+        Ok(signatures)
+    }
+}
+
+impl Write {
+    /// Notes a signed document. False if it is a list that is not newer than all there are.
+    pub(in crate::store) async fn insert_document(
+        &mut self,
+        repository: &RepositoryName,
+        manifest: &Digest,
+        document: &SignedDocument,
+        now_ms: u64,
+    ) -> Result<bool, StoreError> {
+        match document {
+            SignedDocument::Signature { package, envelope } => {
+                sqlx::query(
+                    "INSERT INTO signatures (repository, manifest, package, envelope, size, pushed_at_ms)
+                     VALUES ($1, $2, $3, $4, $5, $6) ON CONFLICT DO NOTHING",
+                )
+                .bind(repository.as_str())
+                .bind(manifest.to_string())
+                .bind(package.to_string())
+                .bind(envelope.digest.to_string())
+                .bind(rows::stored(envelope.size))
+                .bind(rows::stored(now_ms))
+                .execute(self.connection())
+                .await?;
+                Ok(true)
+            }
+            SignedDocument::List { version, envelope, changes_keepers } => {
+                let known: Option<String> = sqlx::query_scalar(
+                    "SELECT envelope FROM publisher_lists WHERE version >= $1 ORDER BY version LIMIT 1",
+                )
+                .bind(rows::stored(*version))
+                .fetch_optional(self.connection())
+                .await?;
+                if let Some(known) = known {
+                    return Ok(known == envelope.digest.to_string());
+                }
+                sqlx::query(
+                    "INSERT INTO publisher_lists (version, manifest, envelope, size, changes_keepers)
+                     VALUES ($1, $2, $3, $4, $5)",
+                )
+                .bind(rows::stored(*version))
+                .bind(manifest.to_string())
+                .bind(envelope.digest.to_string())
+                .bind(rows::stored(envelope.size))
+                .bind(i64::from(*changes_keepers))
+                .execute(self.connection())
+                .await?;
+                Ok(true)
+            }
+        }
+    }
+
+    /// Forgets the signed document that a manifest brought.
+    pub(in crate::store) async fn delete_document(
+        &mut self,
+        repository: &RepositoryName,
+        manifest: &Digest,
+    ) -> Result<(), StoreError> {
+        sqlx::query("DELETE FROM signatures WHERE repository = $1 AND manifest = $2")
+            .bind(repository.as_str())
+            .bind(manifest.to_string())
+            .execute(self.connection())
+            .await?;
+        if repository.as_str() == task_proto::publisher::LIST_REPOSITORY {
+            let delete = sqlx::query("DELETE FROM publisher_lists WHERE manifest = $1").bind(manifest.to_string());
+            delete.execute(self.connection()).await?;
+        }
+        Ok(())
+    }
+}
+
+fn envelope(column: &'static str, row: &AnyRow) -> Result<BlobRef, StoreError> {
+    let digest = rows::id(column, row.try_get("envelope")?)?;
+    Ok(BlobRef { digest, size: rows::number(row.try_get("size")?) })
+}

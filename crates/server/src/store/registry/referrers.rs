@@ -1,0 +1,88 @@
+//! Which manifests refer to one, a page at a time: anything may have any number of them, and each says of itself what it likes.
+
+use sqlx::Row as _;
+use sqlx::any::AnyRow;
+use task_proto::desired::BlobRef;
+use task_proto::oci::Descriptor;
+use task_proto::{Digest, RepositoryName};
+
+use crate::store::{Store, StoreError, rows};
+
+/// About the most bytes of a page as JSON, unless its first entry alone has more.
+const MAX_PAGE_BYTES: u64 = 4 * 1024 * 1024;
+/// What an entry has at most besides its texts, in bytes.
+const ENTRY_BYTES: u64 = 256;
+
+/// Some of the manifests that refer to one.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct ReferrersPage {
+    /// Sorted by digest.
+    pub manifests: Vec<Descriptor>,
+    /// The last of them, if there are more.
+    pub next: Option<Digest>,
+}
+
+impl Store {
+    /// The manifests whose subject is `subject`, of one type or of all: those after a digest, or the first.
+    pub async fn referrers(
+        &self,
+        repository: &RepositoryName,
+        subject: &str,
+        artifact_type: Option<&str>,
+        after: Option<&Digest>,
+    ) -> Result<ReferrersPage, StoreError> {
+        let artifact_type = artifact_type.unwrap_or_default();
+        let after = after.map_or_else(String::new, Digest::to_string);
+        // First how much each has to say, for all of it may be more than fits into memory.
+        let sizes: Vec<(String, i64)> = sqlx::query_as(
+            "SELECT digest, CAST(octet_length(annotations) + octet_length(media_type)
+                 + octet_length(COALESCE(artifact_type, '')) AS BIGINT) FROM manifests
+             WHERE repository = $1 AND subject = $2 AND ($3 = '' OR artifact_type = $3) AND digest > $4
+             ORDER BY digest LIMIT $5",
+        )
+        .bind(repository.as_str())
+        .bind(subject)
+        .bind(artifact_type)
+        .bind(&after)
+        .bind(rows::stored(MAX_PAGE_BYTES / ENTRY_BYTES + 1))
+        .fetch_all(&self.reads)
+        .await?;
+        let Some((last, has_more)) = page_end(&sizes) else { return Ok(ReferrersPage::default()) };
+        let found = sqlx::query(
+            "SELECT digest, size, media_type, artifact_type, annotations FROM manifests
+             WHERE repository = $1 AND subject = $2 AND ($3 = '' OR artifact_type = $3) AND digest > $4 AND digest <= $5
+             ORDER BY digest",
+        )
+        .bind(repository.as_str())
+        .bind(subject)
+        .bind(artifact_type)
+        .bind(&after)
+        .bind(last)
+        .fetch_all(&self.reads)
+        .await?;
+        let next = if has_more { Some(rows::id("manifests.digest", last)?) } else { None };
+        Ok(ReferrersPage { manifests: found.iter().map(descriptor).collect::<Result<_, _>>()?, next })
+    }
+}
+
+/// The last entry of a page that begins with the first of these, and whether there are more; `None` if there is nothing.
+fn page_end(sizes: &[(String, i64)]) -> Option<(&str, bool)> {
+    let mut bytes = 0;
+    let fitting = sizes.iter().take_while(|(_, size)| {
+        bytes += ENTRY_BYTES + rows::number(*size);
+        bytes <= MAX_PAGE_BYTES
+    });
+    let count = fitting.count().max(1);
+    let (last, _) = sizes.get(count - 1)?;
+    Some((last.as_str(), sizes.len() > count))
+}
+
+fn descriptor(row: &AnyRow) -> Result<Descriptor, StoreError> {
+    let digest = rows::id("manifests.digest", row.try_get("digest")?)?;
+    let blob = BlobRef { digest, size: rows::number(row.try_get("size")?) };
+    Ok(Descriptor {
+        artifact_type: row.try_get("artifact_type")?,
+        annotations: rows::from_json("manifests.annotations", row.try_get("annotations")?)?,
+        ..Descriptor::new(row.try_get("media_type")?, blob)
+    })
+}

@@ -1,0 +1,143 @@
+//! How many bytes each robot keeps on the server's disk: of blobs and manifests in its repositories, from when they are there
+//! until they are collected. It knows no limit.
+
+use std::collections::BTreeMap;
+
+use task_proto::desired::BlobRef;
+use task_proto::output::{OutputSet, owner};
+use task_proto::{Digest, RepositoryName, RobotId};
+
+use crate::store::{Store, StoreError, Write, rows};
+
+/// What the smallest file counts: there is more to keeping it than its bytes.
+const LEAST_BYTES: u64 = 64 * 1024;
+
+/// What one takes on the disk with its manifest and config, small files counted as [`LEAST_BYTES`] each, in bytes.
+pub fn bytes_taken(output: &OutputSet) -> u64 {
+    let blobs: BTreeMap<Digest, u64> = output.files.iter().map(|file| (file.blob.digest, file.blob.size)).collect();
+    blobs.values().fold(2 * LEAST_BYTES, |sum, size| sum.saturating_add((*size).max(LEAST_BYTES)))
+}
+
+impl Store {
+    /// Counts a manifest or a blob among what its robot takes, if the repository is a robot's.
+    pub async fn count_blob(&self, repository: &RepositoryName, blob: &BlobRef) -> Result<(), StoreError> {
+        if owner(repository).is_none() {
+            return Ok(());
+        }
+        let mut write = self.begin().await?;
+        write.count_blob(repository, blob).await?;
+        write.commit().await
+    }
+
+    /// Bytes that are kept of what a robot has brought, small files counted as [`LEAST_BYTES`] each.
+    pub async fn bytes_of_robot(&self, robot: &RobotId) -> Result<u64, StoreError> {
+        let bytes: Option<i64> = sqlx::query_scalar("SELECT bytes FROM robot_bytes WHERE robot_id = $1")
+            .bind(robot.as_str())
+            .fetch_optional(&self.reads)
+            .await?;
+        Ok(rows::number(bytes.unwrap_or(0)))
+    }
+
+    /// Blobs of manifests that robots had and have no more, and that nobody is known to be about to list. Others' manifests
+    /// may need them.
+    pub async fn blobs_dropped_by_robots(&self) -> Result<Vec<Digest>, StoreError> {
+        let texts: Vec<String> = sqlx::query_scalar(
+            "SELECT DISTINCT d.digest FROM robot_blobs d WHERE d.dropped = 1
+             AND NOT EXISTS (SELECT 1 FROM robot_blobs b WHERE b.digest = d.digest AND b.dropped = 0)
+             AND NOT EXISTS (SELECT 1 FROM repository_blobs r
+                             WHERE r.digest = d.digest AND r.repository NOT LIKE 'outputs/%')",
+        )
+        .fetch_all(&self.reads)
+        .await?;
+        texts.iter().map(|text| rows::id("robot_blobs.digest", text)).collect()
+    }
+}
+
+impl Write {
+    /// Notes that a manifest is about to be no more, if the repository is a robot's.
+    pub(in crate::store) async fn drop_of_robot(
+        &mut self,
+        repository: &RepositoryName,
+        manifest: &Digest,
+    ) -> Result<(), StoreError> {
+        let Some((robot, _)) = owner(repository) else { return Ok(()) };
+        sqlx::query(
+            "UPDATE robot_blobs SET dropped = 1 WHERE robot_id = $1 AND (digest = $2 OR digest IN
+                 (SELECT digest FROM manifest_parts WHERE repository = $3 AND manifest = $2))",
+        )
+        .bind(robot.as_str())
+        .bind(manifest.to_string())
+        .bind(repository.as_str())
+        .execute(self.connection())
+        .await?;
+        Ok(())
+    }
+
+    /// As [`Store::count_blob`]. What is counted once stays so until the blob is collected: whether it was already.
+    pub(in crate::store) async fn count_blob(
+        &mut self,
+        repository: &RepositoryName,
+        blob: &BlobRef,
+    ) -> Result<bool, StoreError> {
+        let Some((robot, _)) = owner(repository) else { return Ok(false) };
+        let known = sqlx::query("UPDATE robot_blobs SET dropped = 0 WHERE robot_id = $1 AND digest = $2")
+            .bind(robot.as_str())
+            .bind(blob.digest.to_string())
+            .execute(self.connection())
+            .await?;
+        if known.rows_affected() > 0 {
+            return Ok(true);
+        }
+        let bytes = rows::stored(blob.size.max(LEAST_BYTES));
+        sqlx::query("INSERT INTO robot_blobs (robot_id, digest, bytes) VALUES ($1, $2, $3)")
+            .bind(robot.as_str())
+            .bind(blob.digest.to_string())
+            .bind(bytes)
+            .execute(self.connection())
+            .await?;
+        self.add_to_robot(robot.as_str(), bytes).await?;
+        Ok(false)
+    }
+
+    /// Counts that a repository of a robot's got a blob that another of its has.
+    pub(in crate::store) async fn count_link(
+        &mut self,
+        repository: &RepositoryName,
+        blob: &BlobRef,
+    ) -> Result<(), StoreError> {
+        let Some((robot, _)) = owner(repository) else { return Ok(()) };
+        let bytes = rows::stored(LEAST_BYTES);
+        sqlx::query("UPDATE robot_blobs SET bytes = bytes + $1 WHERE robot_id = $2 AND digest = $3")
+            .bind(bytes)
+            .bind(robot.as_str())
+            .bind(blob.digest.to_string())
+            .execute(self.connection())
+            .await?;
+        self.add_to_robot(robot.as_str(), bytes).await
+    }
+
+    /// Counts a blob no more, for it is collected.
+    pub(in crate::store) async fn uncount_blob(&mut self, digest: &Digest) -> Result<(), StoreError> {
+        let counted: Vec<(String, i64)> =
+            sqlx::query_as("DELETE FROM robot_blobs WHERE digest = $1 RETURNING robot_id, bytes")
+                .bind(digest.to_string())
+                .fetch_all(self.connection())
+                .await?;
+        for (robot, bytes) in counted {
+            self.add_to_robot(&robot, -bytes).await?;
+        }
+        Ok(())
+    }
+
+    async fn add_to_robot(&mut self, robot: &str, bytes: i64) -> Result<(), StoreError> {
+        sqlx::query(
+            "INSERT INTO robot_bytes (robot_id, bytes) VALUES ($1, $2)
+             ON CONFLICT (robot_id) DO UPDATE SET bytes = robot_bytes.bytes + excluded.bytes",
+        )
+        .bind(robot)
+        .bind(bytes)
+        .execute(self.connection())
+        .await?;
+        Ok(())
+    }
+}

@@ -1,5 +1,8 @@
-//! The robot's property file, `agent.toml` in the data directory, and the `TASK_AGENT_*` variables above it:
-//! environment > file > defaults. Unknown keys are refused by name. It is read once, at start; it never holds a secret.
+//! The robot's settings: `agent.toml`, the `TASK_AGENT_*` variables above it, and the trusted
+//! publishers. They are read once, at start, and hold no secret.
+//!
+//! The environment wins over the file, the file over the defaults. Unknown keys are refused by
+//! name.
 
 pub mod settings;
 pub mod trust;
@@ -31,8 +34,8 @@ use crate::system::durable;
 pub const FILE_NAME: &str = "agent.toml";
 /// The longest time the gate may be given to answer, in seconds.
 pub const MAX_GATE_TIMEOUT_S: u64 = 300;
-/// The user ids of tasks and builds. Neither Debian nor systemd gives these to anybody, and they are below those that are
-/// handed out for containers.
+/// The user ids of tasks and builds. Neither Debian nor systemd gives these to anybody, and they
+/// are below those that are handed out for containers.
 const DEFAULT_TASK_UIDS: &str = "70000-79999";
 /// Below it are the system's own accounts.
 const MIN_TASK_UID: u32 = 1000;
@@ -62,7 +65,8 @@ pub struct Settings {
     /// Setup files that are sourced before a task is built or run. Absent: what is in `/opt/ros`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub underlays: Option<Vec<PathBuf>>,
-    /// The robot's own ROS workspace, whose setup file in `install` or `devel` is sourced after them.
+    /// The robot's own ROS workspace, whose setup file in `install` or `devel` is sourced after
+    /// them.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub workspace: Option<PathBuf>,
     /// Whether the server may name setup files also where `trusted_publishers` are named.
@@ -83,15 +87,16 @@ pub struct Settings {
     /// Seconds after which the robot says again how its machine does; 0: it does not say.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub vitals_interval_s: Option<u64>,
-    /// Whose groups the tasks of an agent that is root have, by name or number; absent: `taskd-task`. `root` must be said,
-    /// and then tasks run as root.
+    /// Whose groups the tasks of an agent that is root have, by name or number; absent:
+    /// `taskd-task`. `root` must be said, and then tasks run as root.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub task_user: Option<String>,
-    /// Whether builds and tasks are denied system calls that only an administrator needs; absent: where they run under an
-    /// account of their own.
+    /// Whether builds and tasks are denied system calls that only an administrator needs; absent:
+    /// where they run under an account of their own.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub seccomp: Option<Seccomp>,
-    /// The user ids that tasks and builds run under, `FIRST-LAST`; `none`: all of them under `task_user`.
+    /// The user ids that tasks and builds run under, `FIRST-LAST`; `none`: all of them under
+    /// `task_user`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub task_uids: Option<String>,
     /// The labels the robot gives itself; the server's win.
@@ -121,7 +126,8 @@ pub struct PublisherSettings {
     /// Of how many of them.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub threshold: Option<u32>,
-    /// Whose signatures the first list of publishers needs; absent: the same keys, and as many of them.
+    /// Whose signatures the first list of publishers needs; absent: the same keys, and as many of
+    /// them.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub keeper_keys: Option<Vec<PublicKey>>,
     /// Of how many of them.
@@ -183,12 +189,18 @@ pub struct LogSettings {
     pub forward_lines_per_s: Option<u32>,
 }
 
-/// The `[limits]` table. A robot passes over what a newer server may limit; in its own file an unknown key is a slip.
-fn known_limits<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<RobotLimits>, D::Error> {
+/// The `[limits]` table. A robot passes over what a newer server may limit; in its own file an
+/// unknown key is a slip.
+fn known_limits<'de, D: Deserializer<'de>>(
+    deserializer: D,
+) -> Result<Option<RobotLimits>, D::Error> {
     let table = Table::deserialize(deserializer)?;
     let known = RobotLimits::default().bounds().map(|(key, ..)| key.trim_start_matches("limits."));
     if let Some(key) = table.keys().find(|key| !known.contains(&key.as_str())) {
-        return Err(D::Error::custom(format_args!("unknown field `{key}`, expected one of {}", known.join(", "))));
+        return Err(D::Error::custom(format_args!(
+            "unknown field `{key}`, expected one of {}",
+            known.join(", ")
+        )));
     }
     table.try_into().map(Some).map_err(D::Error::custom)
 }
@@ -254,7 +266,8 @@ pub struct Config {
     pub task_pids: u64,
     /// Versions that are prepared at the same time.
     pub parallel_tasks: usize,
-    /// Who is asked before a task is started, stopped or switched; nobody unless a program is named.
+    /// Who is asked before a task is started, stopped or switched; nobody unless a program is
+    /// named.
     pub gate: Option<GateConfig>,
     /// Whose packages are run; `None`: whatever the server orders.
     pub trust: Option<TrustSettings>,
@@ -293,16 +306,21 @@ impl Settings {
         let path = data_dir.join(FILE_NAME);
         let mut text =
             "# The robot's settings. task-agent configure asks for them; TASK_AGENT_* variables win.\n".to_owned();
-        let body = toml::to_string(self).map_err(|error| invalid(&path.display().to_string(), &error))?;
+        let body =
+            toml::to_string(self).map_err(|error| invalid(&path.display().to_string(), &error))?;
         // Writing to a String can't fail.
         let _ = write!(text, "{body}");
-        durable::write(&path, text.as_bytes(), 0o644).map_err(|source| ConfigError::Io { path, source })
+        durable::write(&path, text.as_bytes(), 0o644)
+            .map_err(|source| ConfigError::Io { path, source })
     }
 }
 
 impl Config {
     /// The settings of `data_dir` under `variables`, normally the process's environment.
-    pub fn load(data_dir: &Path, variables: impl Iterator<Item = (OsString, OsString)>) -> Result<Self, ConfigError> {
+    pub fn load(
+        data_dir: &Path,
+        variables: impl Iterator<Item = (OsString, OsString)>,
+    ) -> Result<Self, ConfigError> {
         let path = data_dir.join(FILE_NAME);
         let mut table = read_table(&path)?;
         // The file first, alone, so that an error names where it is.
@@ -310,7 +328,8 @@ impl Config {
         let mut ros_domain_id = None;
         let mut given = BTreeSet::new();
         for (name, value) in variables {
-            // Others may hold any bytes. In a setting's value a wrong character becomes one that its type refuses.
+            // Others may hold any bytes. In a setting's value a wrong character becomes one that
+            // its type refuses.
             let (name, value) = (name.to_string_lossy(), value.to_string_lossy());
             if name == ROS_DOMAIN_ID && !value.is_empty() {
                 ros_domain_id = Some(parse_ros_domain_id(&value)?);
@@ -326,9 +345,13 @@ impl Config {
         settings.ros_domain_id = settings.ros_domain_id.or(ros_domain_id);
         Self::from_settings(settings).map_err(|error| match error {
             ConfigError::Invalid { origin: key, reason } => {
-                let variable = format!("{VARIABLE_PREFIX}{}", key.replace('.', "_").to_ascii_uppercase());
+                let variable =
+                    format!("{VARIABLE_PREFIX}{}", key.replace('.', "_").to_ascii_uppercase());
                 let in_file = || format!("{key} in {}", path.display());
-                ConfigError::Invalid { origin: given.take(&variable).unwrap_or_else(in_file), reason }
+                ConfigError::Invalid {
+                    origin: given.take(&variable).unwrap_or_else(in_file),
+                    reason,
+                }
             }
             other => other,
         })
@@ -352,7 +375,9 @@ impl Config {
             server_underlays: settings.server_underlays.unwrap_or(false),
             ros_domain_id: settings.ros_domain_id,
             poll_interval: Duration::from_secs(settings.poll_interval_s.unwrap_or(300)),
-            poll_interval_without_mqtt: Duration::from_secs(settings.poll_interval_without_mqtt_s.unwrap_or(10)),
+            poll_interval_without_mqtt: Duration::from_secs(
+                settings.poll_interval_without_mqtt_s.unwrap_or(10),
+            ),
             token_lifetime: Duration::from_secs(settings.token_lifetime_s.unwrap_or(30 * 86_400)),
             vitals_interval: Duration::from_secs(settings.vitals_interval_s.unwrap_or(60)),
             parallel_tasks: limits.parallel_tasks.map_or(2, count),
@@ -367,12 +392,27 @@ impl Config {
             own_forward_level: logs.forward_level,
         };
         let bounds = [
-            ("ros_domain_id", u64::from(config.ros_domain_id.unwrap_or(0)), 0, u64::from(MAX_ROS_DOMAIN_ID)),
+            (
+                "ros_domain_id",
+                u64::from(config.ros_domain_id.unwrap_or(0)),
+                0,
+                u64::from(MAX_ROS_DOMAIN_ID),
+            ),
             ("poll_interval_s", config.poll_interval.as_secs(), 1, 86_400),
-            ("poll_interval_without_mqtt_s", config.poll_interval_without_mqtt.as_secs(), 1, 86_400),
+            (
+                "poll_interval_without_mqtt_s",
+                config.poll_interval_without_mqtt.as_secs(),
+                1,
+                86_400,
+            ),
             ("token_lifetime_s", config.token_lifetime.as_secs(), 3600, 3650 * 86_400),
             ("vitals_interval_s", config.vitals_interval.as_secs(), 0, 86_400),
-            ("gate.timeout_s", config.gate.as_ref().map_or(1, |gate| gate.timeout.as_secs()), 1, MAX_GATE_TIMEOUT_S),
+            (
+                "gate.timeout_s",
+                config.gate.as_ref().map_or(1, |gate| gate.timeout.as_secs()),
+                1,
+                MAX_GATE_TIMEOUT_S,
+            ),
             ("logs.forward_lines_per_s", u64::from(config.forward.lines_per_s), 0, 1000),
         ];
         if config.workspace.as_deref().is_some_and(|workspace| !workspace.is_absolute()) {
@@ -380,7 +420,8 @@ impl Config {
             return Err(ConfigError::Invalid { origin: "workspace".to_owned(), reason });
         }
         let limits = config.limits.bounds().into_iter();
-        let limits = limits.filter_map(|(key, value, least, most)| Some((key, value?, least, most)));
+        let limits =
+            limits.filter_map(|(key, value, least, most)| Some((key, value?, least, most)));
         for (key, value, least, most) in bounds.into_iter().chain(limits) {
             if value < least || value > most {
                 let reason = format!("{value} is not between {least} and {most}");
@@ -404,7 +445,8 @@ fn task_uids(text: &str) -> Result<Option<RangeInclusive<u32>>, ConfigError> {
     if text.trim() == "none" {
         return Ok(None);
     }
-    let ends = text.split_once('-').map(|(first, last)| (first.trim().parse(), last.trim().parse()));
+    let ends =
+        text.split_once('-').map(|(first, last)| (first.trim().parse(), last.trim().parse()));
     let range = ends.and_then(|(first, last)| Some(first.ok()?..=last.ok()?));
     let is_usable = |range: &RangeInclusive<u32>| {
         let (first, last) = (*range.start(), *range.end());
@@ -439,7 +481,10 @@ fn trust(settings: PublisherSettings) -> Result<TrustSettings, ConfigError> {
             } else {
                 format!("{key}keys")
             };
-            ConfigError::Invalid { origin: format!("trusted_publishers.{key}"), reason: error.to_string() }
+            ConfigError::Invalid {
+                origin: format!("trusted_publishers.{key}"),
+                reason: error.to_string(),
+            }
         };
         Role::new(keys, threshold).map_err(invalid)
     };
@@ -454,7 +499,8 @@ fn trust(settings: PublisherSettings) -> Result<TrustSettings, ConfigError> {
 /// A server's URL as people write it.
 pub fn parse_server(text: &str) -> Result<reqwest::Url, ConfigError> {
     let fault = |reason: String| ConfigError::Invalid { origin: "server".to_owned(), reason };
-    let is_servers = |url: &reqwest::Url| matches!(url.scheme(), "http" | "https") && url.host_str().is_some();
+    let is_servers =
+        |url: &reqwest::Url| matches!(url.scheme(), "http" | "https") && url.host_str().is_some();
     let url = text.parse().ok().filter(is_servers);
     url.ok_or_else(|| fault(format!("{text:?} is no URL of a server like https://server:8080")))
 }
@@ -463,9 +509,8 @@ pub fn parse_server(text: &str) -> Result<reqwest::Url, ConfigError> {
 fn override_by(table: &mut Table, name: &str, text: &str) -> Result<(), ConfigError> {
     let key = name[VARIABLE_PREFIX.len()..].to_ascii_lowercase();
     let value = match key.as_str() {
-        "server" | "name" | "task_user" | "task_uids" | "seccomp" | "mqtt_transport" | "workspace" => {
-            Value::String(text.to_owned())
-        }
+        "server" | "name" | "task_user" | "task_uids" | "seccomp" | "mqtt_transport"
+        | "workspace" => Value::String(text.to_owned()),
         "gate_command" => Value::Array(vec![Value::String(text.to_owned())]),
         "trusted_publishers_keys" | "trusted_publishers_keeper_keys" => {
             let keys = text.split(',').map(str::trim).filter(|key| !key.is_empty());
@@ -476,11 +521,17 @@ fn override_by(table: &mut Table, name: &str, text: &str) -> Result<(), ConfigEr
             Value::Array(paths.map(|path| Value::String(path.to_owned())).collect())
         }
         "labels" => {
-            let pairs = text.split(',').filter(|pair| !pair.is_empty()).map(|pair| pair.split_once('='));
-            let labels: Option<Table> =
-                pairs.map(|pair| pair.map(|(key, value)| (key.to_owned(), Value::String(value.to_owned())))).collect();
+            let pairs =
+                text.split(',').filter(|pair| !pair.is_empty()).map(|pair| pair.split_once('='));
+            let labels: Option<Table> = pairs
+                .map(|pair| {
+                    pair.map(|(key, value)| (key.to_owned(), Value::String(value.to_owned())))
+                })
+                .collect();
             let reason = "expected key=value,key=value".to_owned();
-            Value::Table(labels.ok_or_else(|| ConfigError::Invalid { origin: name.to_owned(), reason })?)
+            Value::Table(
+                labels.ok_or_else(|| ConfigError::Invalid { origin: name.to_owned(), reason })?,
+            )
         }
         _ => scalar(text),
     };
@@ -489,7 +540,9 @@ fn override_by(table: &mut Table, name: &str, text: &str) -> Result<(), ConfigEr
         .find_map(|outer| Some((*outer, key.strip_prefix(outer)?.strip_prefix('_')?)));
     match nested {
         Some((outer, inner)) => {
-            if let Value::Table(table) = table.entry(outer).or_insert_with(|| Value::Table(Table::new())) {
+            if let Value::Table(table) =
+                table.entry(outer).or_insert_with(|| Value::Table(Table::new()))
+            {
                 table.insert(inner.to_owned(), value);
             }
         }
@@ -503,12 +556,16 @@ fn override_by(table: &mut Table, name: &str, text: &str) -> Result<(), ConfigEr
 /// A number or a truth value where it is one, else text, which the key's type then refuses by name.
 fn scalar(text: &str) -> Value {
     let number = text.parse().map(Value::Integer).ok();
-    number.or_else(|| text.parse().map(Value::Boolean).ok()).unwrap_or_else(|| Value::String(text.to_owned()))
+    number
+        .or_else(|| text.parse().map(Value::Boolean).ok())
+        .unwrap_or_else(|| Value::String(text.to_owned()))
 }
 
 fn read_table(path: &Path) -> Result<Table, ConfigError> {
     match std::fs::read_to_string(path) {
-        Ok(text) => text.parse::<Table>().map_err(|error| invalid(&path.display().to_string(), &error)),
+        Ok(text) => {
+            text.parse::<Table>().map_err(|error| invalid(&path.display().to_string(), &error))
+        }
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(Table::new()),
         Err(source) => Err(ConfigError::Io { path: path.to_owned(), source }),
     }
@@ -541,7 +598,8 @@ mod tests {
 
     #[test]
     fn environment_beats_file_beats_defaults() {
-        let file = "mqtt = true\nros_domain_id = 3\n[limits]\nlog_bytes = 5000\nbuild_timeout_s = 9\n";
+        let file =
+            "mqtt = true\nros_domain_id = 3\n[limits]\nlog_bytes = 5000\nbuild_timeout_s = 9\n";
         let variables = [
             ("TASK_AGENT_MQTT", "false"),
             ("TASK_AGENT_UNDERLAYS", "/opt/ros/jazzy/setup.bash:/ws/install/setup.bash"),
@@ -562,16 +620,23 @@ mod tests {
 
     #[test]
     fn the_domain_is_the_setting_or_what_the_agent_was_started_with() {
-        let domain = |file: &str, variables: &[(&str, &str)]| load(file, variables).expect("valid").ros_domain_id;
+        let domain = |file: &str, variables: &[(&str, &str)]| {
+            load(file, variables).expect("valid").ros_domain_id
+        };
         assert_eq!(domain("", &[("ROS_DOMAIN_ID", "7")]), Some(7));
         assert_eq!(domain("ros_domain_id = 3\n", &[("ROS_DOMAIN_ID", "7")]), Some(3));
-        assert_eq!(domain("", &[("TASK_AGENT_ROS_DOMAIN_ID", "0"), ("ROS_DOMAIN_ID", "7")]), Some(0));
+        assert_eq!(
+            domain("", &[("TASK_AGENT_ROS_DOMAIN_ID", "0"), ("ROS_DOMAIN_ID", "7")]),
+            Some(0)
+        );
         assert_eq!(domain("", &[("ROS_DOMAIN_ID", "")]), None);
     }
 
     #[test]
     fn what_is_wrong_is_named() {
-        let text = |file: &str, variables: &[(&str, &str)]| load(file, variables).expect_err("refused").to_string();
+        let text = |file: &str, variables: &[(&str, &str)]| {
+            load(file, variables).expect_err("refused").to_string()
+        };
         assert!(text("mqt = true\n", &[]).contains("mqt"));
         assert!(text("[limits]\nlogs = 1\n", &[]).contains("logs"));
         assert!(text("", &[("TASK_AGENT_MQT", "true")]).contains("TASK_AGENT_MQT"));
@@ -582,17 +647,27 @@ mod tests {
         assert!(text("poll_interval_s = 0\n", &[]).contains("poll_interval_s"));
         let low = text("[limits]\nlog_bytes = 1\n", &[]);
         assert!(
-            low.starts_with("limits.log_bytes in /") && low.contains("agent.toml: 1 is not between 4096 and "),
+            low.starts_with("limits.log_bytes in /")
+                && low.contains("agent.toml: 1 is not between 4096 and "),
             "{low}"
         );
         let variable = "TASK_AGENT_LIMITS_PARALLEL_TASKS";
-        assert!(text("", &[(variable, "65")]).starts_with("TASK_AGENT_LIMITS_PARALLEL_TASKS: 65 is not between"));
+        assert!(
+            text("", &[(variable, "65")])
+                .starts_with("TASK_AGENT_LIMITS_PARALLEL_TASKS: 65 is not between")
+        );
         let typed = text("poll_interval_s = \"soon\"\n", &[]);
         assert!(typed.contains("expected a whole number\nin `poll_interval_s`"), "{typed}");
-        assert!(text("server = \"foo\"\n", &[]).contains("agent.toml: \"foo\" is no URL of a server like https://"));
+        assert!(
+            text("server = \"foo\"\n", &[])
+                .contains("agent.toml: \"foo\" is no URL of a server like https://")
+        );
         assert!(text("[logs]\nforward_level = \"loud\"\n", &[]).contains("forward_level"));
         let variable = "TASK_AGENT_LOGS_FORWARD_LINES_PER_S";
-        assert!(text("", &[(variable, "100000")]).starts_with("TASK_AGENT_LOGS_FORWARD_LINES_PER_S: 100000 is not"));
+        assert!(
+            text("", &[(variable, "100000")])
+                .starts_with("TASK_AGENT_LOGS_FORWARD_LINES_PER_S: 100000 is not")
+        );
     }
 
     #[test]
@@ -603,9 +678,21 @@ mod tests {
         assert_eq!(uids("task_uids = \"none\"\n").expect("valid"), None);
         let variable = load("", &[("TASK_AGENT_TASK_UIDS", "80000-80003")]).expect("valid");
         assert_eq!(variable.task_uids, Some(80_000..=80_003));
-        for bad in ["", "70000", "70001-70000", "70000-70000", "500-600", "65000-66000", "70000-99999999999", "a-b"] {
+        for bad in [
+            "",
+            "70000",
+            "70001-70000",
+            "70000-70000",
+            "500-600",
+            "65000-66000",
+            "70000-99999999999",
+            "a-b",
+        ] {
             let refused = uids(&format!("task_uids = {bad:?}\n")).expect_err(bad).to_string();
-            assert!(refused.starts_with("task_uids in /") && refused.contains("70000-79999"), "{refused}");
+            assert!(
+                refused.starts_with("task_uids in /") && refused.contains("70000-79999"),
+                "{refused}"
+            );
         }
     }
 
@@ -614,11 +701,21 @@ mod tests {
         let table = include_str!("../../../docs/agent.md");
         let missing = load("unknown = 1\n", &[]).expect_err("refused").to_string();
         let (_, keys) = missing.split_once("expected one of ").expect("all are named");
-        let keys = keys.lines().next().unwrap_or_default().split(", ").map(|key| key.trim_matches('`').to_owned());
-        let limits = RobotLimits::default().bounds().map(|(key, ..)| key.trim_start_matches("limits.").to_owned());
+        let keys = keys
+            .lines()
+            .next()
+            .unwrap_or_default()
+            .split(", ")
+            .map(|key| key.trim_matches('`').to_owned());
+        let limits = RobotLimits::default()
+            .bounds()
+            .map(|(key, ..)| key.trim_start_matches("limits.").to_owned());
         let mut count = 0;
         for key in keys.chain(limits) {
-            assert!(table.contains(&format!("`{key}`")) || table.contains(&format!("`[{key}]`")), "{key}");
+            assert!(
+                table.contains(&format!("`{key}`")) || table.contains(&format!("`[{key}]`")),
+                "{key}"
+            );
             count += 1;
         }
         assert!(count > 20, "{missing}");
@@ -628,9 +725,16 @@ mod tests {
     fn a_gate_is_a_program_by_its_absolute_path() {
         assert_eq!(load("", &[]).expect("valid").gate, None);
         let file = "[gate]\ncommand = [\"/opt/gate\", \"--battery\"]\ndefault = \"allow\"\n";
-        let gate = load(file, &[("TASK_AGENT_GATE_TIMEOUT_S", "3")]).expect("valid").gate.expect("one");
-        assert_eq!((gate.command.len(), gate.timeout.as_secs(), gate.default), (2, 3, GateDefault::Allow));
-        let gate = load("", &[("TASK_AGENT_GATE_COMMAND", "/opt/gate")]).expect("valid").gate.expect("one");
+        let gate =
+            load(file, &[("TASK_AGENT_GATE_TIMEOUT_S", "3")]).expect("valid").gate.expect("one");
+        assert_eq!(
+            (gate.command.len(), gate.timeout.as_secs(), gate.default),
+            (2, 3, GateDefault::Allow)
+        );
+        let gate = load("", &[("TASK_AGENT_GATE_COMMAND", "/opt/gate")])
+            .expect("valid")
+            .gate
+            .expect("one");
         assert_eq!((gate.timeout.as_secs(), gate.default), (10, GateDefault::Deny));
         let text = |file: &str| load(file, &[]).expect_err("refused").to_string();
         assert!(text("[gate]\ncommand = [\"gate\"]\n").contains("gate.command"));
@@ -642,8 +746,9 @@ mod tests {
     #[test]
     fn publishers_are_keys_and_how_many_of_them_it_takes() {
         assert_eq!(load("", &[]).expect("valid").trust, None);
-        let keys: Vec<String> =
-            [1, 2, 3].map(|seed| SigningKey::from_bytes([seed; 32]).public_key().to_string()).into();
+        let keys: Vec<String> = [1, 2, 3]
+            .map(|seed| SigningKey::from_bytes([seed; 32]).public_key().to_string())
+            .into();
         let table = |rest: &str| format!("[trusted_publishers]\nkeys = {:?}\n{rest}", &keys[..2]);
         let trust = load(&table("threshold = 2\n"), &[]).expect("valid").trust.expect("given");
         assert_eq!((trust.publishers.keys().len(), trust.publishers.threshold()), (2, 2));
@@ -655,7 +760,10 @@ mod tests {
             ("TASK_AGENT_TRUSTED_PUBLISHERS_REQUIRE_LIST", "true"),
         ];
         let trust = load("", &variables).expect("valid").trust.expect("given");
-        assert_eq!((trust.publishers.threshold(), trust.keepers.keys().len(), trust.requires_list), (1, 1, true));
+        assert_eq!(
+            (trust.publishers.threshold(), trust.keepers.keys().len(), trust.requires_list),
+            (1, 1, true)
+        );
         let text = |file: &str| load(file, &[]).expect_err("refused").to_string();
         for (file, key, reason) in [
             ("[trusted_publishers]\n", "keys", "0 keys"),
@@ -663,17 +771,25 @@ mod tests {
             (&table("keeper_threshold = 1\n"), "keeper_keys", "0 keys"),
         ] {
             let text = text(file);
-            assert!(text.starts_with(&format!("trusted_publishers.{key} in ")) && text.contains(reason), "{text}");
+            assert!(
+                text.starts_with(&format!("trusted_publishers.{key} in ")) && text.contains(reason),
+                "{text}"
+            );
         }
-        assert!(text("[trusted_publishers]\nkeys = [\"ssh-ed25519 AAAA\"]\n").contains("not an ed25519 public key"));
+        assert!(
+            text("[trusted_publishers]\nkeys = [\"ssh-ed25519 AAAA\"]\n")
+                .contains("not an ed25519 public key")
+        );
         assert!(text(&table("treshold = 1\n")).contains("treshold"));
     }
 
     #[test]
     fn a_written_file_reads_back() {
         let dir = tempfile::tempdir().expect("a directory");
-        let publishers =
-            PublisherSettings { keys: Some(vec![SigningKey::from_bytes([1; 32]).public_key()]), ..Default::default() };
+        let publishers = PublisherSettings {
+            keys: Some(vec![SigningKey::from_bytes([1; 32]).public_key()]),
+            ..Default::default()
+        };
         let settings = Settings {
             trusted_publishers: Some(publishers),
             server: Some("http://server:8080".to_owned()),

@@ -1,6 +1,8 @@
-//! What tasks say: kept on the robot in files that never grow beyond their limit, read back on demand. A line is stored
-//! as it came, behind the time and a letter for where it came from (see [`record`]); what its level is and which node said
-//! it is found out on reading, where control characters end as well.
+//! Log files of tasks: written within a limit, read back on demand, forwarded to the server. They
+//! never grow beyond their limit.
+//!
+//! A line is stored as it came, behind the time and a letter for its stream (see [`record`]). The
+//! level and the node are found when the line is read, where control characters end as well.
 
 pub mod archive;
 pub mod capture;
@@ -79,7 +81,9 @@ impl Logs {
 
     /// The newest lines that are wanted and fit into an answer, the oldest first.
     pub async fn kept(&self, wanted: Wanted) -> Result<Vec<LogLine>, NoSuchTask> {
-        if let Some(task) = wanted.task.as_ref().filter(|task| !self.data.task(task).root().exists()) {
+        if let Some(task) =
+            wanted.task.as_ref().filter(|task| !self.data.task(task).root().exists())
+        {
             return Err(NoSuchTask(task.clone()));
         }
         let data = self.data.clone();
@@ -89,7 +93,8 @@ impl Logs {
 
     /// Has lines of `level` and above published for `lease`.
     pub fn follow(&self, level: LogLevel, lease: Duration) {
-        self.following.send_replace(Some(Following { level, until: Instant::now() + lease.min(MAX_LEASE) }));
+        self.following
+            .send_replace(Some(Following { level, until: Instant::now() + lease.min(MAX_LEASE) }));
     }
 
     /// Whether somebody follows.
@@ -109,13 +114,17 @@ fn files(data: &DataDir) -> Vec<LogFile> {
             (task.ros_log(), LogSource::Rosout),
             (task.build_log(), LogSource::Build),
         ];
-        files.extend(logs.map(|(path, unmarked)| LogFile { path, task: Some(name.clone()), unmarked }));
+        files.extend(logs.map(|(path, unmarked)| LogFile {
+            path,
+            task: Some(name.clone()),
+            unmarked,
+        }));
     }
     files
 }
 
-/// The last lines of the last run in the log at `path`, from its last `max_bytes`, without times; empty when there is no
-/// log.
+/// The last lines of the last run in the log at `path`, from its last `max_bytes`, without times;
+/// empty when there is no log.
 pub fn last_lines(path: &Path, max_bytes: u64) -> String {
     let read = || {
         let mut file = File::open(path)?;
@@ -124,9 +133,13 @@ pub fn last_lines(path: &Path, max_bytes: u64) -> String {
         let mut bytes = Vec::new();
         file.take(max_bytes).read_to_end(&mut bytes)?;
         // What was cut in the middle of a line is not worth showing.
-        let cut =
-            if begin == 0 { 0 } else { bytes.iter().position(|byte| *byte == b'\n').map_or(bytes.len(), |at| at + 1) };
-        let records: Vec<Record> = bytes[cut..].split(|byte| *byte == b'\n').map(Record::parse).collect();
+        let cut = if begin == 0 {
+            0
+        } else {
+            bytes.iter().position(|byte| *byte == b'\n').map_or(bytes.len(), |at| at + 1)
+        };
+        let records: Vec<Record> =
+            bytes[cut..].split(|byte| *byte == b'\n').map(Record::parse).collect();
         let begin = records.iter().rposition(Record::is_start).map_or(0, |at| at + 1);
         let said = records[begin..].iter().filter(|record| record.source != Some(LogSource::Agent));
         let lines: Vec<String> = said.map(|record| console::printable(record.text)).collect();
@@ -152,9 +165,25 @@ mod tests {
         assert_eq!(last_lines(&path, 100), "earlier");
         let mut log = std::fs::read(&path).expect("read");
         record::write_start(&mut log, 0);
-        record::write(&mut log, "1970-01-01T00:00:00.000Z", LogSource::Stderr, false, b"\x1b[31mno\x1b[0m\tway");
-        record::write(&mut log, "1970-01-01T00:00:00.000Z", LogSource::Agent, false, b"[WARN] 4 bytes are missing");
+        record::write(
+            &mut log,
+            "1970-01-01T00:00:00.000Z",
+            LogSource::Stderr,
+            false,
+            b"\x1b[31mno\x1b[0m\tway",
+        );
+        record::write(
+            &mut log,
+            "1970-01-01T00:00:00.000Z",
+            LogSource::Agent,
+            false,
+            b"[WARN] 4 bytes are missing",
+        );
         std::fs::write(&path, log).expect("write");
-        assert_eq!(last_lines(&path, 300), "no way", "an earlier run's lines say nothing about this one");
+        assert_eq!(
+            last_lines(&path, 300),
+            "no way",
+            "an earlier run's lines say nothing about this one"
+        );
     }
 }

@@ -1,13 +1,14 @@
-//! Waits until an administrator approves a robot that has just registered, or turns it away. Who it is has been written down, so
-//! that the wait goes on after a restart; an agent that runs meanwhile notices by itself.
+//! Waits until an administrator approves a robot that has just registered, or turns it away. Who it
+//! is has been written down, so that the wait goes on after a restart; an agent that runs meanwhile
+//! notices by itself.
 
 use std::time::Duration;
 
 use anyhow::{Context as _, bail};
 use task_proto::api::AWAITS_APPROVAL;
 
-use super::enroll::check_key;
 use super::say;
+use crate::reconcile::admission;
 use crate::system::durable;
 use crate::system::error_chain::chain;
 use crate::system::identity::Identity;
@@ -20,6 +21,13 @@ const PAUSE: Duration = Duration::from_secs(8);
 /// The longest while the server can't be reached.
 const MAX_AWAY_MS: u64 = 60 * 1000;
 
+/// The server must hold the key that the token pins: a desired state that it signed shows it.
+pub(super) fn check_key(sent: &Sent, robot: &Identity) -> anyhow::Result<()> {
+    admission::open(&sent.envelope, &robot.server_key, &robot.robot_id)
+        .context("the server does not hold the key that the enrolment token names")?;
+    Ok(())
+}
+
 /// Waits, and makes `robot` the registered one or forgets it. `before` is who this robot was.
 pub(super) async fn wait(
     data: &Layout,
@@ -27,7 +35,10 @@ pub(super) async fn wait(
     robot: Identity,
     before: Option<Identity>,
 ) -> anyhow::Result<()> {
-    say(format_args!("{} waits to be approved at {} (taskd robot approve)", robot.robot_id, robot.server));
+    say(format_args!(
+        "{} waits to be approved at {} (taskd robot approve)",
+        robot.robot_id, robot.server
+    ));
     match answer(server).await {
         Ok(sent) => {
             if let Some(sent) = sent
@@ -50,7 +61,8 @@ pub(super) async fn wait(
     }
 }
 
-/// Whether the robot was not registered anew, and has not gone over to another token, while it waited.
+/// Whether the robot was not registered anew, and has not gone over to another token, while it
+/// waited.
 fn is_still(data: &Layout, robot: &Identity) -> bool {
     Identity::read(&data.identity()).is_ok_and(|known| known.token == robot.token)
 }

@@ -1,4 +1,5 @@
-//! `task-agent enroll`: registers this robot at a server with an enrolment token, and keeps who it is.
+//! `task-agent enroll`: registers this robot at a server with an enrolment token, and keeps who it
+//! is.
 
 use std::process::ExitCode;
 use std::time::Duration;
@@ -10,15 +11,15 @@ use task_proto::token::{Token, TokenKind};
 use task_proto::{MacAddress, RobotName};
 use task_transport::ClientKey;
 
-use super::{DataDir, approval, refuse_plain_text, say, tls};
+use super::approval::{self, check_key};
+use super::{DataDir, refuse_plain_text, say, tls};
 use crate::config::{Config, Settings, parse_server};
-use crate::reconcile::admission;
 use crate::system::clock;
 use crate::system::durable;
 use crate::system::identity::{self, Identity};
 use crate::system::layout::DataDir as Layout;
 use crate::task::plan::backoff_ms;
-use crate::transfer::server::{self, Sent, Server, ServerError};
+use crate::transfer::server::{self, Server, ServerError};
 
 /// How often the server is asked.
 const TRIES: u32 = 4;
@@ -31,8 +32,8 @@ pub struct Arguments {
     /// The server's URL [default: the one in the property file]
     #[arg(long, value_name = "URL")]
     server: Option<String>,
-    /// The enrolment token: `taskd enroll-token create` makes one. Other users of the machine can read it here, but not in
-    /// the variable
+    /// The enrolment token: `taskd enroll-token create` makes one. Other users of the machine can
+    /// read it here, but not in the variable
     #[arg(long, value_name = "TOKEN", env = "TASK_AGENT_ENROLL_TOKEN", hide_env_values = true)]
     token: Option<String>,
     /// The robot's name
@@ -71,7 +72,11 @@ async fn enroll(arguments: Arguments) -> anyhow::Result<ExitCode> {
         if known.awaits_approval {
             return go_on_waiting(&data, known).await;
         }
-        bail!("this robot is registered as {} at {}: use --force to register it anew", known.robot_id, known.server);
+        bail!(
+            "this robot is registered as {} at {}: use --force to register it anew",
+            known.robot_id,
+            known.server
+        );
     }
     let Some(shown_token) = &arguments.token else {
         bail!("--token: no enrolment token is given, here or in TASK_AGENT_ENROLL_TOKEN");
@@ -90,7 +95,8 @@ async fn enroll(arguments: Arguments) -> anyhow::Result<ExitCode> {
         Some(mac) => mac,
         None => identity::find_own_mac()?,
     };
-    durable::create_dir_all(data.root()).with_context(|| format!("cannot make {}", data.root().display()))?;
+    durable::create_dir_all(data.root())
+        .with_context(|| format!("cannot make {}", data.root().display()))?;
 
     let mut labels = config.labels.clone().unwrap_or_default();
     labels.extend(arguments.labels.iter().cloned());
@@ -105,7 +111,11 @@ async fn enroll(arguments: Arguments) -> anyhow::Result<ExitCode> {
     let client = server::client(tls(token.ca_pin(), Some(&client_key))?)?;
     let response = match register(&client, &server, shown_token, &request).await {
         Ok(response) => response,
-        Err(error) => return Err(anyhow::Error::new(error).context(format!("{server} did not register the robot"))),
+        Err(error) => {
+            return Err(
+                anyhow::Error::new(error).context(format!("{server} did not register the robot"))
+            );
+        }
     };
     remember_settings(&data, &arguments, &server, &response, labels)?;
     let robot = Identity {
@@ -121,21 +131,26 @@ async fn enroll(arguments: Arguments) -> anyhow::Result<ExitCode> {
         mac,
         awaits_approval: response.awaits_approval,
     };
-    // Written before the token is used: once it was, the server gives no other for the same enrolment token.
+    // Written before the token is used: once it was, the server gives no other for the same
+    // enrolment token.
     let before = Identity::read(&data.identity()).ok();
     robot.write(&data.identity())?;
-    let registered = Server::new(client, server.clone(), response.robot_id.clone(), response.token.clone());
+    let registered =
+        Server::new(client, server.clone(), response.robot_id.clone(), response.token.clone());
     if response.awaits_approval {
         approval::wait(&data, &registered, robot, before).await?;
     } else if let Ok(Some(sent)) = registered.desired(None).await
-        // Without that answer the robot is registered all the same and must not forget who it is: every state is verified
-        // before it is obeyed.
+        // Without that answer the robot is registered all the same and must not forget who it is:
+        // every state is verified before it is obeyed.
         && let Err(error) = check_key(&sent, &robot)
     {
         approval::forget(&data, before)?;
         return Err(error);
     }
-    say(format_args!("{} is registered at {server} as {}, by {mac}", response.name, response.robot_id));
+    say(format_args!(
+        "{} is registered at {server} as {}, by {mac}",
+        response.name, response.robot_id
+    ));
     Ok(ExitCode::SUCCESS)
 }
 
@@ -150,7 +165,8 @@ async fn go_on_waiting(data: &Layout, robot: Identity) -> anyhow::Result<ExitCod
     Ok(ExitCode::SUCCESS)
 }
 
-/// Registers, again if no answer came: while nobody has used the token that was in it, the same answer can be had anew.
+/// Registers, again if no answer came: while nobody has used the token that was in it, the same
+/// answer can be had anew.
 async fn register(
     client: &reqwest::Client,
     server: &reqwest::Url,
@@ -162,18 +178,16 @@ async fn register(
         tried += 1;
         match server::enroll(client, server, token, request).await {
             Err(ServerError::Unreachable(_) | ServerError::Busy { .. }) if tried < TRIES => {
-                tokio::time::sleep(Duration::from_millis(backoff_ms(tried, MAX_PAUSE_MS, rand::random()))).await;
+                tokio::time::sleep(Duration::from_millis(backoff_ms(
+                    tried,
+                    MAX_PAUSE_MS,
+                    rand::random(),
+                )))
+                .await;
             }
             answer => return answer,
         }
     }
-}
-
-/// The server must hold the key that the token pins: a desired state that it signed shows it.
-pub(super) fn check_key(sent: &Sent, robot: &Identity) -> anyhow::Result<()> {
-    admission::open(&sent.envelope, &robot.server_key, &robot.robot_id)
-        .context("the server does not hold the key that the enrolment token names")?;
-    Ok(())
 }
 
 /// Keeps in the property file what was given on the command line.

@@ -1,5 +1,5 @@
-//! The subcommands of `task-agent`: each turns its arguments into one call and the outcome into an exit code.
-//! They are the only place beside `main` that uses `anyhow` and prints.
+//! The subcommands of `task-agent`: each turns its arguments into one call and the outcome into an
+//! exit code. Only they and `main` use `anyhow` and print.
 
 use std::path::PathBuf;
 
@@ -42,8 +42,13 @@ enum Output {
     Json,
 }
 
-/// Whoever knows the server by a pin says nothing to it in plain text. `setting` is what gave the server's address.
-fn refuse_plain_text(pin: Option<CaPin>, server: &reqwest::Url, setting: &str) -> anyhow::Result<()> {
+/// Whoever knows the server by a pin says nothing to it in plain text. `setting` is what gave the
+/// server's address.
+fn refuse_plain_text(
+    pin: Option<CaPin>,
+    server: &reqwest::Url,
+    setting: &str,
+) -> anyhow::Result<()> {
     let is_plain = pin.is_some() && server.scheme() != "https";
     ensure!(
         !is_plain,
@@ -53,7 +58,8 @@ fn refuse_plain_text(pin: Option<CaPin>, server: &reqwest::Url, setting: &str) -
     Ok(())
 }
 
-/// How the agent speaks TLS: whom it takes for the server, and the key that it shows if it is asked for one.
+/// How the agent speaks TLS: whom it takes for the server, and the key that it shows if it is asked
+/// for one.
 fn tls(pin: Option<CaPin>, key: Option<&ClientKey>) -> anyhow::Result<ClientConfig> {
     let mut config = Trust::by(pin).client_config(clock::for_certificates());
     if let Some(key) = key {

@@ -1,4 +1,4 @@
-//! Packages on the disk: fetched, verified, unpacked, built, sealed. It never starts a task.
+//! Packages on the disk: fetched, verified, unpacked, built and sealed. It never starts a task.
 
 pub mod builder;
 pub mod fetch;

@@ -1,4 +1,5 @@
-//! The connection to the server: MQTT sessions, the endpoint they go to, reports, and new tokens. It never decides about tasks.
+//! The session with the server: MQTT or polling, reports, endpoints and new tokens. It never
+//! decides about tasks.
 
 pub mod endpoint;
 pub mod mqtt;

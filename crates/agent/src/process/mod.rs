@@ -1,4 +1,5 @@
-//! Processes: they are started, confined, supervised by a shim, and found again after a restart of the agent. It decides nothing.
+//! Processes: started, confined, supervised by a shim, and found again after a restart of the
+//! agent. It never decides when.
 
 pub mod call_filter;
 pub mod cgroup;

@@ -1,4 +1,5 @@
-//! The driver brings the robot to its desired state through the real effects, and answers the server's requests. Decisions are `task`'s.
+//! The driver that brings the robot to its desired state, the real effects, and the answers to
+//! requests. It leaves each decision to `task`.
 
 pub mod admission;
 pub mod answers;

@@ -1,4 +1,5 @@
-//! The ROS graph: the process that takes part in it, readiness of tasks, and a look into installations. It starts and stops no task.
+//! The ROS graph: the process that takes part in it, the readiness of tasks, and the survey of
+//! installations. It starts and stops no task.
 
 pub mod graph;
 pub mod graph_access;

@@ -1,5 +1,6 @@
-//! A ROS installation as tasks use it: the setup files to source and what is in it. Pure: which one a task gets, and
-//! what a task would miss. Finding installations is `underlay`'s work, looking into them `survey`'s.
+//! A ROS installation as tasks use it: the setup files to source and what is in it. Pure: which one
+//! a task gets, and what a task would miss. Finding installations is `underlay`'s work, looking
+//! into them `ros::probe`'s.
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -56,43 +57,54 @@ impl Installation {
         self.versions.is_empty() || self.versions.contains(&version)
     }
 
-    /// Those of `needed` that are certainly not in it. Only names that can't be anything but ROS packages are judged:
-    /// others are keys of `rosdep` for what the operating system or pip provides, which no index of ROS lists.
+    /// Those of `needed` that are certainly not in it. Only names that can't be anything but ROS
+    /// packages are judged: others are keys of `rosdep` for what the operating system or pip
+    /// provides, which no index of ROS lists.
     pub fn lacks<'a>(&self, needed: impl IntoIterator<Item = &'a str>) -> BTreeSet<&'a str> {
         let Some(packages) = &self.packages else { return BTreeSet::new() };
-        needed.into_iter().filter(|name| is_ros_package(name) && !packages.contains(*name)).collect()
+        needed
+            .into_iter()
+            .filter(|name| is_ros_package(name) && !packages.contains(*name))
+            .collect()
     }
 }
 
-/// Whether only a ROS package can be called `name`. Of 4,210 released ROS packages nine in ten have an underscore, of
-/// 2,414 names of system packages one.
+/// Whether only a ROS package can be called `name`. Of 4,210 released ROS packages nine in ten have
+/// an underscore, of 2,414 names of system packages one.
 pub fn is_ros_package(name: &str) -> bool {
-    let plain = name.bytes().all(|byte| byte.is_ascii_lowercase() || byte.is_ascii_digit() || byte == b'_');
+    let plain =
+        name.bytes().all(|byte| byte.is_ascii_lowercase() || byte.is_ascii_digit() || byte == b'_');
     (plain && name.contains('_') && !SYSTEM_NAMES.contains(&name)) || PLAIN_NAMES.contains(&name)
 }
 
-/// The installation for a task that needs `version` (`None`: any will do, also none) of one of `distros` (none: any).
-/// The best one is the last of `installations`.
+/// The installation for a task that needs `version` (`None`: any will do, also none) of one of
+/// `distros` (none: any). The best one is the last of `installations`.
 pub fn choose<'a>(
     installations: &'a [Installation],
     version: Option<RosVersion>,
     distros: &[String],
 ) -> Result<Option<&'a Installation>, NoInstallation> {
-    let mut of_version = installations.iter().filter(|found| version.is_none_or(|version| found.may_be(version)));
+    let mut of_version =
+        installations.iter().filter(|found| version.is_none_or(|version| found.may_be(version)));
     if distros.is_empty() {
         return match (of_version.next_back(), version) {
-            (None, Some(version)) => Err(NoInstallation::Version(version, all_distros(installations))),
+            (None, Some(version)) => {
+                Err(NoInstallation::Version(version, all_distros(installations)))
+            }
             (found, _) => Ok(found),
         };
     }
-    let accepted = of_version.rfind(|found| found.distros.iter().any(|distro| distros.contains(distro)));
-    let none = || NoInstallation::Distro { wanted: distros.to_vec(), found: all_distros(installations) };
+    let accepted =
+        of_version.rfind(|found| found.distros.iter().any(|distro| distros.contains(distro)));
+    let none =
+        || NoInstallation::Distro { wanted: distros.to_vec(), found: all_distros(installations) };
     accepted.map(Some).ok_or_else(none)
 }
 
 /// The distributions, sorted, each once.
 pub fn all_distros(installations: &[Installation]) -> Vec<String> {
-    let distros: BTreeSet<&String> = installations.iter().flat_map(|found| &found.distros).collect();
+    let distros: BTreeSet<&String> =
+        installations.iter().flat_map(|found| &found.distros).collect();
     distros.into_iter().cloned().collect()
 }
 
@@ -114,12 +126,17 @@ mod tests {
     use super::*;
 
     fn installation(distro: &str, version: RosVersion) -> Installation {
-        Installation { distros: vec![distro.to_owned()], versions: vec![version], ..Installation::default() }
+        Installation {
+            distros: vec![distro.to_owned()],
+            versions: vec![version],
+            ..Installation::default()
+        }
     }
 
     #[test]
     fn a_task_gets_its_version_of_ros_whatever_else_is_there() {
-        let all = [installation("noetic", RosVersion::Ros1), installation("humble", RosVersion::Ros2)];
+        let all =
+            [installation("noetic", RosVersion::Ros1), installation("humble", RosVersion::Ros2)];
         let distro = |version, wanted: &[&str]| {
             let wanted: Vec<String> = wanted.iter().map(|text| (*text).to_owned()).collect();
             choose(&all, version, &wanted).map(|found| found.map(|found| found.distros[0].clone()))
@@ -127,7 +144,8 @@ mod tests {
         assert_eq!(distro(None, &[]), Ok(Some("humble".to_owned())));
         assert_eq!(distro(Some(RosVersion::Ros1), &[]), Ok(Some("noetic".to_owned())));
         assert_eq!(distro(None, &["noetic"]), Ok(Some("noetic".to_owned())));
-        let text = distro(Some(RosVersion::Ros2), &["noetic"]).expect_err("another version").to_string();
+        let text =
+            distro(Some(RosVersion::Ros2), &["noetic"]).expect_err("another version").to_string();
         assert_eq!(text, "ros_distro noetic (it has humble, noetic)");
         let text = choose(&all[..1], Some(RosVersion::Ros2), &[]).expect_err("none").to_string();
         assert_eq!(text, "ROS 2 (no ROS 2 found, only noetic)");
@@ -140,7 +158,16 @@ mod tests {
 
     #[test]
     fn only_what_is_certainly_absent_is_lacking() {
-        let needed = ["nav2_bringup", "rclpy", "std_msgs", "python3-numpy", "eigen", "xacro", "onvif_zeep", "libFoo_x"];
+        let needed = [
+            "nav2_bringup",
+            "rclpy",
+            "std_msgs",
+            "python3-numpy",
+            "eigen",
+            "xacro",
+            "onvif_zeep",
+            "libFoo_x",
+        ];
         let mut found = installation("jazzy", RosVersion::Ros2);
         assert!(found.lacks(needed).is_empty(), "nobody has looked");
         found.packages = Some(["std_msgs".to_owned()].into());

@@ -1,4 +1,4 @@
-//! ROS installations, launchers and the scripts made for them, as pure text. It starts nothing.
+//! ROS installations, launchers, and the scripts that are generated for them. It starts nothing.
 
 pub mod environment;
 pub mod installation;

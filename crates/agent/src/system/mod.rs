@@ -1,4 +1,5 @@
-//! The machine and its files: clocks, disk, accounts, and the layout of the data directory. It knows nothing of tasks' states and speaks to no network.
+//! The machine: clocks, disk, accounts, identity, and the layout of the data directory. It knows no
+//! tasks and opens no connection.
 
 pub mod accounts;
 pub mod battery;

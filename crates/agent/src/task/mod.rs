@@ -1,4 +1,5 @@
-//! The state of tasks and the pure decision about the next step. It has no effects: those are a trait.
+//! The state of tasks on disk and the pure decision about the next step. It never acts: effects are
+//! a trait.
 
 pub mod effects;
 pub mod ledger;

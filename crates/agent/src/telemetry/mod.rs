@@ -1,4 +1,5 @@
-//! Data about the robot on its way to the server: vitals, and the files that runs bring back. It changes nothing.
+//! Data on its way to the server: vitals of the robot and the output files of runs. It changes
+//! nothing on the robot.
 
 pub mod outputs;
 pub mod vitals;

@@ -1,4 +1,5 @@
-//! Bytes between server and robot: the HTTP client and its credential, parts that come over MQTT, and the measurement of the link. It decides nothing.
+//! Bytes between server and robot: the HTTP client and its credential, parts that arrive over MQTT,
+//! and the measurement of the link. It never decides and never retries.
 
 pub mod credential;
 pub mod link_meter;

@@ -1,4 +1,5 @@
-//! The end-to-end tests: the real programs, started as processes, and the rules all of the source keeps.
+//! The end-to-end tests: the real programs, started as processes, and the rules all of the source
+//! keeps.
 
 mod approval;
 mod broker;
@@ -23,6 +24,7 @@ mod questions;
 mod registry;
 mod restore;
 mod revoked;
+mod rooms;
 mod ros;
 mod ros1;
 #[expect(dead_code, reason = "the agent's own tests need more of it")]
